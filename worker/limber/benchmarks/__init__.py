@@ -1,0 +1,1 @@
+"""Benchmarks: one module a topic; each measures what an issue asked, and softens nothing."""

@@ -1,0 +1,66 @@
+"""The errors that Limber raises on purpose, and the exit code that each ends a command with.
+
+Every message has three parts: what was seen, why it is wrong, what to do.
+"""
+
+
+class LimberError(Exception):
+    """Base of all errors that a user can meet. Not raised itself."""
+
+    exit_code = 3
+    status = "failed"
+
+    def __init__(self, seen: str, why: str = "", fix: str = ""):
+        """State what was ``seen``, ``why`` that is wrong and how to ``fix`` it."""
+        self.seen, self.why, self.fix = seen, why, fix
+        super().__init__(" ".join(part for part in (seen, why, fix) if part))
+
+
+class InputError(LimberError):
+    """The input or its use is wrong; nothing was computed (exit code 2)."""
+
+    exit_code = 2
+
+
+class BranchFolderError(InputError):
+    """A branch folder is missing, damaged, of a newer format, or lacks a stage's files."""
+
+
+class WorkError(LimberError):
+    """The input was understood but the work failed (exit code 3)."""
+
+
+class ConvergenceError(WorkError):
+    """A solver ended without a solution; ``result`` holds its last state and history."""
+
+    def __init__(self, seen: str, why: str = "", fix: str = "", *, result: object = None):
+        super().__init__(seen, why, fix)
+        self.result = result
+
+
+class MeshingError(WorkError):
+    """No valid surface or tetrahedral mesh came out."""
+
+
+class NoPathError(WorkError):
+    """The planner found no path that meets the constraints."""
+
+
+class MissingDependencyError(WorkError):
+    """An optional package is not installed; ``limber doctor`` lists what that costs."""
+
+
+class SafetyStop(LimberError):
+    """A robot was stopped, or not started, for safety (exit code 4)."""
+
+    exit_code = 4
+
+
+class Cancelled(LimberError):
+    """The user stopped the work (exit code 130); what was there before is untouched."""
+
+    exit_code = 130
+    status = "cancelled"
+
+    def __init__(self, seen: str = "Cancelled.", why: str = "", fix: str = ""):
+        super().__init__(seen, why, fix)

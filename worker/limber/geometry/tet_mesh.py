@@ -1,0 +1,161 @@
+"""Tetrahedral meshes: the type that geometry makes and mechanics computes on, and its file.
+
+Nodes of a quadratic tetrahedron follow VTK: four corners, then the middles of the edges
+01, 12, 20, 03, 13, 23.
+"""
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+
+EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
+"""Corners of the six edges of a tetrahedron, in VTK's order of the mid-side nodes."""
+
+FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+"""Corners of the four faces, counter-clockwise seen from outside."""
+
+
+@dataclass(frozen=True)
+class TetMesh:
+    """Tetrahedra with data on them; all arrays read-only by convention.
+
+    Attributes:
+        nodes: Positions [m], shape [node_count, 3].
+        tets: Node indices, shape [tet_count, 4] (linear) or [tet_count, 10] (quadratic).
+        cell_data: Name to array of shape [tet_count, ...]: ``young`` [Pa], ``poisson``.
+        point_data: Name to array of shape [node_count, ...]: ``fixed`` (0 or 1),
+            ``control_point`` (index or -1), ``grasp`` (0 or 1).
+    """
+
+    nodes: np.ndarray
+    tets: np.ndarray
+    cell_data: dict[str, np.ndarray] = field(default_factory=dict)
+    point_data: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def node_count(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def tet_count(self) -> int:
+        return len(self.tets)
+
+    @property
+    def is_quadratic(self) -> bool:
+        return self.tets.shape[1] == 10
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Signed volumes of the straight-sided tetrahedra [m^3], shape [tet_count]."""
+        corner = self.nodes[self.tets[:, :4]]
+        return np.linalg.det(corner[:, 1:] - corner[:, :1]) / 6.0
+
+    @property
+    def centroids(self) -> np.ndarray:
+        """Centroids of the corners [m], shape [tet_count, 3]."""
+        return self.nodes[self.tets[:, :4]].mean(axis=1)
+
+    def oriented(self) -> "TetMesh":
+        """Return the mesh with every tetrahedron positively oriented."""
+        flip = self.volumes < 0
+        tets = self.tets.copy()
+        order = [0, 2, 1, 3] if not self.is_quadratic else [0, 2, 1, 3, 6, 5, 4, 7, 9, 8]
+        tets[flip] = tets[flip][:, order]
+        return replace(self, tets=tets)
+
+    def quadratic(self) -> "TetMesh":
+        """Return the mesh with straight-sided 10-node tetrahedra; corner nodes keep their index.
+
+        Point data of a mid-side node is that of both corners where they agree; a flag (integer
+        data) that they do not share is 0 there, or -1 for ``control_point``.
+        """
+        if self.is_quadratic:
+            return self
+        pairs = np.sort(self.tets[:, EDGES], axis=2).reshape(-1, 2)
+        edges, inverse = np.unique(pairs, axis=0, return_inverse=True)
+        middle = self.node_count + inverse.reshape(-1, 6)
+        nodes = np.vstack([self.nodes, self.nodes[edges].mean(axis=1)])
+        point_data = {name: np.concatenate([values, _on_edges(name, values, edges)])
+                      for name, values in self.point_data.items()}
+        return replace(self, nodes=nodes, tets=np.hstack([self.tets, middle]),
+                       point_data=point_data)
+
+    def linear(self) -> "TetMesh":
+        """Return the mesh of the corners alone; unused nodes are dropped."""
+        if not self.is_quadratic:
+            return self
+        used, inverse = np.unique(self.tets[:, :4], return_inverse=True)
+        return replace(self, nodes=self.nodes[used], tets=inverse.reshape(-1, 4),
+                       point_data={k: v[used] for k, v in self.point_data.items()})
+
+    def surface_faces(self) -> np.ndarray:
+        """Return the boundary triangles (corner nodes, outward), shape [face_count, 3]."""
+        faces = self.tets[:, FACES].reshape(-1, 3)
+        _, first, count = np.unique(
+            np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return faces[np.sort(first[count == 1])]
+
+    def with_data(self, *, cell_data: dict[str, np.ndarray] | None = None,
+                  point_data: dict[str, np.ndarray] | None = None) -> "TetMesh":
+        """Return the mesh with some data added or replaced."""
+        return replace(self, cell_data=self.cell_data | (cell_data or {}),
+                       point_data=self.point_data | (point_data or {}))
+
+    def geometry_digest(self) -> str:
+        """Return a sha256 of nodes, tetrahedra and point data: what E does not change."""
+        digest = hashlib.sha256()
+        arrays = [self.nodes, self.tets.astype(np.int64)]
+        arrays += [self.point_data[name] for name in sorted(self.point_data)]
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    def write(self, path: Path) -> None:
+        """Write a VTU file that ParaView opens."""
+        import meshio
+
+        kind = "tetra10" if self.is_quadratic else "tetra"
+        # meshio converts tetra10 between its own (Gmsh-like) and VTK's node order: not for VTU,
+        # where it passes nodes through; test_tet_mesh holds that.
+        meshio.write_points_cells(
+            path, self.nodes, [(kind, self.tets)], file_format="vtu",
+            point_data=self.point_data,
+            cell_data={name: [values] for name, values in self.cell_data.items()})
+
+    @classmethod
+    def read(cls, path: Path) -> "TetMesh":
+        """Read tetrahedra from a VTU file (any format that meshio knows).
+
+        Raises:
+            InputError: the file has no tetrahedra or cannot be read.
+        """
+        import meshio
+
+        try:
+            mesh = meshio.read(path)
+        except (meshio.ReadError, OSError, ValueError, SyntaxError) as error:
+            raise InputError(f"{path} cannot be read as a mesh ({error}).",
+                             "A VTU file with tetrahedra was expected.",
+                             "Check the file, or make it anew.") from error
+        for number, block in enumerate(mesh.cells):
+            if block.type in ("tetra", "tetra10"):
+                cell_data = {name: np.asarray(parts[number])
+                             for name, parts in mesh.cell_data.items()}
+                point_data = {name: np.asarray(v) for name, v in mesh.point_data.items()}
+                return cls(np.asarray(mesh.points, float), np.asarray(block.data, np.int64),
+                           cell_data, point_data)
+        kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells"
+        raise InputError(f"{path} holds {kinds}.", "Tetrahedra were expected.",
+                         "Use `limber mesh` to fill a closed surface with tetrahedra.")
+
+
+def _on_edges(name: str, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    first, second = values[edges[:, 0]], values[edges[:, 1]]
+    if np.issubdtype(values.dtype, np.integer):
+        other = -1 if name == "control_point" else 0
+        return np.where(first == second, first, other).astype(values.dtype)
+    return (first + second) / 2

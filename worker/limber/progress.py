@@ -1,0 +1,107 @@
+"""Progress and cancelling of long work, the same for a terminal, a parent process and a test.
+
+A long function takes ``progress: Progress = SILENT`` and calls it as it goes::
+
+    progress(0.4, "contracting", iteration=7)
+
+A call raises :class:`limber.errors.Cancelled` once the work has been cancelled, so every call
+is also a place where the work can stop. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
+"""
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, TextIO
+
+from limber.errors import Cancelled
+
+Sink = Callable[[float, str, dict[str, Any]], None]
+
+
+class Progress:
+    """Reports a fraction of done work to a sink; raises ``Cancelled`` after :meth:`cancel`."""
+
+    def __init__(self, sink: Sink | None = None, *, _span: tuple[float, float] = (0.0, 1.0),
+                 _stop: threading.Event | None = None):
+        self._sink = sink
+        self._span = _span
+        self._stop = _stop or threading.Event()
+
+    def __call__(self, fraction: float, message: str = "", **numbers: Any) -> None:
+        """Report ``fraction`` in [0, 1] with a short message and named numbers."""
+        if self._stop.is_set():
+            raise Cancelled
+        if self._sink is not None:
+            start, stop = self._span
+            clipped = min(max(float(fraction), 0.0), 1.0)
+            self._sink(start + (stop - start) * clipped, message, numbers)
+
+    def part(self, start: float, stop: float) -> "Progress":
+        """Return a progress whose 0..1 is ``start..stop`` of this one."""
+        low, high = self._span
+        span = (low + (high - low) * start, low + (high - low) * stop)
+        return Progress(self._sink, _span=span, _stop=self._stop)
+
+    def cancel(self) -> None:
+        """Make the next report, from any thread, raise ``Cancelled``."""
+        self._stop.set()
+
+    @property
+    def cancelled(self) -> bool:
+        return self._stop.is_set()
+
+
+SILENT = Progress()
+
+
+class JsonSink:
+    """Writes one JSON object a line: ``{"progress", "message", "seconds", ...numbers}``."""
+
+    def __init__(self, stream: TextIO | None = None, *, interval_seconds: float = 0.05):
+        self._stream = stream or sys.stdout
+        self._interval = interval_seconds
+        self._start = time.perf_counter()
+        self._last = -1.0
+        self._last_message = ""
+
+    def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        now = time.perf_counter() - self._start
+        due = now - self._last >= self._interval or message != self._last_message
+        if not (due or fraction >= 1.0):
+            return
+        self._last, self._last_message = now, message
+        line = {"progress": round(fraction, 4), "message": message, "seconds": round(now, 3)}
+        print(json.dumps(line | numbers, default=float), file=self._stream, flush=True)
+
+
+class BarSink:
+    """Draws a bar on standard error, with the last message and the numbers beside it."""
+
+    def __init__(self, title: str):
+        from rich.console import Console
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as RichProgress
+
+        self._bar = RichProgress(
+            TextColumn("{task.fields[title]}"), BarColumn(bar_width=30),
+            TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
+            TextColumn("{task.description}"), console=Console(stderr=True),
+        )
+        self._task = self._bar.add_task("", total=1.0, title=title)
+
+    def __enter__(self) -> "BarSink":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._bar.stop()
+
+    def __call__(self, fraction: float, message: str, numbers: dict[str, Any]) -> None:
+        shown = " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
+        self._bar.update(self._task, completed=fraction, description=f"{message} {shown}".strip())
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
