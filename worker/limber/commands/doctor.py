@@ -1,0 +1,66 @@
+"""``limber doctor``: what is installed, what is missing, and what then does not work."""
+
+import importlib
+import importlib.util
+import os
+import platform
+import shutil
+from importlib import metadata
+from typing import Any
+
+import click
+
+from limber.cli import Run, stage_command
+
+# Module, distribution, what does not work without it. None: nothing works without it.
+PARTS = [
+    ("numpy", "numpy", None),
+    ("scipy", "scipy", None),
+    ("numba", "numba", None),
+    ("cvxopt", "cvxopt", "fast factorisation; SuperLU takes over, about 4 times slower"),
+    ("robust_laplacian", "robust_laplacian", "the robust Laplacian; our own takes over"),
+    ("pytetwild", "pytetwild", "fTetWild meshes; the sweep mesher takes over"),
+    ("manifold3d", "manifold3d", "smooth unions at forks"),
+    ("ompl", "ompl", "OMPL's RRT*; our own planner takes over (no wheel for Windows)"),
+    ("rtde_control", "ur-rtde", "motion of a UR robot"),
+    ("laspy", "laspy", "LAS and LAZ scans"),
+    ("pypcd4", "pypcd4", "PCD scans"),
+    ("ezc3d", "ezc3d", "C3D motion capture"),
+    ("distributed", "distributed", "work on more than one machine"),
+    ("bpy", "bpy", "`limber scene`, unless a real Blender is found"),
+    ("ultralytics", "ultralytics", "masks by a YOLO model of your own (optional)"),
+]
+
+
+@stage_command("doctor")
+@click.option("--warm", is_flag=True, help="Compile the solver's kernels now, not at first use.")
+def command(run: Run, warm: bool) -> dict[str, Any]:
+    """What is installed, what is missing and what then does not work."""
+    parts = {}
+    missing = []
+    for module, distribution, cost in PARTS:
+        present = importlib.util.find_spec(module) is not None
+        parts[module] = _version(distribution) if present else f"missing: {cost}"
+        if not present:
+            missing.append(module)
+    result: dict[str, Any] = {
+        "python": platform.python_version(), "system": platform.platform(),
+        "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
+    }
+    if warm:
+        from limber.mechanics.warm_up import warm_up
+
+        result["warm_up"] = warm_up(run.progress)
+    return result
+
+
+def _version(distribution: str) -> str:
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return "present"
+
+
+def _blender() -> str:
+    path = os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
+    return path or "none found (LIMBER_BLENDER or the PATH); scripts/provision_blender brings one"
