@@ -1,0 +1,145 @@
+"""The command line's contract: exit codes, the last JSON line, progress lines, options."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import click
+import pytest
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber import cli
+from limber.errors import Cancelled, ConvergenceError, InputError, SafetyStop
+
+
+class Settings(BaseModel):
+    """Settings of a stage that exists for the tests."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size: float = Field(0.5, gt=0, allow_inf_nan=False, description="Size [m].")
+    deep: bool = Field(False, description="Go deep.")
+    goal: tuple[float, float, float] | None = Field(None, description="Goal [m].")
+    fractions: tuple[float, ...] = Field((0.2, 0.4), description="Fractions.")
+
+
+def invoke(function, arguments, capfd):
+    """Run a command made from ``function``; return exit code and standard output's lines."""
+    command = cli.stage_command("probe")(function)
+    with pytest.raises(SystemExit) as stop:
+        command.main(arguments, standalone_mode=False)
+    return stop.value.code, capfd.readouterr().out.splitlines()
+
+
+def test_result_is_the_last_json_line(capfd):
+    """--json ends with one object that has the contract's keys and the result's."""
+    def function(run, **_options):
+        """Probe."""
+        run.progress(0.5, "half", count=2)
+        run.warn("careful")
+        return {"tet_count": 12}
+    code, lines = invoke(function, ["--json", "--progress", "json"], capfd)
+    assert code == 0
+    first, last = json.loads(lines[0]), json.loads(lines[-1])
+    assert (first["progress"], first["message"], first["count"]) == (0.5, "half", 2)
+    assert last["command"] == "probe"
+    assert last["status"] == "done"
+    assert last["error"] is None
+    assert last["warnings"] == ["careful"]
+    assert last["tet_count"] == 12
+    assert last["seconds"] >= 0
+
+
+@pytest.mark.parametrize(("failure", "code", "status"), [
+    (InputError("a", "b", "c"), 2, "failed"), (ConvergenceError("a"), 3, "failed"),
+    (SafetyStop("a"), 4, "failed"), (Cancelled(), 130, "cancelled"),
+    (KeyboardInterrupt(), 130, "cancelled"), (ZeroDivisionError("bug"), 3, "failed"),
+    (MemoryError(), 3, "failed"),
+])
+def test_exit_codes(failure, code, status, capfd):
+    """Each kind of failure ends with its exit code, and --json still ends with one object."""
+    def function(run, **_options):
+        """Probe."""
+        raise failure
+    got, lines = invoke(function, ["--json"], capfd)
+    assert got == code
+    assert json.loads(lines[-1])["status"] == status
+    assert json.loads(lines[-1])["error"]
+
+
+@pytest.mark.parametrize(("arguments", "wanted"), [
+    ([], Settings()),
+    (["--size", "2", "--deep", "--goal", "1", "2", "3", "--fractions", "0.5,0.9"],
+     Settings(size=2, deep=True, goal=(1, 2, 3), fractions=(0.5, 0.9))),
+])
+def test_settings_become_options(arguments, wanted, capfd):
+    """Every field is an option with its type; the function gets one checked settings object."""
+    seen = []
+
+    @cli.settings_options(Settings)
+    def function(run, settings, **_options):
+        """Probe."""
+        seen.append(settings)
+        return {}
+    code, _ = invoke(function, arguments, capfd)
+    assert code == 0
+    assert seen == [wanted]
+
+
+@pytest.mark.parametrize("arguments", [["--size=-1"], ["--size=nan"], ["--fractions", "0.1,x"]])
+def test_refused_setting_is_named(arguments, capfd):
+    """A value out of range is a usage error (2); the last JSON line names option and value."""
+    @cli.settings_options(Settings)
+    def function(run, settings, **_options):
+        """Probe."""
+        return {}
+    code, lines = invoke(function, [*arguments, "--json"], capfd)
+    assert code == 2
+    assert arguments[0].split("=")[0] in json.loads(lines[-1])["error"]
+
+
+def test_every_listed_command_exists():
+    """`limber --help` lists only commands whose module loads and has help."""
+    for name in cli.COMMANDS:
+        command = cli.main.get_command(click.Context(cli.main), name)
+        assert command is not None
+        assert command.help
+
+
+@pytest.mark.parametrize("arguments", [["nosuch"], ["reconstruct"], ["reconstruct", "--nosuch"]])
+def test_wrong_usage_is_exit_code_2(arguments):
+    """Unknown commands and options, and missing arguments, end with 2."""
+    assert cli.call(arguments) == 2
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    """`limber --help` does not load the numerical packages."""
+    program = ("import sys; sys.argv=['limber','--help']\n"
+               "from limber import cli; code = cli.call(['--help'])\n"
+               "assert code == 0\n"
+               "assert not {'scipy', 'numba', 'trimesh', 'matplotlib'} & set(sys.modules)")
+    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+@pytest.mark.parametrize("kind", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_ends_with_130(kind):
+    """Ctrl-C and SIGTERM end a running command with 130 and the cancelled status."""
+    program = ("import time\nfrom limber import cli\n"
+               "def function(run, **_):\n"
+               "    'Probe.'\n"
+               "    print('ready', flush=True); time.sleep(30)\n"
+               "cli._terminate_like_interrupt()\n"
+               "cli.stage_command('probe')(function).main(['--json'], standalone_mode=False)")
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True,
+                               stderr=subprocess.DEVNULL)
+    assert process.stdout.readline().strip() == "ready"
+    time.sleep(0.1)
+    process.send_signal(kind)
+    out, _ = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert json.loads(out.splitlines()[-1])["status"] == "cancelled"

@@ -1,0 +1,200 @@
+"""The branch folder: atomic stages, checksums, formats, and what must never cost earlier results."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.errors import BranchFolderError, InputError
+from limber.store import FORMAT_VERSION, Alignment, Branch, plain, write_atomically
+
+
+@pytest.fixture
+def branch(tmp_path: Path) -> Branch:
+    """A branch folder with one finished stage."""
+    branch = Branch.create(tmp_path / "apple.branch")
+    with branch.stage("first", {"size": 3}) as stage:
+        stage.path("data.txt").write_text("one")
+        stage.result["count"] = np.int64(1)
+    return branch
+
+
+def test_stage_enters_folder_and_manifest(branch: Branch):
+    """A finished stage's file, checksum, settings and result can be read back by another opener."""
+    again = Branch.open(branch.folder)
+    assert again.path("data.txt").read_text() == "one"
+    assert again.manifest.stages["first"].result == {"count": 1}
+    assert again.manifest.files["data.txt"].stage == "first"
+    assert again.name == "apple"
+    assert not list(branch.folder.glob(".first*"))
+
+
+@pytest.mark.parametrize("failure", [ValueError, KeyboardInterrupt, SystemExit])
+def test_failed_stage_leaves_everything_as_it_was(branch: Branch, failure: type[BaseException]):
+    """An error or Ctrl-C in the middle of a stage changes no file and leaves no litter."""
+    before = {p.name: p.read_bytes() for p in branch.folder.iterdir() if p.is_file()}
+    with pytest.raises(failure), branch.stage("first", {"size": 4}) as stage:
+        stage.path("data.txt").write_text("half")
+        raise failure
+    assert {p.name: p.read_bytes() for p in branch.folder.iterdir() if p.is_file()} == before
+    assert not [p for p in branch.folder.iterdir() if p.is_dir()]
+
+
+def test_is_current_follows_settings_inputs_and_files(branch: Branch):
+    """A stage is run again exactly when its settings, its inputs or its files have changed."""
+    with branch.stage("second", {"k": 1}, reads=["data.txt"], digests={"cloud": "abc"}) as stage:
+        stage.path("out.txt").write_text("two")
+    current = dict(reads=["data.txt"], digests={"cloud": "abc"})
+    assert branch.is_current("second", {"k": 1}, **current)
+    assert not branch.is_current("second", {"k": 2}, **current)
+    assert not branch.is_current("second", {"k": 1}, reads=["data.txt"], digests={"cloud": "x"})
+    with branch.stage("first", {"size": 5}) as stage:
+        stage.path("data.txt").write_text("changed")
+    assert not branch.is_current("second", {"k": 1}, **current)
+    branch.path("data.txt").write_text("by hand")
+    assert not branch.is_current("first", {"size": 5})
+
+
+def test_damaged_file_is_named(branch: Branch):
+    """Changed bytes of the same length are found by checksum; the message names file and stage."""
+    branch.path("data.txt").write_text("eno")
+    with pytest.raises(BranchFolderError, match=r"data\.txt \(other content\).*first"):
+        Branch.open(branch.folder)
+
+
+def test_missing_file_is_named(branch: Branch):
+    """A file that was deleted is reported as missing."""
+    branch.path("data.txt").unlink()
+    with pytest.raises(BranchFolderError, match=r"data\.txt \(missing\)"):
+        Branch.open(branch.folder)
+
+
+def test_newer_format_is_refused(branch: Branch):
+    """A folder of a newer format is refused with both versions and what to do."""
+    path = branch.folder / "branch.json"
+    content = json.loads(path.read_text()) | {"format_version": FORMAT_VERSION + 1}
+    path.write_text(json.dumps(content))
+    with pytest.raises(BranchFolderError, match=f"format {FORMAT_VERSION + 1}.*Update Limber"):
+        Branch.open(branch.folder)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"name": 3}', '{"format_version": 1}'])
+def test_damaged_manifest_is_refused(branch: Branch, text: str):
+    """A manifest that is empty, cut off or of another shape gives a clear error, not a trace."""
+    (branch.folder / "branch.json").write_text(text)
+    with pytest.raises(BranchFolderError, match="damaged"):
+        Branch.open(branch.folder)
+
+
+def test_foreign_folder_is_not_written_to(tmp_path: Path):
+    """A folder with other files is never taken for a branch folder."""
+    (tmp_path / "photo.jpg").write_bytes(b"x")
+    with pytest.raises(BranchFolderError, match="not a branch folder"):
+        Branch.create(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["photo.jpg"]
+
+
+def test_place_that_cannot_be_written(tmp_path: Path):
+    """An output path below a file is reported as such."""
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BranchFolderError, match="cannot be written"):
+        Branch.create(tmp_path / "file" / "x.branch")
+
+
+def test_no_such_folder(tmp_path: Path):
+    """Opening what is not there says how to make one."""
+    with pytest.raises(BranchFolderError, match="limber reconstruct"):
+        Branch.open(tmp_path / "nothing.branch")
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/x", "", "branch.json", "a\\b"])
+def test_names_stay_inside(branch: Branch, name: str):
+    """No file name leads out of the folder or onto the manifest."""
+    with pytest.raises(InputError):
+        branch.path(name)
+
+
+def test_removed_and_listed(branch: Branch):
+    """A stage can drop files of its earlier run; `names` lists what is below a folder."""
+    with branch.stage("pull:a") as stage:
+        stage.path("pulls/a/robot.csv").write_text("t")
+        stage.path("pulls/a/clouds/0.ply").write_text("t")
+    with branch.stage("pull:b") as stage:
+        stage.path("pulls/b/robot.csv").write_text("t")
+    assert branch.names("pulls") == ["a", "b"]
+    with branch.stage("pull:a") as stage:
+        stage.path("pulls/a/robot.csv").write_text("t")
+        stage.remove("pulls/a/clouds/0.ply")
+    assert not branch.path("pulls/a/clouds/0.ply").exists()
+    Branch.open(branch.folder)
+
+
+def test_two_openers_do_not_lose_each_others_stages(branch: Branch):
+    """A stage that began before another one ended still keeps the other's entry."""
+    other = Branch.open(branch.folder)
+    with branch.stage("second") as stage:
+        stage.path("b.txt").write_text("b")
+        with other.stage("third") as inner:
+            inner.path("c.txt").write_text("c")
+    again = Branch.open(branch.folder)
+    assert set(again.manifest.stages) == {"first", "second", "third"}
+
+
+def test_killed_in_the_last_move_is_finished_by_the_next_opener(tmp_path: Path):
+    """A process killed between the journal and the manifest leaves a folder that opens whole."""
+    program = (
+        "import os, sys\n"
+        "from limber import store\n"
+        "branch = store.Branch.create(sys.argv[1])\n"
+        "with branch.stage('a') as s: s.path('x.txt').write_text('old')\n"
+        "real, count = os.replace, [0]\n"
+        "def replace(a, b):\n"
+        "    count[0] += 1\n"
+        "    if count[0] == 3: os._exit(9)\n"
+        "    real(a, b)\n"
+        "store.os.replace = replace\n"
+        "with branch.stage('a', {'n': 2}) as s:\n"
+        "    s.path('x.txt').write_text('new'); s.path('y.txt').write_text('new')\n")
+    folder = tmp_path / "b.branch"
+    done = subprocess.run([sys.executable, "-c", program, str(folder)], check=False)
+    assert done.returncode == 9
+    assert (folder / ".commit").is_dir()
+    branch = Branch.open(folder)
+    assert branch.path("x.txt").read_text() == branch.path("y.txt").read_text() == "new"
+    assert branch.manifest.stages["a"].settings == {"n": 2}
+    assert not (folder / ".commit").exists()
+
+
+def test_write_atomically_keeps_the_old_file_on_failure(tmp_path: Path, monkeypatch):
+    """When the last step fails, the old content stays and no temporary file is left."""
+    path = tmp_path / "a.json"
+    write_atomically(path, "old")
+
+    def refuse(*_paths: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, "new")
+    monkeypatch.undo()
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_alignment_can_be_undone():
+    """Points far from the origin in millimetres come back to within a micrometre."""
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    alignment = Alignment(scale=1e-3, origin=(4.2e5, 5.3e6, 100.0), rotation=turn.tolist())
+    points = np.array([[4.2e8 + 1.25, 5.3e9 - 7.5, 1.0e5 + 3.0]])
+    assert np.abs(alignment.undo(alignment.apply(points)) - points).max() < 1e-3
+
+
+def test_plain_makes_json():
+    """numpy values, paths and models become JSON; what is not finite becomes null."""
+    value = {"a": np.float32(1.5), "b": np.arange(2), "c": (Path("x"), np.nan), "d": np.True_}
+    assert json.loads(json.dumps(plain(value))) == {
+        "a": 1.5, "b": [0, 1], "c": ["x", None], "d": True}
