@@ -1,4 +1,4 @@
-"""What every test shares: where the real recordings are, and results kept out of the user's cache."""
+"""What every test shares: the folder of the real recordings."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The branch folder: atomic stages, checksums, formats, and what must never cost earlier results."""
+"""The branch folder: atomic stages, checksums, formats, and what must never be lost."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def test_is_current_follows_settings_inputs_and_files(branch: Branch):
     """A stage is run again exactly when its settings, its inputs or its files have changed."""
     with branch.stage("second", {"k": 1}, reads=["data.txt"], digests={"cloud": "abc"}) as stage:
         stage.path("out.txt").write_text("two")
-    current = dict(reads=["data.txt"], digests={"cloud": "abc"})
+    current = {"reads": ["data.txt"], "digests": {"cloud": "abc"}}
     assert branch.is_current("second", {"k": 1}, **current)
     assert not branch.is_current("second", {"k": 2}, **current)
     assert not branch.is_current("second", {"k": 1}, reads=["data.txt"], digests={"cloud": "x"})
