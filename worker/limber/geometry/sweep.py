@@ -1,0 +1,82 @@
+"""Rotation-minimising frames and rings along a curve: what tubes and swept meshes are made of."""
+
+import numpy as np
+
+
+def tangents(points: np.ndarray) -> np.ndarray:
+    """Unit tangents of a polyline by central differences, shape [n, 3]."""
+    step = np.diff(points, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1), 1e-300)[:, None]
+    tangent = np.vstack([step[:1], step[:-1] + step[1:], step[-1:]])
+    return tangent / np.maximum(np.linalg.norm(tangent, axis=1), 1e-300)[:, None]
+
+
+def any_normal(direction: np.ndarray) -> np.ndarray:
+    """A unit vector orthogonal to ``direction`` [3]; the same for the same direction."""
+    axis = np.zeros(3)
+    axis[int(np.argmin(np.abs(direction)))] = 1.0
+    normal = np.cross(direction, axis)
+    return normal / np.linalg.norm(normal)
+
+
+def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = None,
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation-minimising frames by double reflection.
+
+    Wang, Jüttler, Zheng, Liu: Computation of Rotation Minimizing Frames, ACM TOG 27 (2008).
+
+    Args:
+        points: Polyline [m], shape [n, 3].
+        tangent: Unit tangents, shape [n, 3].
+        normal: First normal, shape [3]; made orthogonal to the first tangent. None: any.
+
+    Returns:
+        Normals and binormals, shape [n, 3] each.
+    """
+    normals = np.empty_like(points)
+    first = any_normal(tangent[0]) if normal is None else normal - tangent[0] * (
+        normal @ tangent[0])
+    normals[0] = first / np.linalg.norm(first)
+    for i in range(len(points) - 1):
+        across = points[i + 1] - points[i]
+        square = across @ across
+        reflected = normals[i] - (2 / square) * (across @ normals[i]) * across
+        turned = tangent[i] - (2 / square) * (across @ tangent[i]) * across
+        second = tangent[i + 1] - turned
+        size = second @ second
+        if size > 1e-30:
+            reflected = reflected - (2 / size) * (second @ reflected) * second
+        reflected = reflected - tangent[i + 1] * (reflected @ tangent[i + 1])
+        normals[i + 1] = reflected / np.linalg.norm(reflected)
+    return normals, np.cross(tangent, normals)
+
+
+def polygon_factor(sides: int) -> float:
+    """Circumradius of the regular polygon with the area of the unit circle.
+
+    An inscribed polygon would make a branch too thin: a hexagon has 17 % less area than its
+    circle. At equal area the hexagon's second moment is 0.8 % over the circle's.
+    """
+    return float(np.sqrt(np.pi / (sides / 2 * np.sin(2 * np.pi / sides))))
+
+
+def rings(centres: np.ndarray, radius: np.ndarray, normals: np.ndarray, binormals: np.ndarray,
+          sides: int) -> np.ndarray:
+    """Polygons of circle area around ``centres``, shape [n, sides, 3]."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    around = (np.cos(angle)[None, :, None] * normals[:, None]
+              + np.sin(angle)[None, :, None] * binormals[:, None])
+    return centres[:, None] + (radius * polygon_factor(sides))[:, None, None] * around
+
+
+def resample(points: np.ndarray, radius: np.ndarray, spacing: np.ndarray | float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Points and radii anew along a polyline, ``spacing`` (a number, or one a point) apart."""
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    wanted = np.broadcast_to(np.asarray(spacing, float), along.shape)
+    # Equal steps in the integral of 1/spacing follow a spacing that changes along the way.
+    density = np.concatenate([[0], np.cumsum(np.diff(along) * 2 / (wanted[1:] + wanted[:-1]))])
+    count = max(round(density[-1]), 1)
+    at = np.interp(np.linspace(0, density[-1], count + 1), density, along)
+    centres = np.stack([np.interp(at, along, points[:, k]) for k in range(3)], axis=1)
+    return centres, np.interp(at, along, radius)
