@@ -72,16 +72,20 @@ def main() -> None:
 
 
 class Run:
-    """What a command's function gets besides its options: progress and a place for warnings."""
+    """What a command's function gets besides its options.
 
-    def __init__(self, progress: Progress):
+    ``progress`` to report to, ``say`` to print a line on standard error, ``warn`` for warnings.
+    """
+
+    def __init__(self, progress: Progress, say: Callable[[str], None]):
         self.progress = progress
+        self.say = say
         self.warnings: list[str] = []
 
     def warn(self, message: str) -> None:
         """Tell the user something that does not stop the work; kept for the JSON result."""
         self.warnings.append(message)
-        click.echo(f"warning: {message}", err=True)
+        self.say(f"warning: {message}")
 
 
 def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
@@ -166,12 +170,12 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
         progress_style = "bar" if sys.stderr.isatty() else "none"
     outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
     result: dict[str, Any] = {}
-    state = Run(Progress())
+    state = Run(Progress(), functools.partial(click.echo, err=True))
     code = 0
     try:
         if progress_style == "bar":
             with BarSink(name) as bar:
-                state.progress = Progress(bar)
+                state.progress, state.say = Progress(bar), bar.say
                 result = function(state, **options)
         else:
             state.progress = Progress(JsonSink() if progress_style == "json" else None)

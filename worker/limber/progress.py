@@ -102,6 +102,10 @@ class BarSink:
         shown = " ".join(f"{name} {_short(value)}" for name, value in numbers.items())
         self._bar.update(self._task, completed=fraction, description=f"{message} {shown}".strip())
 
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        self._bar.console.print(line, markup=False, highlight=False)
+
 
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,130 @@
+"""``limber demo``: every stage on one branch, as processes, with progress and a closing table."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli import Run, stage_command
+from limber.errors import InputError
+from limber.jobs.process import run_stage
+
+# Young's modulus [Pa] at the control points for the simulated pull on a scan that comes without
+# a recording: the mature branch of the paper's table.
+DEMO_YOUNG = (2.61e7, 0.913e7, 0.758e7, 0.104e7)
+
+# Share of the whole time by which each stage ends, for the bar; measured once, need not be exact.
+_ENDS = {"generate": 0.01, "reconstruct": 0.15, "virtual-pull": 0.3, "estimate": 0.5,
+         "simulate": 0.55, "energy": 0.8, "plan": 0.92, "scene": 0.97, "report": 1.0}
+
+
+@dataclass
+class _Demo:
+    """A demo in progress: its folder and what its stages returned, by command."""
+
+    folder: Path
+    run: Run
+    results: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    done: float = 0.0
+
+    def stage(self, title: str, *arguments: object) -> None:
+        """Run one stage as a process; show its progress and its time; keep its result."""
+        name = str(arguments[0])
+        started = time.perf_counter()
+        progress = self.run.progress.part(self.done, _ENDS[name])
+        progress(0.0, title)
+        result = run_stage([str(a) for a in arguments], progress)
+        self.done = _ENDS[name]
+        self.seconds[name] = round(time.perf_counter() - started, 1)
+        self.results[name] = result
+        self.run.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
+        for warning in result.get("warnings", []):
+            self.run.warn(f"{name}: {warning}")
+
+
+@stage_command("demo")
+@click.argument("cloud", required=False, type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="Folder of the results.  [default: out/NAME]")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the cloud.")
+@click.option("--seed", type=int, default=1, show_default=True,
+              help="Of the generated branch, the sensor noise and the planner.")
+def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None,
+            seed: int) -> dict[str, Any]:
+    """The whole pipeline on one branch: a generated one with known truth, or your CLOUD."""
+    if cloud is not None and not cloud.is_file():
+        raise InputError(f"There is no file {cloud}.", "The demo wants the scan of one branch.",
+                         "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
+    name = cloud.stem if cloud else "generated"
+    demo = _Demo(output or Path("out") / name, run)
+    _make_folder(demo.folder)
+    started = time.perf_counter()
+    run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
+    branch = _run_stages(demo, cloud, name, unit, seed)
+    _show_tables(demo)
+    summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}
+    run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\n"
+            f"picture {summary['picture']}\n{summary['demo_seconds']:.0f} s in all")
+    return summary
+
+
+def _run_stages(demo: _Demo, cloud: Path | None, name: str, unit: str | None, seed: int) -> Path:
+    branch = demo.folder / f"{name}.branch"
+    truth: list[str] = []
+    if cloud is None:
+        source = demo.folder / "scan"
+        demo.stage("a generated branch, scanned", "generate", source, "--seed", seed)
+        cloud = source / "cloud.ply"
+    else:
+        truth = ["--young", ",".join(f"{value:g}" for value in DEMO_YOUNG)]
+    units = ["--unit", unit] if unit else []
+    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *units)
+    demo.stage("a simulated pull, with sensor noise", "virtual-pull", branch,
+               "--name", "pull-1", "--seed", seed, *truth)
+    demo.stage("Young's modulus from the pull", "estimate", branch)
+    demo.stage("a pull with the estimated modulus", "simulate", branch)
+    demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
+    demo.stage("RRT* and D-RRT* paths", "plan", branch, "--name", "to-goal", "--seed", seed)
+    picture = demo.folder / "scene.png"
+    demo.stage("a Blender scene and its picture", "scene", branch,
+               "-o", demo.folder / "scene.blend", "--render", picture)
+    demo.stage("the report", "report", branch, "--picture", picture)
+    return branch
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder} cannot be made ({error.strerror}).", "Results go there.",
+                         "Choose another folder with -o.") from error
+
+
+def _show_tables(demo: _Demo) -> None:
+    from limber.report.tables import comparison_rows, modulus_rows
+
+    _show("Young's modulus", modulus_rows(demo.results["estimate"], demo.results["virtual-pull"]),
+          demo.run)
+    _show("Paths", comparison_rows(demo.results["plan"]), demo.run)
+
+
+def _show(title: str, rows: list[list[str]], run: Run) -> None:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    run.say(f"\n{title}")
+    for row in rows:
+        run.say("  " + "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths,
+                                                                          strict=True)))
+
+
+def _summary(demo: _Demo, branch: Path) -> dict[str, Any]:
+    return {
+        "branch": branch, "report": branch / "report.html",
+        "scene": demo.folder / "scene.blend", "picture": demo.folder / "scene.png",
+        "stage_seconds": demo.seconds,
+        "young_pa": demo.results["estimate"]["young_pa"],
+        "energy_saved_percent": demo.results["plan"]["energy_saved_percent"],
+        "length_added_percent": demo.results["plan"]["length_added_percent"],
+    }

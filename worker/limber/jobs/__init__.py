@@ -1,0 +1,1 @@
+"""Running stages as processes of their own: what the demo, the batch and the add-on share."""

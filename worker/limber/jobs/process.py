@@ -1,0 +1,79 @@
+"""One stage as a process: its progress relayed, its result returned, cancelled with its parent."""
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from typing import Any, TextIO
+
+from limber.errors import Cancelled, InputError, LimberError, SafetyStop, WorkError
+from limber.progress import SILENT, Progress
+
+_ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop, 130: Cancelled}
+_GRACE_SECONDS = 10.0
+
+
+def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str, Any]:
+    """Run ``limber ARGUMENTS`` in a process of its own and return its JSON result.
+
+    Memory and native crashes stay in that process. A cancel of ``progress``, or Ctrl-C, ends it.
+
+    Raises:
+        LimberError: the stage's own error, by its exit code; :class:`WorkError` if it crashed.
+    """
+    command = [sys.executable, "-m", "limber", *map(str, arguments),
+               "--json", "--progress", "json"]
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True,
+                                   encoding="utf-8", errors="replace")
+        try:
+            result = _read_lines(process, progress)
+            process.wait()
+        except BaseException:
+            _stop(process)
+            raise
+        if process.returncode != 0:
+            raise _failure(arguments, process.returncode, result, errors)
+    return result
+
+
+def _read_lines(process: subprocess.Popen, progress: Progress) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for line in process.stdout or ():
+        try:
+            content = json.loads(line)
+        except json.JSONDecodeError:
+            # Native libraries (fTetWild, Blender) print lines of their own.
+            continue
+        if not isinstance(content, dict):
+            continue
+        if "progress" in content:
+            fraction = content.pop("progress")
+            message = content.pop("message", "")
+            content.pop("seconds", None)
+            progress(fraction, message, **content)
+        elif "status" in content:
+            result = content
+    return result
+
+
+def _stop(process: subprocess.Popen) -> None:
+    process.terminate()
+    try:
+        process.wait(_GRACE_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _failure(arguments: Sequence[str], code: int, result: dict[str, Any],
+             errors: TextIO) -> LimberError:
+    stage = arguments[0]
+    if result.get("error"):
+        return _ERRORS.get(code, WorkError)(f"{stage}: {result['error']}")
+    errors.seek(0)
+    tail = " | ".join(errors.read().strip().splitlines()[-4:])
+    return _ERRORS.get(code, WorkError)(
+        f"limber {stage} ended with exit code {code} and no result.", tail,
+        f"Run it alone to see more: limber {' '.join(map(str, arguments))}")

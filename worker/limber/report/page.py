@@ -1,0 +1,270 @@
+"""``report.html``: what was done to a branch, told in figures and tables, in one file."""
+
+import base64
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.progress import SILENT, Progress
+from limber.report import figures
+from limber.report.tables import comparison_rows, modulus_rows
+from limber.store import Branch
+from limber.version import VERSION
+
+
+@dataclass
+class Section:
+    """One part of the page; ``missing`` tells which command would fill it."""
+
+    title: str
+    text: list[str] = field(default_factory=list)
+    pictures: list[tuple[str, str]] = field(default_factory=list)
+    tables: list[tuple[str, list[list[str]]]] = field(default_factory=list)
+    missing: str = ""
+
+    def draw(self, figure: Any, caption: str) -> None:
+        """Add a matplotlib figure, as a PNG inside the page."""
+        self.pictures.append((_inline_png(_png(figure)), caption))
+
+
+def write_report(folder: Path, *, picture: Path | None = None, progress: Progress = SILENT,
+                 ) -> dict[str, Any]:
+    """Write ``report.html`` into a branch folder from whatever stages have been run.
+
+    Args:
+        folder: The branch folder.
+        picture: A render of the scene to put at the top, PNG.
+
+    Returns:
+        ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``.
+    """
+    branch = Branch.open(folder)
+    page = [_summary(branch, picture)]
+    builders: list[Callable[[Branch], Section]] = [_scan, _mesh, *_pulls(branch), _estimate,
+                                                   _energy, *_plans(branch), _provenance]
+    for number, build in enumerate(builders):
+        progress(number / len(builders), "drawing")
+        page.append(build(branch))
+    html = _render(branch, page)
+    with branch.stage("report", {"picture": bool(picture)}) as stage:
+        stage.path("report.html").write_text(html, encoding="utf-8")
+        stage.result.update(
+            figure_count=sum(len(section.pictures) for section in page),
+            sections=[section.title for section in page if not section.missing],
+            missing=[section.title for section in page if section.missing])
+    progress(1.0, "written")
+    return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
+
+
+def _summary(branch: Branch, picture: Path | None) -> Section:
+    section = Section("Summary")
+    if picture is not None:
+        section.pictures.append((_inline_png(_read_png(picture)), "The scene, rendered."))
+    result = _reconstruction(branch)
+    rows = [["what", "value"]]
+    source = branch.manifest.source
+    rows += [[key.replace("_", " "), str(value)] for key, value in source.items()
+             if isinstance(value, str | int | float)]
+    for key, label, form in [
+            ("point_count", "points used", "{:,.0f}"), ("branch_count", "branches", "{:.0f}"),
+            ("length_m", "centreline, all branches [m]", "{:.3f}"),
+            ("radius_min_m", "smallest radius [m]", "{:.5f}"),
+            ("radius_max_m", "largest radius [m]", "{:.5f}"),
+            ("tet_count", "tetrahedra", "{:,.0f}")]:
+        if result.get(key) is not None:
+            rows.append([label, form.format(result[key])])
+    section.tables.append(("", rows))
+    return section
+
+
+def _scan(branch: Branch) -> Section:
+    section = Section("Scan and skeleton")
+    if not (branch.has("cloud.ply") and branch.has("skeleton.swc")):
+        section.missing = "limber reconstruct CLOUD -o NAME.branch"
+        return section
+    section.draw(figures.scan_and_skeleton(branch),
+                 "The aligned cloud (grey) with the centreline tree, one colour an order, and the "
+                 "control points (rings); from the front and from the side.")
+    section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
+                                        "it is known, one colour an order.")
+    result = _reconstruction(branch)
+    if result.get("clamped_radius_count"):
+        section.text.append(f"{result['clamped_radius_count']} radii were clamped to the cloud's "
+                            "scale.")
+    return section
+
+
+def _mesh(branch: Branch) -> Section:
+    section = Section("Mesh")
+    if not branch.has("mesh.vtu"):
+        section.missing = "limber reconstruct or limber mesh"
+        return section
+    section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
+                                                  "modulus; base in black, grasp patch in red.")
+    result = _reconstruction(branch)
+    quality = {key: value for key, value in (result.get("quality") or {}).items()
+               if isinstance(value, int | float)}
+    rows = [["what", "value"]]
+    for key in ("surface_volume_m3", "mesh_volume_m3"):
+        if result.get(key) is not None:
+            rows.append([key.replace("_m3", " [m3]").replace("_", " "), f"{result[key]:.4g}"])
+    rows += [[key.replace("_", " "), f"{value:.4g}"] for key, value in quality.items()]
+    if len(rows) > 1:
+        section.tables.append(("", rows))
+    return section
+
+
+def _pulls(branch: Branch) -> list[Callable[[Branch], Section]]:
+    names = branch.names("pulls")
+    if not names:
+        return [lambda _branch: Section("Pulls", missing="limber import-pull or virtual-pull")]
+    return [lambda opened, name=name: _pull(opened, name) for name in names]
+
+
+def _pull(branch: Branch, name: str) -> Section:
+    from limber.estimation.recording import read_pull
+
+    section = Section(f"Pull {name}")
+    pull = read_pull(branch.path(f"pulls/{name}"))
+    if _is_virtual(branch, name):
+        section.text.append(
+            "This pull was simulated, with a known Young's modulus and sensor noise, on another "
+            "and finer mesh: there is no robot recording of this branch.")
+    section.draw(figures.pull(pull), "Force on the branch and displacement of the grasp over time.")
+    return section
+
+
+def _estimate(branch: Branch) -> Section:
+    section = Section("Young's modulus along the branch")
+    if not branch.has("estimate.json"):
+        section.missing = "limber estimate NAME.branch"
+        return section
+    from limber.estimation import figures as estimation_figures
+
+    estimate = json.loads(branch.path("estimate.json").read_text(encoding="utf-8"))
+    virtual = _virtual_result(branch)
+    section.tables.append(("Estimated against true" if virtual else "Estimated",
+                           modulus_rows(estimate, virtual)))
+    section.text.append(
+        f"Method: {estimate['method']}; {estimate['forward_count']} forward simulations; "
+        f"loss {estimate['loss_m2']:.3g} m²; "
+        f"{'converged' if estimate['converged'] else 'NOT converged'}.")
+    for figure, caption in estimation_figures.report_figures(branch, estimate):
+        section.draw(figure, caption)
+    section.text += estimate.get("warnings", [])
+    return section
+
+
+def _energy(branch: Branch) -> Section:
+    section = Section("Energy over grasp poses")
+    if not branch.has("energy.npz"):
+        section.missing = "limber energy NAME.branch"
+        return section
+    with np.load(branch.path("energy.npz"), allow_pickle=False) as data:
+        section.draw(figures.energy_samples(data), "Strain energy of the sampled grasp poses "
+                                                   "against the distance from rest, and the force.")
+        error = {key: float(data[key]) for key in ("energy_error", "force_error") if key in data}
+    result = branch.manifest.stages["energy"].result
+    section.text.append(
+        f"{result['sample_count']} poses solved, {result['rejected_count']} rejected. Held-out "
+        f"error of the radial basis functions: energy {100 * error.get('energy_error', 0):.2g} %, "
+        f"force {100 * error.get('force_error', 0):.2g} %.")
+    return section
+
+
+def _plans(branch: Branch) -> list[Callable[[Branch], Section]]:
+    names = sorted(key.split(":", 1)[1] for key in branch.manifest.stages
+                   if key.startswith("plan:"))
+    if not names:
+        return [lambda _branch: Section("Paths", missing="limber plan NAME.branch")]
+    return [lambda opened, name=name: _plan(opened, name) for name in names]
+
+
+def _plan(branch: Branch, name: str) -> Section:
+    from limber.planning import figures as planning_figures
+
+    section = Section(f"Paths: {name}")
+    plan = json.loads(branch.path(f"plans/{name}.json").read_text(encoding="utf-8"))
+    section.tables.append(("RRT* (length alone) against D-RRT* (deformation-aware), both scored "
+                           "on the full model", comparison_rows(plan)))
+    section.text.append(
+        f"D-RRT* saves {plan['energy_saved_percent']:.1f} % of the energy along the path for "
+        f"{plan['length_added_percent']:+.1f} % of length. Seed {plan['seed']}.")
+    for figure, caption in planning_figures.report_figures(branch, name):
+        section.draw(figure, caption)
+    return section
+
+
+def _provenance(branch: Branch) -> Section:
+    section = Section("How it was made")
+    rows = [["stage", "seconds", "finished", "settings"]]
+    programs: dict[str, str] = {}
+    for key, entry in branch.manifest.stages.items():
+        shown = ", ".join(f"{name} {value}" for name, value in entry.settings.items()
+                          if isinstance(value, str | int | float))
+        rows.append([key, f"{entry.seconds:.1f}", entry.finished, shown])
+        programs |= entry.programs
+    section.tables.append(("Stages", rows))
+    section.tables.append(("Programs", [["program", "version"],
+                                        *([name, v] for name, v in sorted(programs.items()))]))
+    return section
+
+
+def _reconstruction(branch: Branch) -> dict[str, Any]:
+    for key in ("reconstruct", "mesh"):
+        if key in branch.manifest.stages:
+            return branch.manifest.stages[key].result
+    return {}
+
+
+def _is_virtual(branch: Branch, name: str) -> bool:
+    entry = branch.manifest.stages.get(f"pull:{name}")
+    return entry is not None and entry.result.get("young_true_pa") is not None
+
+
+def _virtual_result(branch: Branch) -> dict[str, Any] | None:
+    names = [name for name in branch.names("pulls") if _is_virtual(branch, name)]
+    return branch.manifest.stages[f"pull:{names[0]}"].result if names else None
+
+
+def _read_png(path: Path) -> bytes:
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).", "It was to open the report.",
+                         "Leave out --picture, or name the PNG of `limber scene`.") from error
+    if not data.startswith(b"\x89PNG"):
+        raise InputError(f"{path} is not a PNG file.", "The page shows PNG.", "Name a PNG.")
+    return data
+
+
+def _png(figure: Any) -> bytes:
+    import matplotlib.pyplot as plt
+
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=130, bbox_inches="tight")
+    plt.close(figure)
+    return stream.getvalue()
+
+
+def _inline_png(data: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
+
+
+def _render(branch: Branch, page: list[Section]) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("limber.report", "."), autoescape=True,
+        undefined=jinja2.StrictUndefined)
+    made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return environment.get_template("page.html").render(
+        name=escape(branch.name), sections=page, made=made, version=VERSION)
