@@ -44,6 +44,15 @@ COMMANDS = {
 }
 
 
+# Designed, not built: named so that nobody looks for them in vain.
+NOT_YET = {
+    "record": "record a pull with a robot (bring one with `limber import-pull`)",
+    "execute": "follow a path with a robot (paths are in plans/NAME.csv)",
+    "virtual-robot": "a UR controller in software",
+    "batch": "many jobs, on this machine or a cluster (`limber reconstruct` takes a folder)",
+}
+
+
 class _Commands(click.Group):
     """Loads each command's module only when that command is asked for."""
 
@@ -51,6 +60,8 @@ class _Commands(click.Group):
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name in NOT_YET:
+            raise click.UsageError(f"`limber {name}` is not there yet: {NOT_YET[name]}.")
         if name not in COMMANDS:
             return None
         module = importlib.import_module(f"limber.commands.{name.replace('-', '_')}")
@@ -59,6 +70,8 @@ class _Commands(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
+        with formatter.section("Not there yet"):
+            formatter.write_dl(list(NOT_YET.items()))
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
