@@ -128,16 +128,17 @@ class TetMesh:
 
     @classmethod
     def read(cls, path: Path) -> "TetMesh":
-        """Read tetrahedra from a VTU file (any format that meshio knows).
+        """Read tetrahedra from a VTU file.
 
         Raises:
             InputError: the file has no tetrahedra or cannot be read.
         """
-        import meshio
+        # Not meshio.read: it prints and calls sys.exit where a file is damaged.
+        from meshio import ReadError, vtu
 
         try:
-            mesh = meshio.read(path)
-        except (meshio.ReadError, OSError, ValueError, SyntaxError) as error:
+            mesh = vtu.read(path)
+        except (ReadError, OSError, ValueError, SyntaxError, KeyError) as error:
             raise InputError(f"{path} cannot be read as a mesh ({error}).",
                              "A VTU file with tetrahedra was expected.",
                              "Check the file, or make it anew.") from error
