@@ -1,0 +1,1 @@
+"""From pulls to Young's modulus along the branch: recordings, estimators, uncertainty."""

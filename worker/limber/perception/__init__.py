@@ -1,0 +1,1 @@
+"""From what a camera saw to control points over time."""

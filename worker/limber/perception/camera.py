@@ -1,0 +1,149 @@
+"""A pinhole depth camera: its file, and the way between pixels and points.
+
+Camera axes: x right, y down, z forward, as OpenCV and TUM's RGB-D data have them.
+"""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError
+
+
+class Camera(BaseModel):
+    """Content of ``camera.toml``.
+
+    ``pose`` takes camera coordinates to the branch's: position [m] and rotation vector [rad].
+    A pixel's depth in metres is its value divided by ``depth_scale`` (5000 in TUM's data, 1000
+    for millimetres). The noise of a stereo camera's depth is ``disparity_sigma_px z^2 / (fx b)``.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: float = Field(gt=0)
+    fy: float = Field(gt=0)
+    cx: float
+    cy: float
+    depth_scale: float = Field(1000.0, gt=0)
+    baseline_m: float = Field(0.095, gt=0)
+    disparity_sigma_px: float = Field(0.08, gt=0)
+    pose: tuple[float, float, float, float, float, float] = (0.0,) * 6
+
+    @property
+    def rotation(self) -> np.ndarray:
+        return Rotation.from_rotvec(self.pose[3:]).as_matrix()
+
+    @property
+    def origin(self) -> np.ndarray:
+        return np.array(self.pose[:3])
+
+    def to_branch(self, points: np.ndarray) -> np.ndarray:
+        """Take points [m] from camera to branch coordinates, shape [n, 3]."""
+        return points @ self.rotation.T + self.origin
+
+    def to_camera(self, points: np.ndarray) -> np.ndarray:
+        """Take points [m] from branch to camera coordinates, shape [n, 3]."""
+        return (points - self.origin) @ self.rotation
+
+    def depth_sigma(self, depth: np.ndarray) -> np.ndarray:
+        """Standard deviation [m] of a depth reading at ``depth`` [m]."""
+        return self.disparity_sigma_px * depth**2 / (self.fx * self.baseline_m)
+
+    def looking(self, *, eye: np.ndarray, target: np.ndarray,
+                up: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> "Camera":
+        """Return the camera at ``eye`` [m] with ``target`` [m] in the middle of its view."""
+        forward = np.asarray(target, float) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, up)
+        right /= np.linalg.norm(right)
+        turn = np.column_stack([right, np.cross(forward, right), forward])
+        pose = (*map(float, eye), *Rotation.from_matrix(turn).as_rotvec())
+        return self.model_copy(update={"pose": pose})
+
+
+D455 = Camera(width=1280, height=720, fx=640.0, fy=640.0, cx=639.5, cy=359.5)
+"""Intel RealSense D455 at its full depth resolution (87 degrees wide, 95 mm baseline)."""
+
+
+@dataclass(frozen=True)
+class SeenCloud:
+    """Points of one frame.
+
+    Attributes:
+        points: [m] in the branch's frame, shape [n, 3].
+        sigma: Standard deviation of each along its line of sight [m], shape [n].
+        view: Unit vectors from the camera to each point, branch frame, shape [n, 3].
+    """
+
+    points: np.ndarray
+    sigma: np.ndarray
+    view: np.ndarray
+
+
+def depth_to_cloud(camera: Camera, depth: np.ndarray, mask: np.ndarray | None = None) -> SeenCloud:
+    """Back-project the pixels of a mask.
+
+    Args:
+        camera: Intrinsics and pose.
+        depth: Distance along the camera's axis [m], shape [height, width]; 0 or NaN: no reading.
+        mask: True on the branch, shape [height, width]; None takes every reading.
+
+    Raises:
+        InputError: the images are not of the camera's size.
+    """
+    for name, image in (("depth image", depth), ("mask", mask)):
+        if image is not None and image.shape != (camera.height, camera.width):
+            raise InputError(
+                f"The {name} has {image.shape[1]}x{image.shape[0]} pixels, the camera "
+                f"{camera.width}x{camera.height}.", "They must belong together.",
+                "Use the intrinsics of this image, not those of the colour camera.")
+    chosen = np.isfinite(depth) & (depth > 0)
+    if mask is not None:
+        chosen &= mask
+    row, column = np.nonzero(chosen)
+    z = depth[row, column].astype(float)
+    ray = np.column_stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy,
+                           np.ones(len(z))])
+    length = np.linalg.norm(ray, axis=1)
+    points = camera.to_branch(ray * z[:, None])
+    view = (ray / length[:, None]) @ camera.rotation.T
+    return SeenCloud(points, camera.depth_sigma(z) * length, view)
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixel coordinates (column, row), shape [n, 2], and depths [m], shape [n]."""
+    seen = camera.to_camera(points)
+    depth = seen[:, 2]
+    pixels = seen[:, :2] / depth[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return pixels, depth
+
+
+def read_camera(path: Path) -> Camera:
+    """Read ``camera.toml``.
+
+    Raises:
+        InputError: missing, or an entry makes no sense (named).
+    """
+    try:
+        return Camera.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}).",
+                         "Depth images mean nothing without the camera's intrinsics.",
+                         "Write width, height, fx, fy, cx, cy, depth_scale and pose.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}.",
+                         "The camera cannot be used.", "Correct the entry.") from error
+
+
+def write_camera(path: Path, camera: Camera) -> None:
+    """Write ``camera.toml``."""
+    import tomlkit
+
+    Path(path).write_text(tomlkit.dumps(camera.model_dump(mode="json")), encoding="utf-8")

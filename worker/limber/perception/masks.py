@@ -1,0 +1,111 @@
+"""Which pixels show the branch: from a file, from depth alone, or from a YOLO model of the user's.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from limber.errors import InputError, MissingDependencyError, WorkError
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask image; nonzero is branch. Returns shape [height, width] of bool."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("L") if image.mode not in ("I", "I;16") else image)
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"{path} cannot be read as an image ({error}).", "A mask was expected.",
+                         "Check the file.") from error
+    return pixels > 0
+
+
+def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
+                     background: np.ndarray | None = None, difference: float = 0.02,
+                     smallest_share: float = 0.05) -> np.ndarray:
+    """Find the branch without a model: what stands out of the background, in large pieces.
+
+    Args:
+        depth: [m], shape [height, width]; 0 or NaN: no reading.
+        near: Nothing nearer [m].
+        far: Nothing farther [m].
+        background: Depth without the branch [m]; pixels nearer by ``difference`` are foreground.
+        difference: [m].
+        smallest_share: Pieces smaller than this share of the largest are dropped: flying pixels.
+            Not only the largest stays, since a hand or a leaf may cut a branch in two.
+
+    Returns:
+        True on the branch, shape [height, width]; all False where nothing is in range.
+    """
+    valid = np.isfinite(depth) & (depth > near) & (depth < far)
+    if background is not None:
+        if background.shape != depth.shape:
+            raise InputError(f"The background has {background.shape}, the depth {depth.shape}.",
+                             "They must be of one camera.", "Record the background again.")
+        known = np.isfinite(background) & (background > 0)
+        valid &= ~known | (depth < background - difference)
+    labels, count = ndimage.label(valid, structure=np.ones((3, 3)))
+    if not count:
+        return valid
+    sizes = np.bincount(labels.ravel())[1:]
+    return np.isin(labels, 1 + np.flatnonzero(sizes >= smallest_share * sizes.max()))
+
+
+class YoloSegmenter:
+    """A YOLO segmentation model from a weights file on this computer, through ``ultralytics``.
+
+    With ``prompt`` the model must be an open-vocabulary one (YOLO-World, YOLOE); the paper asked
+    its YOLO for "potted plant". Without, ``class_name`` picks one of the model's own classes.
+    """
+
+    def __init__(self, weights: Path, *, prompt: str | None = None, class_name: str | None = None,
+                 confidence: float = 0.25):
+        weights = Path(weights)
+        if not weights.is_file():
+            raise InputError(f"There is no weights file {weights}.",
+                             "Limber downloads no model by itself.",
+                             "Give the path of a YOLO segmentation model of your own.")
+        try:
+            from ultralytics import YOLO
+        except ImportError as error:
+            raise MissingDependencyError(
+                "The package ultralytics is not installed.", "It runs YOLO models.",
+                "Install it (pip install ultralytics), or use masks from files or the built-in "
+                "segmenter.") from error
+        self._model = YOLO(str(weights))
+        self._confidence = confidence
+        self._classes = self._chosen_classes(prompt, class_name)
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Return the union of the masks found in an image [height, width, 3], as bool."""
+        found = self._model.predict(image[..., ::-1], conf=self._confidence, verbose=False,
+                                    retina_masks=True, classes=self._classes)[0]
+        if found.masks is None:
+            return np.zeros(image.shape[:2], bool)
+        data = found.masks.data
+        masks = data.cpu().numpy() if hasattr(data, "cpu") else np.asarray(data)
+        joined = (masks > 0.5).any(axis=0)
+        if joined.shape != image.shape[:2]:
+            raise WorkError(f"YOLO's masks have {joined.shape}, the image {image.shape[:2]}.",
+                            "Masks at the image's size were asked for.", "Update ultralytics.")
+        return joined
+
+    def _chosen_classes(self, prompt: str | None, class_name: str | None) -> list[int] | None:
+        model: Any = self._model
+        if prompt is not None:
+            if not hasattr(model, "set_classes"):
+                raise InputError("This YOLO model takes no text prompt.",
+                                 "Its classes are fixed.", "Name one of them, or use YOLOE.")
+            model.set_classes([prompt])
+            return None
+        if class_name is None:
+            return None
+        numbers = [number for number, name in dict(model.names).items() if name == class_name]
+        if not numbers:
+            raise InputError(f"The model has no class {class_name!r}.",
+                             f"It has {', '.join(map(str, dict(model.names).values()))}.",
+                             "Name one of these.")
+        return numbers

@@ -1,0 +1,253 @@
+"""Control points followed through partial, noisy, one-sided clouds.
+
+A curve of fixed length (:mod:`limber.perception.curve`) is fitted to each cloud, starting from
+the frame before. A cloud's point says two things about the curve beside it: along the line of
+sight the visible side of a round branch lies sqrt(r^2 - l^2) in front of the axis, l being how
+far beside the axis the line passes; and, over many points, l is zero in the mean. Both hold
+under depth noise larger than the branch, where a distance to the axis would be biased.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from limber.geometry.skeleton import Skeleton
+from limber.perception.camera import SeenCloud
+from limber.perception.curve import BentCurve, RestCurve
+
+BEND_SIGMA = 0.6
+"""Prior standard deviation of the turn between two knots [rad]."""
+SMOOTH_SIGMA = 0.2
+"""Prior standard deviation of the change of that turn from knot to knot [rad]."""
+MODEL_SIGMA_M = 2e-4
+"""How well a tube of the skeleton's radii stands for the branch [m]; added to the covariance."""
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Control points in one frame.
+
+    Attributes:
+        positions: On the branch's axis [m], shape [K, 3].
+        covariance: [m^2], shape [K, 3, 3].
+        visible: Whether the cloud shows the branch around each point, shape [K].
+        inlier_share: Share of the cloud's points that the curve explains.
+        curve: The fitted curve; the start for the next frame.
+    """
+
+    positions: np.ndarray
+    covariance: np.ndarray
+    visible: np.ndarray
+    inlier_share: float
+    curve: BentCurve
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """A material point whose place is known: where the gripper holds.
+
+    Attributes:
+        arc: Arc length of the curve's point nearest to the grasp [m].
+        position: Where that point is now [m], shape [3].
+        sigma: Standard deviation [m].
+    """
+
+    arc: float
+    position: np.ndarray
+    sigma: float = 1.5e-3
+
+
+class CurveTracker:
+    """Follows the control points of one branch; frames must come in the order of time."""
+
+    def __init__(self, skeleton: Skeleton, fractions: tuple[float, ...], *,
+                 point_limit: int = 2500, seed: int = 0):
+        self.rest = RestCurve.of(skeleton)
+        self.arcs = np.array(fractions) * self.rest.length
+        self._point_limit = point_limit
+        self._rng = np.random.default_rng(seed)
+
+    def track(self, cloud: SeenCloud, before: BentCurve | None = None,
+              anchor: Anchor | None = None) -> TrackedFrame:
+        """Fit the curve to a cloud, starting from the frame ``before`` (None: rest).
+
+        A cloud of under 10 points leaves the curve where it was, nothing visible.
+        """
+        curve = before or self.rest.start()
+        cloud = self.thinned(cloud)
+        if anchor is not None:
+            curve = _settle(curve, anchor)
+        if len(cloud.points) < 10:
+            return self._result(curve, _prior(curve)[0], np.empty(0), 0.0)
+        normal, arcs = _prior(curve)[0], np.empty(0)
+        for reach in (0.12, 0.06, 0.03, *([0.0] * 9)):
+            normal, gradient, arcs = _equations(curve, cloud, reach * self.rest.length, anchor)
+            step = -np.linalg.solve(normal, gradient).reshape(-1, 3)
+            step *= min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
+            curve = curve.turned(step)
+            if reach == 0.0 and np.abs(step).max() < 1e-5:
+                break
+        share = len(arcs) / len(cloud.points)
+        return self._result(curve, normal, arcs, share)
+
+    def arc_near(self, point: np.ndarray) -> float:
+        """Return the arc length [m] of the point at rest that is nearest to ``point``."""
+        return float(self.rest.arc[np.argmin(np.linalg.norm(self.rest.nodes - point, axis=1))])
+
+    def _result(self, curve: BentCurve, normal: np.ndarray, arcs: np.ndarray, share: float,
+                ) -> TrackedFrame:
+        jacobian = _interpolated(curve, self.arcs).reshape(len(self.arcs), 3, -1)
+        spread = np.linalg.inv(normal)
+        covariance = np.einsum("kia,ab,kjb->kij", jacobian, spread, jacobian)
+        covariance += MODEL_SIGMA_M**2 * np.eye(3)
+        window = self.rest.length / 16
+        support = np.array([np.sum(np.abs(arcs - arc) < window) for arc in self.arcs])
+        return TrackedFrame(curve.at(self.arcs), covariance, support >= 5, share, curve)
+
+    def thinned(self, cloud: SeenCloud) -> SeenCloud:
+        """Return a random choice of a cloud's points, where it has more than needed."""
+        count = len(cloud.points)
+        if count <= self._point_limit:
+            return cloud
+        kept = np.sort(self._rng.choice(count, self._point_limit, replace=False))
+        return SeenCloud(cloud.points[kept], cloud.sigma[kept], cloud.view[kept])
+
+
+def visible_surface_points(cloud: SeenCloud, control_points: np.ndarray) -> np.ndarray:
+    """Return the cloud's point nearest to each control point [m], shape [K, 3].
+
+    The paper's choice of control points on the real plant, at rest (section Branch Parameter
+    Estimation); such a point lies about a radius in front of the axis.
+    """
+    return cloud.points[cKDTree(cloud.points).query(control_points)[1]]
+
+
+def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Find how a cloud of the branch at rest lies against its skeleton: the camera pose's error.
+
+    Returns:
+        Rotation matrix [3, 3] and translation [m], shape [3], that take the cloud onto the
+        branch. A turn about a straight branch's own axis cannot be seen and stays zero.
+    """
+    curve = tracker.rest.start()
+    centre = curve.nodes.mean(axis=0)
+    rotation, shift = np.eye(3), np.zeros(3)
+    cloud = tracker.thinned(cloud)
+    prior = np.diag(np.r_[np.full(3, 0.1**-2), np.full(3, 0.1**-2)])
+    for reach in (0.2, 0.1, 0.05, 0.05, *([0.0] * 8)):
+        moved = SeenCloud((cloud.points - centre) @ rotation.T + centre + shift,
+                          cloud.sigma, cloud.view @ rotation.T)
+        rows, residual, weight, _ = _residuals(curve, moved, reach * tracker.rest.length)
+        points, directions = moved.points[rows] - centre, _last_directions(curve, moved, rows)
+        jacobian = np.concatenate([
+            np.hstack([np.cross(points, direction), direction]) for direction in directions])
+        residual, weight = np.concatenate(residual), np.concatenate(weight)
+        scaled = jacobian.T * weight
+        step = -np.linalg.solve(scaled @ jacobian + prior, scaled @ residual)
+        turn = Rotation.from_rotvec(step[:3]).as_matrix()
+        rotation, shift = turn @ rotation, turn @ shift + step[3:]
+    return rotation, centre + shift - rotation @ centre
+
+
+def _equations(curve: BentCurve, cloud: SeenCloud, reach: float, anchor: Anchor | None,
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normal matrix, gradient and the arc lengths of the points that were used."""
+    rows, residual, weight, arcs = _residuals(curve, cloud, reach)
+    at = _interpolated(curve, arcs).reshape(len(arcs), 3, -1)
+    normal, gradient = _prior(curve)
+    for direction, value, strength in zip(
+            _last_directions(curve, cloud, rows), residual, weight, strict=True):
+        jacobian = -np.einsum("ni,nia->na", direction, at)
+        normal = normal + (jacobian.T * strength) @ jacobian
+        gradient = gradient + jacobian.T @ (strength * value)
+    if anchor is not None:
+        jacobian = _interpolated(curve, np.array([anchor.arc])).reshape(3, -1)
+        off = curve.at(np.array([anchor.arc]))[0] - anchor.position
+        normal = normal + jacobian.T @ jacobian / anchor.sigma**2
+        gradient = gradient + jacobian.T @ off / anchor.sigma**2
+    used = weight[0] * cloud.sigma[rows]**2 > 0.3
+    return normal, gradient, arcs[used]
+
+
+def _residuals(curve: BentCurve, cloud: SeenCloud, reach: float) -> tuple[
+        np.ndarray, tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Rows of the cloud that belong to the main path; depth and side residuals, weights, arcs."""
+    rows, arcs, offset, radius = _feet(curve, cloud, reach)
+    view, sigma = cloud.view[rows], cloud.sigma[rows]
+    side = _side_directions(curve, arcs, view)
+    beside = np.einsum("ni,ni->n", offset, side)
+    depth = np.einsum("ni,ni->n", offset, view)
+    depth = depth + np.sqrt(np.maximum(radius**2 - beside**2, 0.0))
+    side_sigma = np.sqrt(radius**2 / 3 + (0.3 * sigma)**2)
+    wide = 3.0 * sigma + reach
+    robust = 1.0 / (1.0 + (depth / wide)**2)**2
+    robust = np.where(np.abs(beside) > 2.0 * radius + 2.0 * sigma + reach, 0.0, robust)
+    return rows, (depth, beside), (robust / sigma**2, robust / side_sigma**2), arcs
+
+
+def _feet(curve: BentCurve, cloud: SeenCloud, reach: float,
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    nodes = curve.nodes
+    distance, nearest = cKDTree(np.vstack([nodes, curve.side_nodes])).query(cloud.points)
+    spacing = curve.rest.arc[1]
+    radius = np.interp(np.minimum(nearest, len(nodes) - 1), np.arange(len(nodes)),
+                       curve.rest.radius)
+    mine = (nearest < len(nodes)) & (
+        distance < np.hypot(3 * radius + 5 * cloud.sigma, spacing) + reach)
+    rows = np.flatnonzero(mine)
+    index = nearest[rows]
+    tangent = np.gradient(nodes, axis=0)[index]
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    beyond = np.einsum("ni,ni->n", cloud.points[rows] - nodes[index], tangent)
+    raw = curve.rest.arc[index] + beyond
+    # What lies beyond the tip or before the base is not beside the curve.
+    inside = (raw > -spacing) & (raw < curve.rest.length + spacing)
+    rows, arcs = rows[inside], np.clip(raw[inside], 0.0, curve.rest.length)
+    offset = cloud.points[rows] - curve.at(arcs)
+    return rows, arcs, offset, np.interp(arcs, curve.rest.arc, curve.rest.radius)
+
+
+def _side_directions(curve: BentCurve, arcs: np.ndarray, view: np.ndarray) -> np.ndarray:
+    tangents = np.gradient(curve.nodes, axis=0)
+    tangent = np.column_stack([np.interp(arcs, curve.rest.arc, axis) for axis in tangents.T])
+    side = np.cross(tangent, view)
+    return side / np.maximum(np.linalg.norm(side, axis=1), 1e-12)[:, None]
+
+
+def _last_directions(curve: BentCurve, cloud: SeenCloud, rows: np.ndarray,
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    index = cKDTree(curve.nodes).query(cloud.points[rows])[1]
+    return cloud.view[rows], _side_directions(curve, curve.rest.arc[index], cloud.view[rows])
+
+
+def _interpolated(curve: BentCurve, arcs: np.ndarray) -> np.ndarray:
+    jacobian = curve.jacobian()
+    place = np.clip(arcs / curve.rest.arc[1], 0, len(curve.rest.arc) - 1 - 1e-9)
+    low = place.astype(int)
+    share = (place - low)[:, None, None, None]
+    return (1 - share) * jacobian[low] + share * jacobian[low + 1]
+
+
+def _prior(curve: BentCurve) -> tuple[np.ndarray, np.ndarray]:
+    count = curve.rest.knot_count
+    # The first knot's neighbour is the base, which does not turn.
+    first = np.eye(count) - np.eye(count, k=-1)
+    second = np.diff(first, axis=0)
+    matrix = first.T @ first / BEND_SIGMA**2 + second.T @ second / SMOOTH_SIGMA**2
+    return np.kron(matrix, np.eye(3)), (matrix @ curve.knots).ravel()
+
+
+def _settle(curve: BentCurve, anchor: Anchor) -> BentCurve:
+    """Bend the curve so that the anchored point is where it is known to be."""
+    for _ in range(6):
+        normal, _ = _prior(curve)
+        jacobian = _interpolated(curve, np.array([anchor.arc])).reshape(3, -1)
+        off = curve.at(np.array([anchor.arc]))[0] - anchor.position
+        # The smoothest step that does it: weights of the prior, the anchor as a constraint.
+        spread = np.linalg.solve(normal, jacobian.T)
+        step = -spread @ np.linalg.solve(jacobian @ spread + 1e-10 * np.eye(3), off)
+        step *= min(1.0, 0.5 / max(np.abs(step).max(), 1e-12))
+        curve = curve.turned(step.reshape(-1, 3))
+    return curve
