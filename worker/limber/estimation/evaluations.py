@@ -1,0 +1,86 @@
+"""Every forward simulation of an estimate, kept as it happens: a stopped estimate resumes."""
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class EvaluationEntry:
+    """One evaluation: free vector, objective, the paper's loss [m^2] and time [s]."""
+
+    parameters: tuple[float, ...]
+    objective: float
+    loss: float
+    seconds: float
+
+
+class EvaluationLog:
+    """Appends a JSON line an evaluation; reads what an earlier run of the same problem left.
+
+    The first line names the problem by a digest: of another problem nothing is taken over.
+    """
+
+    def __init__(self, path: Path | None, problem: str):
+        self.entries: list[EvaluationEntry] = []
+        self.resumed_count = 0
+        self._known: dict[bytes, EvaluationEntry] = {}
+        self._path = path
+        self._started = time.perf_counter()
+        self._problem = problem
+        if path is not None:
+            self._resume()
+
+    @property
+    def best(self) -> EvaluationEntry | None:
+        """The entry of the smallest objective."""
+        found = [*self.entries, *self._known.values()]
+        return min(found, key=lambda entry: entry.objective, default=None)
+
+    def find(self, parameters: np.ndarray) -> EvaluationEntry | None:
+        """Return an earlier run's entry of exactly these parameters."""
+        return self._known.get(_key(parameters))
+
+    def add(self, parameters: np.ndarray, objective: float, loss: float) -> None:
+        """Keep an evaluation; the line is on the disk before this returns."""
+        entry = EvaluationEntry(tuple(float(x) for x in parameters), float(objective),
+                                float(loss), round(time.perf_counter() - self._started, 4))
+        self.entries.append(entry)
+        if self._path is not None:
+            with open(self._path, "a", encoding="utf-8") as stream:
+                stream.write(json.dumps(entry.__dict__) + "\n")
+
+    def forget(self) -> None:
+        """Remove the file: the estimate is done."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+    def _resume(self) -> None:
+        lines = (self._path.read_text(encoding="utf-8").splitlines()
+                 if self._path.exists() else [])
+        header = _parsed(lines[0]) if lines else None
+        if header is None or header.get("problem") != self._problem:
+            self._path.write_text(json.dumps({"problem": self._problem}) + "\n", encoding="utf-8")
+            return
+        for line in lines[1:]:
+            record = _parsed(line)
+            if record is not None:
+                entry = EvaluationEntry(**(record | {"parameters": tuple(record["parameters"])}))
+                self._known[_key(np.array(entry.parameters))] = entry
+        self.resumed_count = len(self._known)
+
+
+def _parsed(line: str) -> dict | None:
+    try:
+        record = json.loads(line)
+    except json.JSONDecodeError:
+        # The line that was being written when the process was killed.
+        return None
+    return record if isinstance(record, dict) else None
+
+
+def _key(parameters: np.ndarray) -> bytes:
+    return np.asarray(parameters, float).tobytes()

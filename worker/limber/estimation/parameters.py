@@ -1,0 +1,108 @@
+"""What is estimated, and the vector that an optimiser sees."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+YOUNG_BOUNDS_PA = (1e4, 1e11)
+POISSON_BOUNDS = (0.0, 0.495)
+DENSITY_BOUNDS = (50.0, 5000.0)
+
+
+@dataclass(frozen=True)
+class Values:
+    """Physical values of all parameters.
+
+    Attributes:
+        young: At the control points [Pa], shape [K].
+        poisson: Poisson's ratio.
+        density: [kg/m^3].
+        damping: Rayleigh's alpha [1/s] and beta [s].
+    """
+
+    young: np.ndarray
+    poisson: float
+    density: float
+    damping: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """Which of the values are free, and which control points share one modulus.
+
+    The free vector holds log E of each group, then Poisson's ratio, log density, log alpha and
+    log beta as far as they are free.
+
+    Attributes:
+        base: Values of what is not free, and the start of what is.
+        groups: Group of each control point, shape [K]; groups are numbered from 0.
+        extra: Free ones out of "poisson", "density", "alpha", "beta", in this order.
+    """
+
+    base: Values
+    groups: tuple[int, ...]
+    extra: tuple[str, ...] = ()
+
+    @classmethod
+    def separate(cls, base: Values, extra: tuple[str, ...] = ()) -> "ParameterSpace":
+        """Every control point has a modulus of its own."""
+        return cls(base, tuple(range(len(base.young))), extra)
+
+    @property
+    def group_count(self) -> int:
+        return max(self.groups) + 1
+
+    @property
+    def size(self) -> int:
+        return self.group_count + len(self.extra)
+
+    @property
+    def membership(self) -> np.ndarray:
+        """1 where a control point is in a group, shape [K, groups]."""
+        return np.eye(self.group_count)[list(self.groups)]
+
+    @property
+    def names(self) -> list[str]:
+        members = [[f"E{k + 1}" for k, group in enumerate(self.groups) if group == g]
+                   for g in range(self.group_count)]
+        return ["=".join(group) for group in members] + list(self.extra)
+
+    def pack(self, values: Values) -> np.ndarray:
+        """Return the free vector; members of a group enter by their geometric mean."""
+        member = self.membership
+        young = member.T @ np.log(values.young) / member.sum(axis=0)
+        tail = {"poisson": values.poisson, "density": np.log(values.density),
+                "alpha": np.log(max(values.damping[0], 1e-9)),
+                "beta": np.log(max(values.damping[1], 1e-9))}
+        return np.r_[young, [tail[name] for name in self.extra]]
+
+    def unpack(self, free: np.ndarray) -> Values:
+        """Return the physical values of a free vector."""
+        free = np.asarray(free, float)
+        young = np.exp(self.membership @ free[:self.group_count])
+        tail = dict(zip(self.extra, free[self.group_count:], strict=True))
+        alpha, beta = self.base.damping
+        return Values(young, float(tail.get("poisson", self.base.poisson)),
+                      float(np.exp(tail["density"])) if "density" in tail else self.base.density,
+                      (float(np.exp(tail["alpha"])) if "alpha" in tail else alpha,
+                       float(np.exp(tail["beta"])) if "beta" in tail else beta))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of the free vector."""
+        tail = {"poisson": POISSON_BOUNDS, "density": np.log(DENSITY_BOUNDS),
+                "alpha": np.log((1e-6, 1e4)), "beta": np.log((1e-8, 1.0))}
+        pairs = [np.log(YOUNG_BOUNDS_PA)] * self.group_count + [tail[name] for name in self.extra]
+        lower, upper = np.array(pairs, float).T
+        return lower, upper
+
+    def tied(self, groups: tuple[int, ...]) -> "ParameterSpace":
+        """Return the space with other groups; numbers are made consecutive."""
+        _, compact = np.unique(groups, return_inverse=True)
+        return replace(self, groups=tuple(int(group) for group in compact))
+
+    def on_bound(self, free: np.ndarray, share: float = 1e-3) -> list[str]:
+        """Names of free values that lie on a bound."""
+        lower, upper = self.bounds()
+        width = share * (upper - lower)
+        at = (free <= lower + width) | (free >= upper - width)
+        return [name for name, flag in zip(self.names, at, strict=True) if flag]

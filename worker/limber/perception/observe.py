@@ -1,0 +1,196 @@
+"""From the images or clouds of a pull to control points over time."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError
+from limber.estimation.alignment import poses_at
+from limber.estimation.recording import Observations, Pull
+from limber.geometry.skeleton import Skeleton
+from limber.perception.camera import Camera, SeenCloud, depth_to_cloud, read_camera
+from limber.perception.masks import read_mask, segment_by_depth
+from limber.perception.tracking import Anchor, CurveTracker, rest_offset
+from limber.progress import SILENT, Progress
+
+CAMERA_OFFSET_M = 4e-3
+"""A camera pose that is off by more at the branch is corrected, with a warning [m]."""
+
+
+@dataclass
+class _Notes:
+    empty: list[str] = field(default_factory=list)
+    hidden: int = 0
+    messages: list[str] = field(default_factory=list)
+
+
+def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float, ...], *,
+            progress: Progress = SILENT) -> tuple[Observations, list[str]]:
+    """Find the control points in every frame of a pull's clouds or depth images.
+
+    The gripper's pose tells where the branch is at the grasp; the first frame must show the
+    branch at rest: against it the camera's pose is checked and corrected.
+
+    Args:
+        folder: The pull's folder.
+        pull: The pull; its robot stream and ``entry`` are used.
+        skeleton: The branch at rest.
+        fractions: Places of the control points along its main path.
+        progress: Reports each frame.
+
+    Returns:
+        Observations (a point that was not visible is NaN) and warnings.
+
+    Raises:
+        InputError: there are no frames, or the branch is in none of them.
+    """
+    frames = list_frames(folder, pull.entry.observation)
+    load = _loader(folder, pull.entry.observation)
+    tracker = CurveTracker(skeleton, fractions)
+    notes, curve, correction = _Notes(), None, None
+    count, points = len(frames), len(fractions)
+    positions = np.full((count, points, 3), np.nan)
+    covariance = np.broadcast_to(np.eye(3), (count, points, 3, 3)).copy()
+    times = np.array([time for time, _ in frames])
+    poses = poses_at(pull.times, pull.poses,
+                     np.clip(times + pull.entry.time_offset_s, pull.times[0], pull.times[-1]))
+    for index, (_, path) in enumerate(frames):
+        progress(index / count, "following the control points", frame=index)
+        cloud = _with_view(load(path), skeleton)
+        if len(cloud.points) < 10:
+            notes.empty.append(path.stem)
+            continue
+        if correction is None:
+            correction = _camera_correction(tracker, cloud, poses[index], poses[0], notes)
+        turn, shift = correction
+        cloud = SeenCloud(cloud.points @ turn.T + shift, cloud.sigma, cloud.view @ turn.T)
+        tracked = tracker.track(cloud, curve, _anchor(tracker, pull, poses[index]))
+        curve = tracked.curve
+        notes.hidden += int(np.sum(~tracked.visible))
+        positions[index, tracked.visible] = tracked.positions[tracked.visible]
+        covariance[index] = tracked.covariance
+    if len(notes.empty) == count:
+        raise InputError(f"{folder}: the branch is in none of the {count} frames.",
+                         "Every mask is empty, or nothing lies in the depth range.",
+                         "Check the masks and the camera's depth_scale.")
+    return Observations(times, positions, covariance), _sentences(pull.name, notes, count)
+
+
+def list_frames(folder: Path, kind: str) -> list[tuple[float, Path]]:
+    """Return time stamp [s] and file of each frame; stamps are the files' names."""
+    sub, suffix = ("clouds", ".ply") if kind == "clouds" else ("depth", ".png")
+    files = sorted((Path(folder) / sub).glob(f"*{suffix}"))
+    try:
+        frames = sorted((float(path.stem), path) for path in files)
+    except ValueError as error:
+        raise InputError(f"{folder}/{sub}: {error}.", "File names are time stamps in seconds.",
+                         "Bring the frames in with `limber import-pull --rate ...`.") from error
+    if len(frames) < 2:
+        raise InputError(f"{folder}/{sub} has {len(frames)} frames.", "Two are needed.",
+                         "Import the recording again.")
+    return frames
+
+
+def read_depth(path: Path, camera: Camera) -> np.ndarray:
+    """Read a 16-bit depth image into metres, shape [height, width]; 0 is no reading."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image, float) / camera.depth_scale
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"{path} cannot be read as a depth image ({error}).",
+                         "A 16-bit PNG was expected.", "Check the file.") from error
+
+
+def write_depth(path: Path, depth: np.ndarray, camera: Camera) -> None:
+    """Write depth [m] as a 16-bit PNG."""
+    from PIL import Image
+
+    steps = np.clip(np.round(depth * camera.depth_scale), 0, 65535).astype(np.uint16)
+    Image.fromarray(steps).save(path)
+
+
+def _loader(folder: Path, kind: str) -> Callable[[Path], SeenCloud]:
+    camera_path = folder / "camera.toml"
+    if kind == "clouds":
+        camera = read_camera(camera_path) if camera_path.exists() else None
+        return lambda path: _read_cloud(path, camera)
+    camera = read_camera(camera_path)
+    empty_scene = folder / "background.png"
+    background = read_depth(empty_scene, camera) if empty_scene.exists() else None
+
+    def load(path: Path) -> SeenCloud:
+        depth = read_depth(path, camera)
+        mask_path = folder / "mask" / path.name
+        mask = read_mask(mask_path) if mask_path.exists() else segment_by_depth(
+            depth, background=background)
+        return depth_to_cloud(camera, depth, mask)
+    return load
+
+
+def _read_cloud(path: Path, camera: Camera | None) -> SeenCloud:
+    from limber.geometry.cloud import read_cloud
+
+    try:
+        points = read_cloud(path, unit="m").points
+    except InputError:
+        # An empty frame is no reason to give up the others; it is named in the warnings.
+        points = np.empty((0, 3))
+    points = points[np.isfinite(points).all(axis=1)]
+    if camera is None:
+        return SeenCloud(points, np.full(len(points), 2e-3), np.zeros((len(points), 3)))
+    ray = points - camera.origin
+    distance = np.linalg.norm(ray, axis=1)
+    return SeenCloud(points, camera.depth_sigma(distance), ray / distance[:, None])
+
+
+def _with_view(cloud: SeenCloud, skeleton: Skeleton) -> SeenCloud:
+    """Guess the line of sight where none is known: from the seen side towards the axis."""
+    if not len(cloud.points) or np.any(cloud.view):
+        return cloud
+    from scipy.spatial import cKDTree
+
+    nearest = cKDTree(skeleton.nodes).query(cloud.points)[1]
+    inward = np.median(skeleton.nodes[nearest] - cloud.points, axis=0)
+    inward /= max(np.linalg.norm(inward), 1e-12)
+    return SeenCloud(cloud.points, cloud.sigma, np.broadcast_to(inward, cloud.points.shape).copy())
+
+
+def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray,
+                       rest_pose: np.ndarray, notes: _Notes) -> tuple[np.ndarray, np.ndarray]:
+    nothing = np.eye(3), np.zeros(3)
+    if np.linalg.norm(pose[:3] - rest_pose[:3]) > 2e-3:
+        notes.messages.append("the first usable frame shows the branch already pulled; the "
+                              "camera's pose could not be checked.")
+        return nothing
+    turn, shift = rest_offset(tracker, cloud)
+    moved = np.linalg.norm(tracker.rest.nodes @ turn.T + shift - tracker.rest.nodes, axis=1)
+    if moved.max() <= CAMERA_OFFSET_M:
+        return nothing
+    angle = np.degrees(Rotation.from_matrix(turn).magnitude())
+    notes.messages.append(
+        f"the camera's pose is off by up to {moved.max() * 1e3:.0f} mm and {angle:.1f} degrees at "
+        "the branch at rest; the frames were moved onto it. Calibrate the camera again.")
+    return turn, shift
+
+
+def _anchor(tracker: CurveTracker, pull: Pull, pose: np.ndarray) -> Anchor:
+    held = np.array(pull.entry.grasp.point_m)
+    arc = tracker.arc_near(held)
+    arm = tracker.rest.start().at(np.array([arc]))[0] - held
+    turn = Rotation.from_rotvec(pose[3:]).as_matrix()
+    return Anchor(arc, pose[:3] + turn @ arm)
+
+
+def _sentences(name: str, notes: _Notes, count: int) -> list[str]:
+    found = [f"{name}: {message}" for message in notes.messages]
+    if notes.empty:
+        found.append(f"{name}: {len(notes.empty)} of {count} frames show no branch (first at "
+                     f"{notes.empty[0]} s); left out.")
+    if notes.hidden:
+        found.append(f"{name}: control points were hidden {notes.hidden} times; left out there.")
+    return found
