@@ -1,0 +1,95 @@
+"""The energy field: reproduces an analytic branch, knows its own error and its own limits."""
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError, WorkError
+from limber.planning.field import EnergyField, error_measures, fit_field
+
+ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
+
+
+def test_analytic_energy_and_force_are_reproduced(ridge, ridge_field):
+    """At unseen points inside, energy within 2 % and force within 5 % (root mean square)."""
+    energy = ridge_field.energy(ELSEWHERE) - ridge.energy(ELSEWHERE)
+    force = ridge_field.force(ELSEWHERE) - ridge.force(ELSEWHERE)
+    assert np.sqrt(np.mean(energy**2)) < 0.02 * np.sqrt(np.mean(ridge.energy(ELSEWHERE) ** 2))
+    assert np.sqrt(np.mean(force**2)) < 0.05 * np.sqrt(np.mean(ridge.force(ELSEWHERE) ** 2))
+
+
+def test_energy_gradient_is_that_of_the_clamped_energy(ridge_field):
+    """Central differences of the energy agree with its gradient."""
+    step = 1e-5
+    differences = np.stack(
+        [(ridge_field.energy(ELSEWHERE + step * axis) - ridge_field.energy(ELSEWHERE - step * axis))
+         / (2 * step) for axis in np.eye(3)], axis=1)
+    assert np.allclose(ridge_field.energy_gradient(ELSEWHERE), differences, atol=1e-4)
+
+
+def test_held_out_error_tells_the_true_error(ridge, ridge_field):
+    """The reported error is within a factor of five of that on fresh samples inside the hull."""
+    fresh = ridge.samples(count=300, seed=77)
+    fresh = fresh.take(np.flatnonzero(ridge_field.region.contains(fresh.positions)))
+    true = error_measures(fresh, ridge_field.energy(fresh.positions),
+                          ridge_field.force(fresh.positions))
+    for name in ("energy_error", "force_error"):
+        assert 0.2 < ridge_field.errors[name] / true[name] < 5.0
+
+
+def test_gravity_parts_energy_from_work(well):
+    """With a weight lifted, the force is the gradient of work and not of strain energy."""
+    samples = well.samples(count=80)
+    weight = np.array([0.0, 0.0, 0.5])
+    samples = samples.__class__(**(vars(samples) | {
+        "energies": samples.works - samples.positions @ weight}))
+    field = fit_field(samples)
+    assert np.allclose(field.force(ELSEWHERE), well.force(ELSEWHERE), atol=1e-3)
+    wanted = np.maximum(well.energy(ELSEWHERE) - ELSEWHERE @ weight, 0.0)
+    assert np.allclose(field.energy(ELSEWHERE), wanted, atol=1e-4)
+    assert (wanted == 0.0).any(), "the case must include relaxed poses, where energy is clamped"
+    assert (field.energy(ELSEWHERE) >= 0.0).all()
+
+
+def test_shape_gives_rotation_and_tip(well_field):
+    """Rotation and tip, linear in position here, come back exactly."""
+    poses = well_field.poses(ELSEWHERE)
+    assert np.allclose(poses[:, 3], -ELSEWHERE[:, 1], atol=1e-6)
+    assert np.allclose(well_field.tip(ELSEWHERE), 1.5 * ELSEWHERE + [0, 0, 0.3], atol=1e-6)
+
+
+def test_trust_ends_at_the_hull_and_near_rejected_poses(ridge):
+    """Outside the samples' hull, and nearer to a rejected pose than to an accepted, is refused."""
+    plain = fit_field(ridge.samples()).region
+    hole = np.array([0.05, -0.05, 0.02])
+    holed = fit_field(ridge.samples(rejected=[[*hole, 0, 0, 0]])).region
+    assert plain.contains(hole)[0] and not holed.contains(hole)[0]
+    assert not plain.contains(np.array([0.3, 0.0, 0.0]))[0]
+    drawn = holed.draw(500, np.random.default_rng(0))
+    assert holed.contains(drawn).all() and len(drawn) == 500
+
+
+def test_saved_field_is_the_same(tmp_path, ridge_field):
+    """Written and read again it gives the same numbers to the bit, and nothing is pickled."""
+    ridge_field.write(tmp_path / "energy.npz")
+    again = EnergyField.read(tmp_path / "energy.npz")
+    assert np.array_equal(again.energy(ELSEWHERE), ridge_field.energy(ELSEWHERE))
+    assert np.array_equal(again.force(ELSEWHERE), ridge_field.force(ELSEWHERE))
+    assert np.array_equal(again.poses(ELSEWHERE), ridge_field.poses(ELSEWHERE))
+    assert again.errors == ridge_field.errors
+    with np.load(tmp_path / "energy.npz", allow_pickle=False) as file:
+        wanted = {"poses", "energies_j", "forces_n", "min_det_f", "rejected_poses"}
+        assert wanted <= set(file.files)
+
+
+def test_damaged_file_is_named(tmp_path):
+    """A file that is no energy field is an input error that says what to run."""
+    path = tmp_path / "energy.npz"
+    np.savez(path, poses=np.zeros((3, 6)))
+    with pytest.raises(InputError, match="limber energy"):
+        EnergyField.read(path)
+
+
+def test_too_few_samples(well):
+    """A handful of samples cannot make a field; the message asks for more."""
+    with pytest.raises(WorkError, match="Sample more"):
+        fit_field(well.samples(count=12))

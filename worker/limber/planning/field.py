@@ -1,0 +1,290 @@
+"""The energy field: deformation energy of the branch over the position of its grasp.
+
+Two scalars are kept apart. Both are zero in the rest state, which is the branch hanging under
+its own weight with the gripper open:
+
+- ``energy``: strain energy above that of the rest state, the paper's measure of deformation.
+  Lifting a sagging branch can take it below zero; the field is clamped there.
+- ``work``: what the gripper has done to get there slowly, the strain energy plus the weight
+  lifted. Its gradient is the force of the gripper. Without gravity the two are one.
+
+The field also gives the rotation that the grasped piece takes by itself, and the branch's tip.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from limber.errors import InputError, WorkError
+from limber.planning.radial import RadialInterpolant, gradient_at, value_at
+from limber.planning.trust import TrustRegion, trusted_at
+from limber.progress import SILENT, Progress
+
+# (kernel, shape, smoothing, fitted to forces too): tried in turn, the least held-out error wins.
+CANDIDATES = tuple(
+    (kernel, shape, smoothing, with_forces)
+    for kernel, shape in (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0),
+                          ("multiquadric", 2.0), ("gaussian", 2.0))
+    for smoothing in (1e-10, 1e-6)
+    for with_forces in (True, False))
+_FOLDS_TO_CHOOSE, _FOLDS_TO_REPORT = 4, 10
+
+
+@dataclass(frozen=True)
+class GraspSamples:
+    """What the branch model says of ``m`` accepted grasp poses, rest pose first.
+
+    Attributes:
+        poses: Position [m] and the rotation vector [rad] that the grasped piece takes, [m, 6].
+        energies: Strain energy above the rest state [J], shape [m].
+        works: Work of the gripper from the rest state [J], shape [m].
+        forces: Force that the gripper exerts on the branch [N], shape [m, 3].
+        tips: Position of the branch's tip [m], shape [m, 3].
+        min_det_f: Least determinant of the deformation gradient, shape [m].
+        rejected_poses: Poses without an acceptable solution, shape [q, 6].
+    """
+
+    poses: np.ndarray
+    energies: np.ndarray
+    works: np.ndarray
+    forces: np.ndarray
+    tips: np.ndarray
+    min_det_f: np.ndarray
+    rejected_poses: np.ndarray
+
+    @property
+    def positions(self) -> np.ndarray:
+        return self.poses[:, :3]
+
+    def take(self, index: np.ndarray) -> "GraspSamples":
+        """Return the samples of ``index``; rejected poses stay."""
+        names = ("poses", "energies", "works", "forces", "tips", "min_det_f")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+
+class FieldArrays(NamedTuple):
+    """A field and its limits as the compiled loops take them; see :meth:`EnergyField.limited`."""
+
+    energy: tuple
+    work: tuple
+    planes: np.ndarray
+    accepted: np.ndarray
+    rejected: np.ndarray
+    max_energy: float
+    max_force: float
+
+
+@dataclass(frozen=True)
+class EnergyField:
+    """Fitted field; positions [n, 3] in, arrays out. Make it with :func:`fit_field`.
+
+    Attributes:
+        samples: What it was fitted to.
+        energy_fit, work_fit: Interpolants of the two scalars (clamped by the methods).
+        shape_fit: Six channels: natural rotation vector and tip position.
+        region: Where the field may be believed.
+        errors: Held-out errors; see :func:`held_out_errors`.
+    """
+
+    samples: GraspSamples
+    energy_fit: RadialInterpolant
+    work_fit: RadialInterpolant
+    shape_fit: RadialInterpolant
+    region: TrustRegion
+    errors: dict[str, float]
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Position of the grasp in the rest state [m], shape [3]."""
+        return self.samples.positions[0]
+
+    def energy(self, points: np.ndarray) -> np.ndarray:
+        """Return the deformation energy [J] at ``points`` [n, 3], never negative, shape [n]."""
+        return np.maximum(self.energy_fit.value(_rows(points))[:, 0], 0.0)
+
+    def energy_gradient(self, points: np.ndarray) -> np.ndarray:
+        """Return its gradient [N], shape [n, 3]; zero where the energy is clamped."""
+        points = _rows(points)
+        clamped = self.energy_fit.value(points)[:, 0] <= 0.0
+        gradient = self.energy_fit.gradient(points)[:, :, 0]
+        return np.where(clamped[:, None], 0.0, gradient)
+
+    def work(self, points: np.ndarray) -> np.ndarray:
+        """Return the gripper's slow work from rest [J] at ``points``, shape [n]."""
+        return np.maximum(self.work_fit.value(_rows(points))[:, 0], 0.0)
+
+    def force(self, points: np.ndarray) -> np.ndarray:
+        """Return the force that holds the grasp there [N], the gradient of work, [n, 3]."""
+        return self.work_fit.gradient(_rows(points))[:, :, 0]
+
+    def poses(self, points: np.ndarray) -> np.ndarray:
+        """Return positions with the rotation that the grasped piece takes there, [n, 6]."""
+        points = _rows(points)
+        return np.hstack([points, self.shape_fit.value(points)[:, :3]])
+
+    def tip(self, points: np.ndarray) -> np.ndarray:
+        """Return where the branch's tip is with the grasp at ``points`` [m], [n, 3]."""
+        return self.shape_fit.value(_rows(points))[:, 3:]
+
+    def limited(self, max_energy: float = np.inf, max_force: float = np.inf) -> FieldArrays:
+        """Return the arrays for compiled loops, with limits on energy [J] and force [N]."""
+        return FieldArrays(self.energy_fit.arrays, self.work_fit.arrays, self.region.planes,
+                           self.region.accepted, self.region.rejected,
+                           float(max_energy), float(max_force))
+
+    def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
+        """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; nothing pickled."""
+        samples = self.samples
+        arrays = {
+            "poses": samples.poses, "energies_j": samples.energies, "works_j": samples.works,
+            "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
+            "rejected_poses": samples.rejected_poses,
+            "error_names": np.array(list(self.errors)),
+            "error_values": np.array(list(self.errors.values())),
+            "energy_error": np.array(self.errors["energy_error"]),
+            "force_error": np.array(self.errors["force_error"]),
+        }
+        for name in ("energy_fit", "work_fit", "shape_fit"):
+            arrays |= getattr(self, name).to_arrays(f"{name}_")
+        np.savez_compressed(path, **arrays, **(extra or {}))
+
+    @classmethod
+    def read(cls, path: Path) -> "EnergyField":
+        """Read what :meth:`write` wrote; nothing is fitted again.
+
+        Raises:
+            InputError: the file is not an energy field.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            samples = GraspSamples(
+                arrays["poses"], arrays["energies_j"], arrays["works_j"], arrays["forces_n"],
+                arrays["tips_m"], arrays["min_det_f"], arrays["rejected_poses"])
+            fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
+                    for name in ("energy_fit", "work_fit", "shape_fit")]
+            errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
+                              strict=True))
+        except (KeyError, ValueError, OSError, TypeError) as error:
+            raise InputError(f"{path} is not an energy field ({error}).",
+                             "It was not written by `limber energy`, or is damaged.",
+                             "Run `limber energy` again with --force.") from error
+        return cls(samples, *fits, TrustRegion.of(samples.positions,
+                                                  samples.rejected_poses[:, :3]), errors)
+
+
+def fit_field(samples: GraspSamples, *, seed: int = 0, progress: Progress = SILENT) -> EnergyField:
+    """Fit the field; kernel, smoothing and the use of forces are those of least held-out error.
+
+    Raises:
+        WorkError: too few samples, or they span no volume.
+    """
+    needed = 20
+    if len(samples.poses) < needed:
+        raise WorkError(f"Only {len(samples.poses)} grasp poses were accepted.",
+                        f"A field in three coordinates needs at least {needed}.",
+                        "Sample more poses, or a smaller deflection.")
+    scores = []
+    for number, candidate in enumerate(CANDIDATES):
+        progress(number / len(CANDIDATES), "choosing the interpolation")
+        errors = held_out_errors(samples, candidate, folds=_FOLDS_TO_CHOOSE, seed=seed)
+        scores.append(errors["energy_error"] + errors["force_error"])
+    candidate = CANDIDATES[int(np.argmin(scores))]
+    errors = held_out_errors(samples, candidate, seed=seed)
+    region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3])
+    return EnergyField(samples, *_fits(samples, candidate), region, errors)
+
+
+def held_out_errors(samples: GraspSamples, candidate: tuple, *, folds: int = _FOLDS_TO_REPORT,
+                    seed: int = 0) -> dict[str, float]:
+    """Return errors on samples that the fit has not seen (``folds`` fits, each without a part).
+
+    Only held-out samples inside the hull of the others count: the planner never goes outside.
+
+    Returns:
+        ``energy_error`` and ``force_error``: root mean square error over root mean square of the
+        branch model's values; ``energy_error_median`` and ``force_error_median``: median of
+        the error of each sample over its own value; ``held_out_count``.
+    """
+    order = np.random.default_rng(seed).permutation(len(samples.poses))
+    tested, energy, force = [], [], []
+    for fold in range(folds):
+        out = order[fold::folds]
+        kept = np.setdiff1d(order, out)
+        inside = out[TrustRegion.of(samples.positions[kept],
+                                    np.empty((0, 3))).contains(samples.positions[out])]
+        if len(inside) == 0:
+            continue
+        energy_fit, work_fit = _fits(samples.take(kept), candidate)[:2]
+        tested.append(inside)
+        energy.append(np.maximum(energy_fit.value(samples.positions[inside])[:, 0], 0.0))
+        force.append(work_fit.gradient(samples.positions[inside])[:, :, 0])
+    if not tested:
+        raise WorkError(f"{len(samples.poses)} grasp poses are too few to hold any out.",
+                        "Then the error of the energy field cannot be told.",
+                        "Sample more poses.")
+    index = np.concatenate(tested)
+    return error_measures(samples.take(index), np.concatenate(energy), np.concatenate(force))
+
+
+def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
+                   ) -> dict[str, float]:
+    """Return the measures of :func:`held_out_errors` for predictions at ``truth``'s poses."""
+    wanted = np.maximum(truth.energies, 0.0)
+    energy_off = np.abs(energy - wanted)
+    force_off = np.linalg.norm(force - truth.forces, axis=1)
+    size = np.linalg.norm(truth.forces, axis=1)
+    felt = (wanted > 1e-3 * wanted.max()) & (size > 1e-3 * size.max())
+    return {
+        "energy_error": _rms(energy_off) / _rms(wanted),
+        "force_error": _rms(force_off) / _rms(size),
+        "energy_error_median": float(np.median(energy_off[felt] / wanted[felt])),
+        "force_error_median": float(np.median(force_off[felt] / size[felt])),
+        "held_out_count": float(len(energy)),
+    }
+
+
+def _fits(samples: GraspSamples, candidate: tuple) -> list[RadialInterpolant]:
+    kernel, shape, smoothing, with_forces = candidate
+    options = {"kernel": kernel, "shape": shape, "smoothing": smoothing}
+    work = RadialInterpolant.fit(samples.positions, samples.works,
+                                 samples.forces if with_forces else None, **options)
+    # The force is the gradient of work, not of energy; what gravity adds is smooth and is fitted
+    # to values alone. Same centres and kernel: the weights add up, one loop evaluates the sum.
+    lifted = RadialInterpolant.fit(samples.positions, samples.energies - samples.works, **options)
+    energy = replace(work, value_weights=work.value_weights + lifted.value_weights,
+                     polynomial=work.polynomial + lifted.polynomial)
+    shape_fit = RadialInterpolant.fit(
+        samples.positions, np.hstack([samples.poses[:, 3:], samples.tips]), **options)
+    return [energy, work, shape_fit]
+
+
+def _rows(points: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(points, float).reshape(-1, 3)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@njit(cache=True)
+def energy_at(point, field):
+    """Return the clamped energy [J] at ``point`` [3]."""
+    return max(value_at(point, 0, *field.energy), 0.0)
+
+
+@njit(cache=True)
+def allowed_at(point, energy, field):
+    """Return whether ``point``, whose energy is known, is trusted and within the limits."""
+    if energy > field.max_energy:
+        return False
+    if not trusted_at(point, field.planes, field.accepted, field.rejected):
+        return False
+    if field.max_force == np.inf:
+        return True
+    slope = np.empty(len(point))
+    gradient_at(point, 0, *field.work, slope)
+    return np.sqrt(np.sum(slope * slope)) <= field.max_force

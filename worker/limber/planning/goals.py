@@ -1,0 +1,157 @@
+"""Where a path may end: the grasp at a place, or the branch's tip at a place."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+from limber.errors import NoPathError
+from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
+
+
+class Goal(Protocol):
+    """A region of grasp positions."""
+
+    tolerance: float
+
+    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        """Return how far off the goal the branch is with its grasp at ``points`` [m], [n]."""
+        ...
+
+    def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Return grasp positions likely to be in the region, shape [n, 3]."""
+        ...
+
+    def describe(self) -> dict:
+        """Return the goal as plain data."""
+        ...
+
+
+@dataclass(frozen=True)
+class GraspGoal:
+    """The grasp within ``tolerance`` [m] of ``position`` [m]."""
+
+    position: tuple[float, float, float]
+    tolerance: float
+
+    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(np.asarray(points) - self.position, axis=1)
+
+    def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
+        inside = _ball(count, generator) * self.tolerance + self.position
+        inside[0] = self.position
+        return inside
+
+    def describe(self) -> dict:
+        return {"kind": "grasp", "position_m": list(map(float, self.position)),
+                "tolerance_m": self.tolerance}
+
+
+@dataclass(frozen=True)
+class TipGoal:
+    """The branch's tip (its flower) within ``tolerance`` [m] of ``position`` [m]."""
+
+    position: tuple[float, float, float]
+    tolerance: float
+
+    def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(field.tip(points) - self.position, axis=1)
+
+    def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
+        # The region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
+        points = field.region.draw(20 * count, generator)
+        points = points[np.argsort(self.distance(field, points))[:count]]
+        target = self.position + _ball(count, generator) * (0.9 * self.tolerance)
+        for _ in range(8):
+            points = points + _damped_steps(field.shape_fit.gradient(points)[:, :, 3:],
+                                            target - field.tip(points))
+        return points
+
+    def describe(self) -> dict:
+        return {"kind": "tip", "position_m": list(map(float, self.position)),
+                "tolerance_m": self.tolerance}
+
+
+def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: int = 200,
+                seed: int = 0) -> np.ndarray:
+    """Return allowed grasp positions in the goal region, at most ``count``, shape [n, 3].
+
+    Raises:
+        NoPathError: there is none; says whether the region is out of reach or a limit forbids it.
+    """
+    points = goal.guess(field, count, np.random.default_rng(seed))
+    reached = points[goal.distance(field, points) <= goal.tolerance]
+    trusted = reached[field.region.contains(reached)]
+    if len(trusted) == 0:
+        raise _out_of_reach(goal, field, seed)
+    allowed = trusted[allowed_points(trusted, limits)]
+    if len(allowed) == 0:
+        energy = float(field.energy(trusted).min())
+        force = float(np.linalg.norm(field.force(trusted), axis=1).min())
+        raise NoPathError(
+            f"No pose in the goal region keeps the limits: there the energy is at least "
+            f"{energy:.3g} J and the force at least {force:.3g} N.",
+            f"Allowed are {limits.max_energy:.3g} J and {limits.max_force:.3g} N.",
+            "Raise --max-energy or --max-force, or choose a goal nearer to the rest pose.")
+    return np.ascontiguousarray(allowed)
+
+
+@njit(cache=True)
+def allowed_points(points: np.ndarray, limits: FieldArrays) -> np.ndarray:
+    """Return whether each of ``points`` [n, 3] is trusted and within the limits, bool [n]."""
+    allowed = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        allowed[i] = allowed_at(points[i], energy_at(points[i], limits), limits)
+    return allowed
+
+
+def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
+    """Return a goal worth planning for: far from rest, and reached without force.
+
+    Of the samples deflected by over three quarters of the largest deflection, the one with the
+    least energy, drawn a little towards the rest pose so that the region lies where the field is
+    trusted.
+    """
+    offset = field.samples.positions - field.rest
+    away = np.linalg.norm(offset, axis=1)
+    far = np.flatnonzero(away >= 0.75 * away.max())
+    for index in far[np.argsort(field.samples.energies[far])]:
+        for shrink in (1.0, 0.95, 0.9, 0.85):
+            position = field.rest + shrink * offset[index]
+            around = position + _ball(100, np.random.default_rng(0)) * tolerance
+            if field.region.contains(around).mean() > 0.5 and field.region.contains(position)[0]:
+                return GraspGoal(tuple(map(float, position)), tolerance)
+    raise NoPathError("No far pose lies well inside the sampled region.",
+                      f"Too few of {len(away)} accepted samples are far from the rest pose.",
+                      "Sample more poses with `limber energy --samples`, or name a --goal.")
+
+
+def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
+    points = field.region.draw(2000, np.random.default_rng(seed))
+    distance = goal.distance(field, points)
+    nearest = points[np.argmin(distance)]
+    place = ", ".join(f"{value:.3f}" for value in nearest)
+    what = "the tip" if isinstance(goal, TipGoal) else "the grasp"
+    return NoPathError(
+        f"No sampled pose brings {what} to the goal; the nearest misses it by "
+        f"{distance.min():.3f} m, with the grasp at ({place}).",
+        f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
+        f"{_place(field.region.low)} to {_place(field.region.high)}.",
+        "Choose a goal nearer to that, widen --goal-tolerance, or sample a larger --deflection.")
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.3f}" for value in point) + ")"
+
+
+def _ball(count: int, generator: np.random.Generator) -> np.ndarray:
+    direction = generator.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * generator.uniform(size=(count, 1)) ** (1 / 3)
+
+
+def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:
+    """Gauss-Newton steps [n, 3] for d tip_c / d x_k = ``slope`` [n, k, c], damped where flat."""
+    normal = slope @ slope.transpose(0, 2, 1) + 1e-3 * np.eye(3)
+    return np.linalg.solve(normal, slope @ missing[:, :, None])[:, :, 0]

@@ -1,0 +1,145 @@
+"""What a path costs, and how two paths are compared.
+
+The paper's edge cost (its eq. 6) adds deformation and distance. Summing the energy over waypoints,
+as a literal reading has it, depends on their spacing and lets a planner win by long edges; so
+
+    J = a_def * integral E ds / (E0 L0) + a_dis * integral ds / L0
+
+with ``E0`` the peak energy and ``L0`` the length of the straight line: dimensionless, additive,
+the same however an edge is divided. Limits on energy and force are part of validity, not of cost:
+a branch breaks by the peak, not by the integral.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.integrate import trapezoid
+
+from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
+
+STEP = 0.005
+"""Longest distance between points where an edge is evaluated [m]; also the paper-like spacing."""
+
+
+class EdgeWeights(NamedTuple):
+    """Weights of an edge: ``energy`` [1/(J m)], ``length`` [1/m]; ``step`` [m] of quadrature."""
+
+    energy: float
+    length: float
+    step: float
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The weights ``a_def`` and ``a_dis``, both without unit, and the scales ``E0`` [J], ``L0``
+    [m]. The baseline RRT* is ``a_def = 0``, ``a_dis = 1``."""
+
+    deformation: float
+    distance: float
+    energy_scale: float
+    length_scale: float
+
+    @classmethod
+    def between(cls, field: EnergyField, start: np.ndarray, goal: np.ndarray, *,
+                deformation: float, distance: float) -> "Objective":
+        """Scale to the straight line from ``start`` to ``goal`` [3]."""
+        line = resample(np.stack([start, goal]), STEP)
+        line = line[field.region.contains(line)]
+        peak = float(field.energy(line).max()) if len(line) else 0.0
+        length = float(np.linalg.norm(np.asarray(goal) - start))
+        return cls(deformation, distance, peak or float(field.samples.energies.max()),
+                   length or STEP)
+
+    @property
+    def weights(self) -> EdgeWeights:
+        return EdgeWeights(self.deformation / (self.energy_scale * self.length_scale),
+                           self.distance / self.length_scale, STEP)
+
+    def cost(self, path: np.ndarray, field: FieldArrays) -> float:
+        """Return ``J`` of a polyline [n, 3]; infinite if it leaves what is allowed."""
+        return float(path_cost(np.ascontiguousarray(path, float), field, self.weights))
+
+
+@dataclass(frozen=True)
+class PathMeasures:
+    """What a path asks of the branch; the same measure for every path.
+
+    Attributes:
+        length_m: Length of the grasp's path [m].
+        energy_integral_jm: Integral of energy over length [J m].
+        energy_sum_nmm: Sum of energies at 5 mm spacing [N mm]: the paper's number.
+        peak_energy_j, peak_force_n: Largest energy [J] and gripper force [N].
+        positive_work_j: Sum of the increases of energy along the path [J].
+    """
+
+    length_m: float
+    energy_integral_jm: float
+    energy_sum_nmm: float
+    peak_energy_j: float
+    peak_force_n: float
+    positive_work_j: float
+
+
+def measure_path(positions: np.ndarray, energies: np.ndarray, forces: np.ndarray) -> PathMeasures:
+    """Return the measures of a path given at points along it.
+
+    Args:
+        positions: Grasp positions [m], shape [n, 3], at 5 mm spacing or less.
+        energies: Deformation energy there [J], shape [n].
+        forces: Magnitude of the gripper's force there [N], shape [n].
+    """
+    along = arc_lengths(positions)
+    spots = np.linspace(0.0, along[-1], max(round(along[-1] / STEP), 1) + 1)
+    return PathMeasures(
+        length_m=float(along[-1]),
+        energy_integral_jm=float(trapezoid(energies, along)),
+        energy_sum_nmm=float(np.interp(spots, along, energies).sum() * 1e3),
+        peak_energy_j=float(energies.max()), peak_force_n=float(forces.max()),
+        positive_work_j=float(np.maximum(np.diff(energies), 0.0).sum()))
+
+
+def arc_lengths(path: np.ndarray) -> np.ndarray:
+    """Return the distance along a polyline [n, 3] of each of its points [m], shape [n]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+
+
+def resample(path: np.ndarray, spacing: float) -> np.ndarray:
+    """Return points of a polyline evenly spaced by at most ``spacing`` [m], ends included."""
+    along = arc_lengths(path)
+    count = max(int(np.ceil(along[-1] / spacing - 1e-9)), 1)
+    spots = np.linspace(0.0, along[-1], count + 1)
+    return np.stack([np.interp(spots, along, path[:, k]) for k in range(path.shape[1])], axis=1)
+
+
+@njit(cache=True)
+def edge_cost(start, stop, field, weights):
+    """Return the cost of the straight edge; infinite if any of it is not allowed.
+
+    Midpoint rule at ``weights.step`` or finer; ``stop`` is checked, ``start`` taken as checked.
+    """
+    length = np.sqrt(np.sum((stop - start) ** 2))
+    pieces = max(int(np.ceil(length / weights.step)), 1)
+    total = 0.0
+    for i in range(pieces):
+        point = start + (stop - start) * ((i + 0.5) / pieces)
+        energy = 0.0
+        if weights.energy > 0.0 or field.max_energy < np.inf:
+            energy = energy_at(point, field)
+        if not allowed_at(point, energy, field):
+            return np.inf
+        total += energy
+    energy = energy_at(stop, field) if field.max_energy < np.inf else 0.0
+    if not allowed_at(stop, energy, field):
+        return np.inf
+    return length * (weights.energy * total / pieces + weights.length)
+
+
+@njit(cache=True)
+def path_cost(path, field, weights):
+    """Return the summed cost of a polyline's edges."""
+    total = 0.0
+    for i in range(len(path) - 1):
+        total += edge_cost(path[i], path[i + 1], field, weights)
+    return total

@@ -1,0 +1,148 @@
+"""RRT* of the Open Motion Planning Library on the same problem, cost and limits as our own.
+
+What its Python bindings (2.0.1) need to be told, each found out by measuring:
+``StateCostIntegralObjective`` never calls Python, so the objective overrides ``motionCost``;
+the default neighbour constant connects every node to every other, so the rewire factor is small;
+the random seed must be set before anything is built; progress comes from the termination
+callback, where an exception (a cancelled run) passes through ``solve``.
+"""
+
+import math
+
+import numpy as np
+
+from limber.errors import MissingDependencyError
+from limber.planning.objective import edge_cost
+from limber.planning.rrt_star import Problem, Search
+from limber.progress import Progress
+
+_REWIRE_FACTOR = 0.05
+_REPORT_EVERY = 100  # iterations
+
+
+def ompl_missing() -> str:
+    """Return why OMPL cannot be used, or an empty string if it can."""
+    try:
+        import ompl.geometric  # noqa: F401
+    except ImportError as error:
+        return str(error)
+    return ""
+
+
+def search_with_ompl(problem: Problem, search: Search, progress: Progress,
+                     ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
+    """Return the best path [n, 3] or None, the cost's history and the tree's size.
+
+    Raises:
+        MissingDependencyError: OMPL is not installed.
+    """
+    if reason := ompl_missing():
+        raise MissingDependencyError(
+            "OMPL is not installed.", f"Importing it says: {reason}.",
+            "Use --engine own, which needs nothing, or install the extra `planning`.")
+    from ompl import base, geometric
+    from ompl import util as ompl_util
+
+    # OMPL takes seeds from 1 on and logs at a second call that it is late; it reseeds all the same.
+    ompl_util.setLogLevel(ompl_util.LogLevel.LOG_NONE)
+    ompl_util.RNG.setSeed(search.seed + 1)
+    space = _space(base, problem)
+    setup = geometric.SimpleSetup(space)
+    information = setup.getSpaceInformation()
+    checker, motion, objective, goal = _rules(base, information, problem, search)
+    setup.setStateValidityChecker(checker)
+    information.setMotionValidator(motion)
+    start = space.allocState()
+    start[0:3] = problem.start.tolist()
+    setup.addStartState(start)
+    setup.setGoal(goal)
+    setup.setOptimizationObjective(objective)
+    planner = geometric.RRTstar(information)
+    planner.setRange(search.reach * problem.diagonal)
+    planner.setRewireFactor(_REWIRE_FACTOR)
+    planner.setGoalBias(search.goal_bias)
+    setup.setPlanner(planner)
+    setup.setup()
+    watch = _Watch(planner, search, progress)
+    setup.solve(base.PlannerTerminationCondition(watch))
+    data = base.PlannerData(information)
+    setup.getPlannerData(data)
+    nodes = data.numVertices()
+    if not setup.haveExactSolutionPath():
+        return None, watch.history, nodes
+    states = setup.getSolutionPath().getStates()
+    return np.array([state[0:3] for state in states]), watch.history, nodes
+
+
+class _Watch:
+    """Ends the search after its iterations; reports progress, and so can be cancelled."""
+
+    def __init__(self, planner: object, search: Search, progress: Progress):
+        self._planner, self._search, self._progress = planner, search, progress
+        self.history: list[dict[str, float]] = []
+        self._calls = 0
+
+    def __call__(self) -> bool:
+        self._calls += 1
+        if self._calls % _REPORT_EVERY == 0:
+            cost = self._planner.bestCost().value()
+            numbers = {"cost": cost} if math.isfinite(cost) else {}
+            if numbers:
+                self.history.append({"iteration": self._calls, "cost": cost})
+            self._progress(self._calls / self._search.iterations, "growing the tree", **numbers)
+        return self._calls > self._search.iterations
+
+
+def _space(base: object, problem: Problem) -> object:
+    space = base.RealVectorStateSpace(len(problem.start))
+    bounds = base.RealVectorBounds(len(problem.start))
+    for axis, (low, high) in enumerate(zip(problem.low, problem.high, strict=True)):
+        bounds.setLow(axis, float(low))
+        bounds.setHigh(axis, float(high))
+    space.setBounds(bounds)
+    return space
+
+
+def _rules(base: object, information: object, problem: Problem, search: Search) -> tuple:
+    """Make the subclasses of OMPL's classes that know the problem."""
+    generator = np.random.default_rng([search.seed, 2])
+    weights, field = problem.weights, problem.limits
+
+    def point(state: object) -> np.ndarray:
+        return np.array(state[0:3])
+
+    class Validity(base.StateValidityChecker):
+        def isValid(self, state: object) -> bool:
+            spot = point(state)
+            return math.isfinite(edge_cost(spot, spot, field, weights))
+
+    class Motion(base.MotionValidator):
+        def checkMotion(self, first: object, second: object, *_last: object) -> bool:
+            return math.isfinite(edge_cost(point(first), point(second), field, weights))
+
+    class PathCost(base.OptimizationObjective):
+        def stateCost(self, _state: object) -> object:
+            return base.Cost(0.0)
+
+        def motionCost(self, first: object, second: object) -> object:
+            return base.Cost(edge_cost(point(first), point(second), field, weights))
+
+        def motionCostHeuristic(self, first: object, second: object) -> object:
+            return base.Cost(weights.length * math.dist(first[0:3], second[0:3]))
+
+    class GoalRegion(base.GoalSampleableRegion):
+        def distanceGoal(self, state: object) -> float:
+            spot = point(state)[None]
+            if problem.in_goal(spot)[0]:
+                return 0.0
+            return float(np.linalg.norm(problem.goals - spot, axis=1).min()) + 1e-9
+
+        def sampleGoal(self, state: object) -> None:
+            state[0:3] = problem.goals[generator.integers(len(problem.goals))].tolist()
+
+        def maxSampleCount(self) -> int:
+            return len(problem.goals)
+
+    goal = GoalRegion(information)
+    goal.setThreshold(1e-12)
+    return Validity(information), Motion(information), PathCost(information), goal
