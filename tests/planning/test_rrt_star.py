@@ -1,0 +1,149 @@
+"""Both engines of RRT* on a branch with a ridge: gentler, honest when there is no way."""
+
+import numpy as np
+import pytest
+
+from limber.errors import Cancelled, NoPathError
+from limber.planning.goals import GraspGoal, TipGoal, default_goal, goal_points
+from limber.planning.objective import Objective, measure_path
+from limber.planning.ompl_engine import ompl_missing
+from limber.planning.rrt_star import Problem, Search, plan_path
+from limber.progress import Progress
+
+START = np.array([-0.13, 0.0, 0.0])
+GOAL = GraspGoal((0.13, 0.0, 0.0), 0.01)
+ENGINES = ["own", pytest.param("ompl", marks=pytest.mark.skipif(
+    bool(ompl_missing()), reason=f"OMPL: {ompl_missing()}"))]
+
+
+def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):
+    limited = field.limited(**limits)
+    objective = Objective.between(field, START, np.array(goal.position),
+                                  deformation=deformation, distance=distance)
+    return Problem(START, goal_points(goal, field, limited),
+                   lambda points: goal.distance(field, points) <= goal.tolerance,
+                   field, limited, objective.weights)
+
+
+def measured(field, points):
+    return measure_path(points, field.energy(points),
+                        np.linalg.norm(field.force(points), axis=1))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_deformation_aware_path_goes_round_the_ridge(ridge_field, engine):
+    """D-RRT* saves at least 40 % of the energy of the baseline for at most 25 % more length."""
+    search = Search(iterations=1500, seed=1)
+    baseline = plan_path(make_problem(ridge_field, deformation=0.0, distance=1.0), search,
+                         engine=engine)
+    gentle = plan_path(make_problem(ridge_field, deformation=1.0), search, engine=engine)
+    first, second = measured(ridge_field, baseline.points), measured(ridge_field, gentle.points)
+    assert second.energy_integral_jm < 0.6 * first.energy_integral_jm
+    assert second.peak_energy_j < 0.6 * first.peak_energy_j
+    assert first.length_m < second.length_m < 1.25 * first.length_m
+    for found in (baseline, gentle):
+        assert np.allclose(found.points[0], START)
+        assert GOAL.distance(ridge_field, found.points[-1:])[0] <= GOAL.tolerance + 1e-9
+        assert ridge_field.region.contains(found.points).all()
+        assert found.cost <= found.tree_cost + 1e-9
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_baseline_is_the_straight_line(well_field, engine):
+    """Without deformation in its cost RRT* ends within 2 % of the straight distance."""
+    found = plan_path(make_problem(well_field, deformation=0.0, distance=1.0),
+                      Search(iterations=800, seed=2), engine=engine)
+    straight = np.linalg.norm(found.points[-1] - found.points[0])
+    assert measured(well_field, found.points).length_m < 1.02 * straight
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_seed_decides_the_path(ridge_field, engine):
+    """The same seed gives the same path to the bit; another seed another tree."""
+    problem = make_problem(ridge_field, deformation=1.0)
+    one, two, other = (plan_path(problem, Search(iterations=600, seed=seed), engine=engine)
+                       for seed in (5, 5, 6))
+    assert np.array_equal(one.points, two.points)
+    assert one.history == two.history
+    assert other.tree_cost != one.tree_cost
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_cost_falls_as_the_tree_grows(ridge_field, engine):
+    """The history of the best cost never rises."""
+    found = plan_path(make_problem(ridge_field, deformation=1.0),
+                      Search(iterations=2000, seed=3), engine=engine)
+    costs = [entry["cost"] for entry in found.history]
+    assert len(costs) > 3 and (np.diff(costs) <= 1e-9).all()
+    assert costs[-1] == pytest.approx(found.tree_cost, rel=1e-3)
+
+
+def test_limit_is_kept_all_along(ridge_field):
+    """With a cap on energy even the shortest path stays below it, going round."""
+    cap = 0.15
+    found = plan_path(make_problem(ridge_field, deformation=0.0, distance=1.0, max_energy=cap),
+                      Search(iterations=2500, seed=4))
+    dense = np.concatenate([np.linspace(a, b, 20) for a, b in
+                            zip(found.points[:-1], found.points[1:], strict=True)])
+    assert ridge_field.energy(dense).max() < 1.02 * cap
+    force_cap = 3.0
+    found = plan_path(make_problem(ridge_field, deformation=0.0, distance=1.0,
+                                   max_force=force_cap), Search(iterations=2500, seed=4))
+    assert np.linalg.norm(ridge_field.force(found.points), axis=1).max() < 1.02 * force_cap
+
+
+def test_goal_out_of_reach_says_how_far(ridge_field):
+    """A goal outside the sampled region is refused before any search, with the distance."""
+    far = GraspGoal((0.6, 0.0, 0.0), 0.02)
+    with pytest.raises(NoPathError, match=r"misses it by 0\.4"):
+        goal_points(far, ridge_field, ridge_field.limited())
+
+
+def test_goal_above_the_limit_says_so(ridge_field):
+    """A goal whose energy is over the cap is refused with both numbers."""
+    with pytest.raises(NoPathError, match="max-energy"):
+        goal_points(GOAL, ridge_field, ridge_field.limited(max_energy=0.01))
+
+
+def test_goal_behind_a_wall(ridge_field):
+    """A cap that parts the start from the goal ends in NoPathError and not in a path."""
+    problem = make_problem(ridge_field, deformation=0.0, distance=1.0)
+    start_and_goal_only = ridge_field.limited(max_energy=1.0)._replace(
+        rejected=np.random.default_rng(0).uniform([-0.03, -0.2, -0.2], [0.03, 0.2, 0.2],
+                                                  (2000, 3)))
+    walled = Problem(problem.start, problem.goals, problem.in_goal, ridge_field,
+                     start_and_goal_only, problem.weights)
+    with pytest.raises(NoPathError, match="500 iterations"):
+        plan_path(walled, Search(iterations=500))
+
+
+def test_tip_goal_brings_the_tip_there(ridge_field):
+    """Grasp positions for a tip goal put the tip, by the field, within the tolerance."""
+    goal = TipGoal((0.15, -0.05, 0.33), 0.01)
+    points = goal_points(goal, ridge_field, ridge_field.limited())
+    assert len(points) > 20
+    assert np.linalg.norm(ridge_field.tip(points) - goal.position, axis=1).max() <= 0.01
+    found = plan_path(make_problem(ridge_field, deformation=1.0, goal=goal),
+                      Search(iterations=800, seed=1))
+    assert goal.distance(ridge_field, found.points[-1:])[0] <= goal.tolerance + 1e-9
+
+
+def test_default_goal_is_far_and_reachable(ridge_field):
+    """The default goal is deflected far, trusted, and gentle among the far poses."""
+    goal = default_goal(ridge_field, 0.01)
+    away = np.linalg.norm(np.array(goal.position) - ridge_field.rest)
+    assert away > 0.6 * 0.2
+    assert ridge_field.region.contains(np.array(goal.position))[0]
+    far = np.linalg.norm(ridge_field.samples.positions, axis=1) > 0.15
+    at_goal = ridge_field.energy(np.array(goal.position))[0]
+    assert at_goal < np.median(ridge_field.samples.energies[far])
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_cancel_ends_the_search(ridge_field, engine):
+    """A cancel during the search raises Cancelled out of either engine."""
+    progress = Progress(lambda fraction, _message, _numbers:
+                        progress.cancel() if fraction > 0.1 else None)
+    with pytest.raises(Cancelled):
+        plan_path(make_problem(ridge_field, deformation=1.0), Search(iterations=4000),
+                  engine=engine, progress=progress)
