@@ -1,0 +1,252 @@
+"""A scan's skeleton: thin, contract, connect, root, prune, fit."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial import cKDTree
+
+from limber.errors import InputError
+from limber.geometry.axis_fit import attached, clamped, fit_axes, resampled
+from limber.geometry.contraction import Contraction, contract
+from limber.geometry.curve_graph import CurveGraph, curve_graph, prune_spurs, rooted
+from limber.geometry.skeleton import Skeleton
+from limber.progress import SILENT, Progress
+
+FIT_POINT_LIMIT = 60_000
+"""More points than that do not make the fit better, only slower."""
+
+
+class SkeletonSettings(BaseModel):
+    """How the skeleton is made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    contraction_points: int = Field(
+        12_000, ge=50, description="Contract at most so many points (thinned evenly).")
+    gap_factor: float = Field(
+        3.0, gt=1, description="The paper's gamma: longer than so many median steps is a gap.")
+    bridge_limit: float = Field(
+        0.15, ge=0, le=1, description="Bridge gaps up to this share of the cloud's diagonal.")
+    prune: float = Field(
+        2.5, ge=0, description="A twig stays if it reaches so many radii of its carrier beyond "
+        "the carrier's axis.")
+    radius_low: float = Field(
+        5e-4, ge=0, description="Radii are clamped from below at this share of the diagonal.")
+    radius_high: float = Field(
+        0.1, gt=0, le=1, description="Radii are clamped from above at this share.")
+
+
+@dataclass(frozen=True)
+class SkeletonResult:
+    """A skeleton, and what was done to get it.
+
+    Attributes:
+        skeleton: Axes and radii [m] in the cloud's frame.
+        contraction: Contracted points and history.
+        node_of_point: Skeleton node of each point, shape [m].
+        residual: Distance of each point from its cylinder [m], shape [m].
+        noise: Robust standard deviation of the residuals [m].
+        bridges: Gaps closed: ``from``, ``to``, ``length`` [m].
+        split_off: Pieces left away: ``points``, ``distance`` [m], ``at``.
+        loops: Lengths [m] of closed loops that were opened.
+        pruned: Number of spurs pruned.
+        warnings: What the user should know.
+    """
+
+    skeleton: Skeleton
+    contraction: Contraction
+    node_of_point: np.ndarray
+    residual: np.ndarray
+    noise: float
+    bridges: list[dict] = field(default_factory=list)
+    split_off: list[dict] = field(default_factory=list)
+    loops: list[float] = field(default_factory=list)
+    pruned: int = 0
+    warnings: list[str] = field(default_factory=list)
+
+    def report(self) -> dict[str, Any]:
+        """Numbers for the stage's result."""
+        return {"contraction_iterations": self.contraction.iterations,
+                "contraction_status": self.contraction.status, "noise_m": self.noise,
+                "bridges": self.bridges, "split_off": self.split_off,
+                "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
+
+
+def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
+                root: np.ndarray | None = None, progress: Progress = SILENT) -> SkeletonResult:
+    """Find the rooted skeleton of a cloud.
+
+    Args:
+        points: Scanned points [m], shape [n, 3].
+        settings: How.
+        root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
+        progress: Called as it goes.
+
+    Raises:
+        InputError: the cloud is not branch-like.
+    """
+    settings = settings or SkeletonSettings()
+    thin = thinned(points, settings.contraction_points)
+    contraction = contract(points[thin], progress=progress.part(0.0, 0.6))
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    progress(0.6, "connecting")
+    graph = curve_graph(points[thin], contraction.points, gap_factor=settings.gap_factor,
+                        bridge_limit=settings.bridge_limit * diagonal)
+    _check_branch_like(points[thin], contraction, graph, diagonal)
+    first, pruned = _first_skeleton(graph, settings, root)
+    some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
+    fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
+    skeleton, segment, residual = _nearest(fitted.skeleton, points)
+    result = SkeletonResult(
+        skeleton, contraction, segment, residual, fitted.noise, graph.bridges, graph.split_off,
+        graph.loops, pruned + more)
+    result.warnings.extend(_warnings(result, len(points)))
+    progress(1.0, "skeleton", nodes=skeleton.node_count)
+    return result
+
+
+def thinned(points: np.ndarray, limit: int) -> np.ndarray:
+    """Indices of at most ``limit`` points, one from each cell of a grid that fits that number."""
+    if len(points) <= limit:
+        return np.arange(len(points))
+    low = points.min(axis=0)
+    # Points lie on a surface: cells grow with the square root of how many there are too many.
+    size = float(np.median(cKDTree(points).query(
+        points[:: max(len(points) // 2000, 1)], k=2)[0][:, 1])) * np.sqrt(len(points) / limit)
+    size = max(size, 1e-6 * float(np.ptp(points, axis=0).max()), 1e-12)
+    for _ in range(40):
+        cell = np.floor((points - low) / size).astype(np.int64)
+        extent = cell.max(axis=0) + 1
+        key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+        _, first = np.unique(key, return_index=True)
+        if len(first) <= limit:
+            return np.sort(first)
+        size *= max(1.03, np.sqrt(len(first) / limit))
+    return np.sort(first)
+
+
+def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, root: np.ndarray | None,
+                    ) -> tuple[Skeleton, int]:
+    start = _root_node(graph, root)
+    parent = rooted(graph.nodes, graph.edges, start)
+    keep, pruned = prune_spurs(graph.nodes, parent, graph.thickness, settings.prune)
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
+    radius = np.maximum(graph.thickness[keep], 1e-3 * float(np.median(graph.thickness)) + 1e-12)
+    return Skeleton.from_edges(graph.nodes[keep], moved, radius), pruned
+
+
+def _root_node(graph: CurveGraph, root: np.ndarray | None) -> int:
+    """The tip nearest to ``root``, or the tip of the thickest end."""
+    degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
+    tips = np.flatnonzero(degree == 1)
+    if root is not None:
+        return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))])
+    around = cKDTree(graph.nodes)
+    reach = 0.08 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
+    thick = np.array([np.median(graph.thickness[around.query_ball_point(graph.nodes[tip], reach)])
+                      for tip in tips])
+    # Among ends of nearly the same thickness the lowest is the root.
+    candidates = tips[thick >= 0.75 * thick.max()]
+    return int(candidates[np.argmin(graph.nodes[candidates, 2])])
+
+
+def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
+         progress: Progress):
+    low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
+    skeleton = resampled(skeleton, 1.5)
+    fit = fit_axes(skeleton, points, progress=progress.part(0.0, 0.5))
+    skeleton = _with_full_tips(attached(fit.skeleton), points, fit)
+    keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, skeleton.radius, settings.prune)
+    skeleton = resampled(clamped(skeleton.subset(keep), low, high), 1.0)
+    fit = fit_axes(skeleton, points, progress=progress.part(0.5, 1.0))
+    from dataclasses import replace
+    return replace(fit, skeleton=clamped(fit.skeleton, low, high)), pruned
+
+
+def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleton:
+    """Lengthen the ends that the contraction drew in, as far as there are points."""
+    nodes = skeleton.nodes.copy()
+    _, segment, _ = _nearest(skeleton, points)
+    tips = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
+    inner = int(np.flatnonzero(skeleton.parent == 0)[0])
+    for end, before, is_root in [(t, b, False) for t, b in tips] + [(0, inner, True)]:
+        start = before
+        for _ in range(2):
+            if not is_root and skeleton.parent[start] > 0:
+                start = int(skeleton.parent[start])
+        direction = nodes[end] - skeleton.nodes[start]
+        length = np.linalg.norm(direction)
+        if length == 0:
+            continue
+        direction /= length
+        radius = skeleton.radius[end]
+        mine = points[(segment == end) | (segment == (before if not is_root else inner))]
+        offset = mine - nodes[end]
+        along = offset @ direction
+        across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
+        along = along[across < 2.0 * radius + 3 * fit.noise]
+        if len(along) < 3:
+            continue
+        reach = float(np.quantile(along, 0.98)) - (0.0 if is_root else radius)
+        nodes[end] = nodes[end] + direction * np.clip(reach, -0.8 * length, 20 * radius)
+    return skeleton.moved(nodes)
+
+
+def _nearest(skeleton: Skeleton, points: np.ndarray):
+    from limber.geometry.axis_fit import _match
+
+    segments, residuals = [], []
+    for begin in range(0, len(points), 100_000):
+        match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
+                       points[begin:begin + 100_000])
+        segments.append(match.segment)
+        residuals.append(match.residual)
+    return skeleton, np.concatenate(segments), np.concatenate(residuals)
+
+
+def _check_branch_like(points: np.ndarray, contraction: Contraction, graph: CurveGraph,
+                       diagonal: float) -> None:
+    fix = "Cut out one branch (--crop), or bring a skeleton of your own (--skeleton)."
+    if len(graph.nodes) < 4:
+        raise InputError(f"The cloud contracts to {len(graph.nodes)} points.",
+                         "It is not branch-like: no axis was found (a ball or a blob?).", fix)
+    length = float(np.linalg.norm(
+        graph.nodes[graph.edges[:, 0]] - graph.nodes[graph.edges[:, 1]], axis=1).sum())
+    thick = float(np.median(graph.thickness))
+    curve = float(np.median(contraction.linearity))
+    if curve < 0.8:
+        raise InputError(
+            f"Only {100 * curve:.0f} % of the contracted cloud's local variance lies on lines.",
+            "It is not branch-like: it stays a sheet or a blob (a wall, the ground, foliage?).",
+            fix)
+    if length < 4 * thick:
+        raise InputError(
+            f"The axes are {length:.3g} m long at {thick:.3g} m radius.",
+            "It is not branch-like: too stout for an axis (a ball or a fruit?).", fix)
+
+
+def _warnings(result: SkeletonResult, count: int) -> list[str]:
+    texts = []
+    for bridge in result.bridges:
+        texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
+                     f"{_place(bridge['to'])}.")
+    lost = sum(piece["points"] for piece in result.split_off)
+    if lost:
+        share = 100 * lost / len(result.contraction.points)
+        texts.append(f"{len(result.split_off)} pieces ({share:.1f} % of the points) were left "
+                     "away: too far from the rest to be bridged.")
+    for loop in result.loops:
+        texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
+    far = float(np.mean(np.abs(result.residual) > np.maximum(
+        4 * result.noise, result.skeleton.radius[result.node_of_point])))
+    if far > 0.2:
+        texts.append(f"{100 * far:.0f} % of the points lie on no cylinder: foliage, flying "
+                     "pixels or a second plant? Trust the skeleton less there.")
+    return texts
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:.3f}" for v in point) + ")"
