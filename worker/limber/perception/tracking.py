@@ -129,23 +129,26 @@ def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np
 
     Returns:
         Rotation matrix [3, 3] and translation [m], shape [3], that take the cloud onto the
-        branch. A turn about a straight branch's own axis cannot be seen and stays zero.
+        branch.
     """
     curve = tracker.rest.start()
     centre = curve.nodes.mean(axis=0)
     rotation, shift = np.eye(3), np.zeros(3)
     cloud = tracker.thinned(cloud)
-    prior = np.diag(np.r_[np.full(3, 0.1**-2), np.full(3, 0.1**-2)])
+    # What cannot be seen (a slide along the branch, a turn about it) stays where it was.
+    prior = np.r_[np.full(3, 0.1**-2), np.full(3, 0.03**-2)]
     for reach in (0.2, 0.1, 0.05, 0.05, *([0.0] * 8)):
         moved = SeenCloud((cloud.points - centre) @ rotation.T + centre + shift,
                           cloud.sigma, cloud.view @ rotation.T)
-        rows, residual, weight, _ = _residuals(curve, moved, reach * tracker.rest.length)
-        points, directions = moved.points[rows] - centre, _last_directions(curve, moved, rows)
+        match = _match(curve, moved, reach * tracker.rest.length)
+        points = moved.points[match.rows] - centre
         jacobian = np.concatenate([
-            np.hstack([np.cross(points, direction), direction]) for direction in directions])
-        residual, weight = np.concatenate(residual), np.concatenate(weight)
+            np.hstack([np.cross(points, direction), direction]) for direction in match.directions])
+        residual, weight = np.concatenate(match.residuals), np.concatenate(match.weights)
         scaled = jacobian.T * weight
-        step = -np.linalg.solve(scaled @ jacobian + prior, scaled @ residual)
+        total = np.r_[Rotation.from_matrix(rotation).as_rotvec(), shift]
+        step = -np.linalg.solve(scaled @ jacobian + np.diag(prior),
+                                scaled @ residual + prior * total)
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         rotation, shift = turn @ rotation, turn @ shift + step[3:]
     return rotation, centre + shift - rotation @ centre
@@ -154,11 +157,11 @@ def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np
 def _equations(curve: BentCurve, cloud: SeenCloud, reach: float, anchor: Anchor | None,
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normal matrix, gradient and the arc lengths of the points that were used."""
-    rows, residual, weight, arcs = _residuals(curve, cloud, reach)
-    at = _interpolated(curve, arcs).reshape(len(arcs), 3, -1)
+    match = _match(curve, cloud, reach)
+    at = _interpolated(curve, match.arcs).reshape(len(match.arcs), 3, -1)
     normal, gradient = _prior(curve)
-    for direction, value, strength in zip(
-            _last_directions(curve, cloud, rows), residual, weight, strict=True):
+    for direction, value, strength in zip(match.directions, match.residuals, match.weights,
+                                          strict=True):
         jacobian = -np.einsum("ni,nia->na", direction, at)
         normal = normal + (jacobian.T * strength) @ jacobian
         gradient = gradient + jacobian.T @ (strength * value)
@@ -167,24 +170,43 @@ def _equations(curve: BentCurve, cloud: SeenCloud, reach: float, anchor: Anchor 
         off = curve.at(np.array([anchor.arc]))[0] - anchor.position
         normal = normal + jacobian.T @ jacobian / anchor.sigma**2
         gradient = gradient + jacobian.T @ off / anchor.sigma**2
-    used = weight[0] * cloud.sigma[rows]**2 > 0.3
-    return normal, gradient, arcs[used]
+    return normal, gradient, match.arcs[match.inlier]
 
 
-def _residuals(curve: BentCurve, cloud: SeenCloud, reach: float) -> tuple[
-        np.ndarray, tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """Rows of the cloud that belong to the main path; depth and side residuals, weights, arcs."""
+@dataclass(frozen=True)
+class _Match:
+    """What the points of a cloud that belong to the main path say about the curve.
+
+    Attributes:
+        rows: Their indices in the cloud, shape [n].
+        arcs: Arc lengths of the nearest points of the curve [m], shape [n].
+        directions: Towards the back and towards the side, both across the axis, 2 x [n, 3].
+        residuals: 2 x [n]; [m].
+        weights: 2 x [n]; robust, over variance.
+        inlier: Whether the point counts, shape [n] of bool.
+    """
+
+    rows: np.ndarray
+    arcs: np.ndarray
+    directions: tuple[np.ndarray, np.ndarray]
+    residuals: tuple[np.ndarray, np.ndarray]
+    weights: tuple[np.ndarray, np.ndarray]
+    inlier: np.ndarray
+
+
+def _match(curve: BentCurve, cloud: SeenCloud, reach: float) -> _Match:
     rows, arcs, offset, radius = _feet(curve, cloud, reach)
-    view, sigma = cloud.view[rows], cloud.sigma[rows]
-    side = _side_directions(curve, arcs, view)
+    back, side, slant = _across(curve, arcs, cloud.view[rows])
+    sigma = cloud.sigma[rows] * slant
     beside = np.einsum("ni,ni->n", offset, side)
-    depth = np.einsum("ni,ni->n", offset, view)
+    depth = np.einsum("ni,ni->n", offset, back)
     depth = depth + np.sqrt(np.maximum(radius**2 - beside**2, 0.0))
     side_sigma = np.sqrt(radius**2 / 3 + (0.3 * sigma)**2)
     wide = 3.0 * sigma + reach
     robust = 1.0 / (1.0 + (depth / wide)**2)**2
     robust = np.where(np.abs(beside) > 2.0 * radius + 2.0 * sigma + reach, 0.0, robust)
-    return rows, (depth, beside), (robust / sigma**2, robust / side_sigma**2), arcs
+    return _Match(rows, arcs, (back, side), (depth, beside),
+                  (robust / sigma**2, robust / side_sigma**2), robust > 0.3)
 
 
 def _feet(curve: BentCurve, cloud: SeenCloud, reach: float,
@@ -209,17 +231,16 @@ def _feet(curve: BentCurve, cloud: SeenCloud, reach: float,
     return rows, arcs, offset, np.interp(arcs, curve.rest.arc, curve.rest.radius)
 
 
-def _side_directions(curve: BentCurve, arcs: np.ndarray, view: np.ndarray) -> np.ndarray:
+def _across(curve: BentCurve, arcs: np.ndarray, view: np.ndarray,
+            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions across the axis: away from the camera, and sideways; and the view's slant."""
     tangents = np.gradient(curve.nodes, axis=0)
     tangent = np.column_stack([np.interp(arcs, curve.rest.arc, axis) for axis in tangents.T])
-    side = np.cross(tangent, view)
-    return side / np.maximum(np.linalg.norm(side, axis=1), 1e-12)[:, None]
-
-
-def _last_directions(curve: BentCurve, cloud: SeenCloud, rows: np.ndarray,
-                     ) -> tuple[np.ndarray, np.ndarray]:
-    index = cKDTree(curve.nodes).query(cloud.points[rows])[1]
-    return cloud.view[rows], _side_directions(curve, curve.rest.arc[index], cloud.view[rows])
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    back = view - np.einsum("ni,ni->n", view, tangent)[:, None] * tangent
+    slant = np.maximum(np.linalg.norm(back, axis=1), 0.1)
+    back = back / slant[:, None]
+    return back, np.cross(tangent, back), slant
 
 
 def _interpolated(curve: BentCurve, arcs: np.ndarray) -> np.ndarray:

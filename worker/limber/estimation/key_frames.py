@@ -1,0 +1,72 @@
+"""Simulate a few frames of a slow pull, know all of them.
+
+Without inertia a branch's state depends on the gripper's pose (or force) alone, and smoothly so.
+A few states along the path and a cubic spline through them give the others, at a small part of
+the cost; every observed frame still counts in the fit, so no measurement is thrown away.
+"""
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+ROTATION_LENGTH_M = 0.1
+"""A turn of one radian counts as this much travel."""
+
+
+def travel(poses: np.ndarray, step_m: float = 5e-4) -> np.ndarray:
+    """Return the path's length up to each pose, shape [n]; jitter below ``step_m`` is no travel."""
+    scaled = poses * np.r_[np.ones(3), np.full(3, ROTATION_LENGTH_M)]
+    length = np.zeros(len(poses))
+    last = 0
+    for index in range(1, len(poses)):
+        moved = float(np.linalg.norm(scaled[index] - scaled[last]))
+        if moved >= step_m:
+            length[last:index + 1] = length[last] + np.linspace(0.0, moved, index - last + 1)
+            last = index
+        else:
+            length[index] = length[last]
+    return length
+
+
+def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Choose frames to simulate, and how all frames follow from them.
+
+    Args:
+        along: A parameter that grows along the path, shape [n].
+        count: How many to simulate at most.
+
+    Returns:
+        Indices of the key frames, shape [k], and S, shape [n, k]: values at all frames are
+        S @ values at the key frames.
+    """
+    places, first = np.unique(along, return_index=True)
+    if len(places) > count:
+        wanted = np.linspace(places[0], places[-1], count)
+        near = np.unique(np.abs(places[:, None] - wanted).argmin(axis=0))
+        places, first = places[near], first[near]
+    if len(places) == 1:
+        return first, np.ones((len(along), 1))
+    if len(places) < 4:
+        spread = np.column_stack([np.interp(along, places, row) for row in np.eye(len(places))])
+        return first, spread
+    return first, CubicSpline(places, np.eye(len(places)))(along)
+
+
+def smoothed(times: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Noisy measurements at some instants, each by a quadratic through its neighbourhood.
+
+    Args:
+        times: [s], shape [n].
+        values: Shape [n, c]; rows with NaN are left out.
+        places: Instants wanted [s], shape [k].
+    """
+    known = np.isfinite(values).all(axis=1)
+    times, values = times[known], values[known]
+    width = max(2.0 * np.ptp(times) / max(len(places) - 1, 1), 1e-9)
+    result = np.empty((len(places), values.shape[1]))
+    for row, place in enumerate(places):
+        near = np.abs(times - place) <= width / 2
+        if near.sum() < 6:
+            result[row] = [np.interp(place, times, column) for column in values.T]
+        else:
+            result[row] = np.polynomial.polynomial.polyfit(times[near] - place, values[near], 2)[0]
+    return result

@@ -1,0 +1,201 @@
+"""What an optimiser minimises: differences of simulated and measured, each over its deviation."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from limber.errors import Cancelled
+from limber.estimation.alignment import Frames
+from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.progress import SILENT, Progress
+
+FAILED_OBJECTIVE = 1e12
+"""Objective of parameters under which the simulation finds no equilibrium."""
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulated pull at all frames, and its derivative to the physical parameters.
+
+    Attributes:
+        positions: Observed points [m], shape [f, m, 3].
+        forces: Of the gripper on the branch [N], shape [f, 3].
+        d_positions: Shape [f, m, 3, P], or None; P parameters in the order log E_1..log E_K and
+            the extra ones of the parameter space.
+        d_forces: Shape [f, 3, P], or None.
+    """
+
+    positions: np.ndarray
+    forces: np.ndarray
+    d_positions: np.ndarray | None = None
+    d_forces: np.ndarray | None = None
+
+
+class Forward(Protocol):
+    """Simulates one pull for given values; None where no equilibrium was found."""
+
+    name: str
+    frames: Frames
+    uses_force: bool
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None: ...
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All pulls under one free vector.
+
+    Attributes:
+        free: Shape [p].
+        residual: Differences over standard deviations, shape [r].
+        jacobian: Its derivative to the free vector, shape [r, p], or None.
+        loss: The paper's J: sum of squared distances of all seen points [m^2].
+        pulls: The simulated pulls.
+    """
+
+    free: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray | None
+    loss: float
+    pulls: tuple[Simulated, ...]
+
+    @property
+    def objective(self) -> float:
+        """Half the sum of squared residuals."""
+        return 0.5 * float(self.residual @ self.residual)
+
+
+class Stopped(Cancelled):
+    """The optimiser was stopped; the evaluation log has the best so far."""
+
+
+class Objective:
+    """Evaluates free vectors, counts forward simulations and keeps each in a log."""
+
+    def __init__(self, forwards: list[Forward], space: ParameterSpace, *,
+                 log: EvaluationLog | None = None, force_sigma: list[float] | None = None,
+                 progress: Progress = SILENT, expected_count: int = 20):
+        self.forwards = forwards
+        self.space = space
+        self.log = log or EvaluationLog(None, "")
+        self.forward_count = 0
+        self.force_sigma = force_sigma or [0.1] * len(forwards)
+        self._progress = progress
+        self._expected = expected_count
+        self._last: Evaluation | None = None
+        self._whitening = [_whitening(forward.frames) for forward in forwards]
+
+    def with_space(self, space: ParameterSpace) -> "Objective":
+        """Return an objective on other parameters that goes on with the same log and count."""
+        other = Objective(self.forwards, space, log=self.log, force_sigma=self.force_sigma,
+                          progress=self._progress, expected_count=self._expected)
+        other.forward_count = self.forward_count
+        return other
+
+    def evaluate(self, free: np.ndarray, *, jacobian: bool = False) -> Evaluation | None:
+        """Simulate all pulls; None where one finds no equilibrium.
+
+        Raises:
+            Stopped: by Ctrl-C or the progress' cancel.
+        """
+        free = np.array(free, float)
+        last = self._last
+        if last is not None and np.array_equal(last.free, free) and (
+                not jacobian or last.jacobian is not None):
+            return last
+        values = self.space.unpack(free)
+        try:
+            pulls = [forward.simulate(values, self.space.extra, jacobian)
+                     for forward in self.forwards]
+            self.forward_count += 1
+            found = None if any(pull is None for pull in pulls) else self._compare(free, pulls)
+            self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
+                         found.loss if found else np.inf)
+            best = self.log.best
+            self._progress(min(self.forward_count / self._expected, 0.99), "fitting",
+                           loss_m2=found.loss if found else np.inf, best_m2=best.loss,
+                           young_mpa=" ".join(f"{young / 1e6:.3g}" for young in values.young))
+        except (KeyboardInterrupt, Cancelled) as stop:
+            raise Stopped("The estimate was stopped.") from stop
+        if found is not None:
+            self._last = found
+        return found
+
+    def scored(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per pull: standardised residual of each point [f, m] (RMS of axes) and force [f]."""
+        scored = []
+        for index, simulated in enumerate(evaluation.pulls):
+            points = self._points(index, simulated)
+            scored.append((np.sqrt(np.mean(points**2, axis=2)),
+                           np.sqrt(np.mean(self._forces(index, simulated)**2, axis=1))))
+        return scored
+
+    def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
+        residual, jacobian, loss = [], [], 0.0
+        for index, simulated in enumerate(pulls):
+            frames = self.forwards[index].frames
+            points, seen = self._points(index, simulated), _seen(frames)
+            residual.append(points[seen].ravel())
+            loss += float(np.sum((simulated.positions - frames.positions)[seen]**2))
+            if simulated.d_positions is not None:
+                slope = np.einsum("fmij,fmjp->fmip", self._whitening[index], simulated.d_positions)
+                jacobian.append(slope[seen].reshape(-1, slope.shape[-1]))
+            if self.forwards[index].uses_force:
+                measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+                residual.append(self._forces(index, simulated)[measured].ravel())
+                if simulated.d_forces is not None:
+                    slope = simulated.d_forces / self._sigma(index)[:, None, None]
+                    jacobian.append(slope[measured].reshape(-1, slope.shape[-1]))
+        return Evaluation(free, np.concatenate(residual),
+                          self._on_free(np.vstack(jacobian)) if jacobian else None,
+                          loss, tuple(pulls))
+
+    def _on_free(self, jacobian: np.ndarray) -> np.ndarray:
+        count = len(self.space.groups)
+        return np.hstack([jacobian[:, :count] @ self.space.membership, jacobian[:, count:]])
+
+    def _points(self, index: int, simulated: Simulated) -> np.ndarray:
+        off = simulated.positions - self.forwards[index].frames.positions
+        return np.einsum("fmij,fmj->fmi", self._whitening[index], off)
+
+    def _forces(self, index: int, simulated: Simulated) -> np.ndarray:
+        off = simulated.forces - self.forwards[index].frames.wrenches[:, :3]
+        return off / self._sigma(index)[:, None]
+
+    def _sigma(self, index: int) -> np.ndarray:
+        counts = np.maximum(self.forwards[index].frames.wrench_counts, 1)
+        return self.force_sigma[index] / np.sqrt(counts)
+
+
+def _seen(frames: Frames) -> np.ndarray:
+    return np.isfinite(frames.positions).all(axis=2)
+
+
+def _whitening(frames: Frames) -> np.ndarray:
+    """Inverse square roots of the covariances, shape [f, m, 3, 3]."""
+    values, vectors = np.linalg.eigh(frames.covariance)
+    return np.einsum("fmij,fmj,fmkj->fmik", vectors, 1 / np.sqrt(values), vectors)
+
+
+def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float, float]:
+    """RMS distance [m] of points and RMS force error [N] of one pull that a fit did not see."""
+    forward = objective.forwards[index]
+    simulated = forward.simulate(objective.space.unpack(free), (), False)
+    if simulated is None:
+        return np.inf, np.inf
+    off = (simulated.positions - forward.frames.positions)[_seen(forward.frames)]
+    force = simulated.forces - forward.frames.wrenches[:, :3]
+    force = force[np.isfinite(force).all(axis=1)]
+    return (float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan,
+            float(np.sqrt(np.mean(np.sum(force**2, axis=1)))) if len(force) else np.nan)
+
+
+def without(objective: Objective, index: int) -> Objective:
+    """Return the objective on all pulls but one; it keeps no log."""
+    kept = [k for k in range(len(objective.forwards)) if k != index]
+    return Objective([objective.forwards[k] for k in kept], objective.space,
+                     force_sigma=[objective.force_sigma[k] for k in kept])
+

@@ -1,0 +1,112 @@
+"""The optimisers: the paper's Nelder-Mead, and Gauss-Newton with exact sensitivities."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+from limber.errors import WorkError
+from limber.estimation.objective import FAILED_OBJECTIVE, Evaluation, Objective
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where an optimiser ended.
+
+    Attributes:
+        evaluation: The best one, with derivatives where they were asked for.
+        converged: Whether the optimiser's own criterion ended it.
+        reason: That criterion in words.
+    """
+
+    evaluation: Evaluation
+    converged: bool
+    reason: str
+
+
+def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
+                 evaluation_limit: int = 40, tolerance: float = 1e-6) -> Fit:
+    """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
+
+    Args:
+        objective: Gives residuals and derivatives.
+        start: Free vector.
+        robust: Residuals beyond 3 standard deviations count linearly (``soft_l1``), so that an
+            outlier cannot pull the fit.
+        evaluation_limit: At most so many forward simulations.
+        tolerance: Relative change of cost and of parameters that ends it.
+
+    Raises:
+        WorkError: no equilibrium at the start.
+    """
+    lower, upper = objective.space.bounds()
+    start = np.clip(start, lower + 1e-6, upper - 1e-6)
+    first = _required(objective, start)
+    size = len(first.residual)
+
+    def residual(free: np.ndarray) -> np.ndarray:
+        found = objective.evaluate(free, jacobian=True)
+        if found is None:
+            # Farther off than anything: the trust region shrinks.
+            return np.full(size, np.sqrt(FAILED_OBJECTIVE / size))
+        return found.residual
+
+    def jacobian(free: np.ndarray) -> np.ndarray:
+        return _required(objective, free).jacobian
+
+    found = least_squares(
+        residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale="jac",
+        loss="soft_l1" if robust else "linear", f_scale=3.0, ftol=tolerance, xtol=tolerance,
+        gtol=1e-12, max_nfev=evaluation_limit)
+    return Fit(_required(objective, found.x), found.status > 0, str(found.message))
+
+
+def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: int = 400,
+                delta_m2: float | None = None, tolerance: float = 1e-3) -> Fit:
+    """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
+
+    It stops when the mean squared error of the points falls below ``delta_m2`` [m^2], or settles:
+    when the simplex spans less than ``tolerance`` in every log E and in the objective.
+
+    Raises:
+        WorkError: no candidate had an equilibrium.
+    """
+    lower, upper = objective.space.bounds()
+    best: list[Evaluation] = []
+    point_count = max(sum(int(np.isfinite(f.frames.positions).all(axis=2).sum())
+                          for f in objective.forwards), 1)
+
+    def cost(free: np.ndarray) -> float:
+        known = objective.log.find(free)
+        if known is not None:
+            return known.objective
+        found = objective.evaluate(free)
+        if found is None:
+            return FAILED_OBJECTIVE
+        if not best or found.objective < best[0].objective:
+            best[:] = [found]
+        return found.objective
+
+    def settled(_free: np.ndarray) -> None:
+        if delta_m2 is not None and best and best[0].loss / point_count < delta_m2:
+            raise StopIteration
+
+    steps = np.r_[np.full(objective.space.group_count, 0.5),
+                  [0.03 if name == "poisson" else 0.3 for name in objective.space.extra]]
+    simplex = np.vstack([start, start + np.diag(steps)])
+    found = minimize(cost, start, method="Nelder-Mead", bounds=list(zip(lower, upper, strict=True)),
+                     callback=settled, options={
+                         "initial_simplex": np.clip(simplex, lower, upper), "xatol": tolerance,
+                         "fatol": tolerance, "maxfev": evaluation_limit, "adaptive": False})
+    return Fit(_required(objective, found.x), bool(found.success), str(found.message))
+
+
+def _required(objective: Objective, free: np.ndarray) -> Evaluation:
+    found = objective.evaluate(free, jacobian=True)
+    if found is None:
+        values = objective.space.unpack(free)
+        young = ", ".join(f"{value:.3g}" for value in values.young)
+        raise WorkError(f"The simulation finds no equilibrium with E = {young} Pa.",
+                        "The pull may be impossible for this branch (poses out of its reach).",
+                        "Check the grasp point and the poses, or start from another --young.")
+    return found

@@ -1,0 +1,77 @@
+"""How sure an estimate is: covariance and intervals, and which measurements do not fit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from limber.estimation.objective import Evaluation, Objective
+
+OUTLIER = 4.5
+"""Standardised residual (RMS over axes) from which a measurement is named an outlier."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Of the free vector and of the moduli.
+
+    Attributes:
+        covariance: Of the free vector, shape [p, p].
+        young_interval: 95 % intervals at the control points [Pa], shape [K, 2].
+        variance_factor: Mean squared residual over the one expected; 1 where the noise is as
+            stated.
+        correlation: Of the free vector, shape [p, p].
+    """
+
+    covariance: np.ndarray
+    young_interval: np.ndarray
+    variance_factor: float
+    correlation: np.ndarray
+
+
+def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
+    """Gauss' approximation at the fit's end.
+
+    The stated noise is scaled by what the residuals show, each kind of residual weighing as in
+    the fit; a robust share of the residuals is used, so that outliers do not widen the interval.
+    """
+    jacobian, residual = evaluation.jacobian, evaluation.residual
+    freedom = max(len(residual) - jacobian.shape[1], 1)
+    # Huber's proposal: residuals beyond 3 deviations count as 3.
+    clipped = np.clip(residual, -3 * _scale(residual), 3 * _scale(residual))
+    factor = float(clipped @ clipped / freedom)
+    _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
+    spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
+    covariance = factor * spread @ spread.T
+    deviation = np.sqrt(np.diag(covariance))
+    width = stats.t.ppf(0.5 + level / 2, freedom) * deviation
+    space = objective.space
+    # Wider than 30 orders of magnitude says no more than that nothing is known.
+    width = np.minimum(width, 70.0)
+    centre = evaluation.free
+    low, high = space.unpack(centre - width), space.unpack(centre + width)
+    bounds = np.exp(space.bounds()[0][0]), np.exp(space.bounds()[1][0])
+    interval = np.clip(np.column_stack([low.young, high.young]), *bounds)
+    return Uncertainty(covariance, interval, factor,
+                       covariance / np.maximum(np.outer(deviation, deviation), 1e-300))
+
+
+def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> list[dict]:
+    """Name the measurements that do not fit, worst first: pull, time, point or force, deviations.
+    """
+    found = []
+    for forward, (points, forces) in zip(objective.forwards, objective.scored(evaluation),
+                                         strict=True):
+        for frame, point in np.argwhere(points > OUTLIER):
+            found.append({"pull": forward.name, "time_s": float(forward.frames.times[frame]),
+                          "what": f"point {point + 1}",
+                          "deviations": float(points[frame, point])})
+        if forward.uses_force:
+            for frame in np.flatnonzero(forces > OUTLIER):
+                found.append({"pull": forward.name, "time_s": float(forward.frames.times[frame]),
+                              "what": "force", "deviations": float(forces[frame])})
+    return sorted(found, key=lambda entry: -entry["deviations"])[:limit]
+
+
+def _scale(residual: np.ndarray) -> float:
+    return max(1.4826 * float(np.median(np.abs(residual))), 1e-12)
