@@ -24,6 +24,23 @@ def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str
     """
     command = [sys.executable, "-m", "limber", *map(str, arguments),
                "--json", "--progress", "json"]
+    return run_json_process(arguments[0], command, progress,
+                            fix=f"Run it alone to see more: limber {' '.join(map(str, arguments))}")
+
+
+def run_json_process(name: str, command: Sequence[str], progress: Progress = SILENT, *,
+                     fix: str = "") -> dict[str, Any]:
+    """Run a program that writes progress and result as stages do; returns its result.
+
+    Args:
+        name: What it is called in an error.
+        command: The program and its arguments.
+        progress: Gets what it reports.
+        fix: What to do when it ends without a word.
+
+    Raises:
+        LimberError: as :func:`run_stage`.
+    """
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True,
                                    encoding="utf-8", errors="replace")
@@ -34,7 +51,7 @@ def run_stage(arguments: Sequence[str], progress: Progress = SILENT) -> dict[str
             _stop(process)
             raise
         if process.returncode != 0:
-            raise _failure(arguments, process.returncode, result, errors)
+            raise _failure(name, process.returncode, result, errors, fix)
     return result
 
 
@@ -67,13 +84,11 @@ def _stop(process: subprocess.Popen) -> None:
         process.wait()
 
 
-def _failure(arguments: Sequence[str], code: int, result: dict[str, Any],
-             errors: TextIO) -> LimberError:
-    stage = arguments[0]
+def _failure(name: str, code: int, result: dict[str, Any], errors: TextIO,
+             fix: str) -> LimberError:
+    kind = _ERRORS.get(code, WorkError)
     if result.get("error"):
-        return _ERRORS.get(code, WorkError)(f"{stage}: {result['error']}")
+        return kind(f"{name}: {result['error']}")
     errors.seek(0)
     tail = " | ".join(errors.read().strip().splitlines()[-4:])
-    return _ERRORS.get(code, WorkError)(
-        f"limber {stage} ended with exit code {code} and no result.", tail,
-        f"Run it alone to see more: limber {' '.join(map(str, arguments))}")
+    return kind(f"{name} ended with exit code {code} and no result.", tail, fix)

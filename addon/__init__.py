@@ -1,0 +1,45 @@
+"""The Blender extension Limber: shows branches and starts the worker that computes them.
+
+Nothing is computed here. ``bridge`` is the one door between arrays and Blender's data, each file
+of ``operators`` one action, each file of ``panels`` one step of the work.
+"""
+
+import importlib
+
+# In the order of registration: what a class refers to comes before it.
+MODULES = (
+    "preferences",
+    "properties",
+    "operators.import_cloud",
+    "operators.reconstruct",
+    "operators.open_result",
+    "operators.play",
+    "operators.cancel_job",
+    "operators.check_worker",
+    "panels.job",
+    "panels.import_cloud",
+    "panels.reconstruct",
+    "panels.result",
+    "panels.play",
+    "command",
+)
+
+_registered = []
+
+
+def register() -> None:
+    """Register every module; if one fails, those before it are taken back."""
+    try:
+        for name in MODULES:
+            module = importlib.import_module(f".{name}", __package__)
+            module.register()
+            _registered.append(module)
+    except BaseException:
+        unregister()
+        raise
+
+
+def unregister() -> None:
+    """Take back what :func:`register` did, in reverse order."""
+    while _registered:
+        _registered.pop().unregister()

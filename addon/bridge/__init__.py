@@ -1,0 +1,1 @@
+"""The one door between numpy arrays and Blender's data. Lengths in metres, one unit one metre."""

@@ -1,0 +1,99 @@
+"""Motion from files: a PC2 cache on a mesh, and objects along points.
+
+Blender shows the rest shape without a word when a cache is missing or belongs to another mesh,
+so the file is looked at here first.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+_HEADER = struct.Struct("<12siiffi")
+MODIFIER = "Limber motion"
+
+
+class CacheError(ValueError):
+    """A PC2 file that cannot move the mesh; says what was seen and what to do."""
+
+
+@dataclass(frozen=True)
+class CacheHeader:
+    """What the head of a PC2 file says."""
+
+    vertex_count: int
+    frame_count: int
+
+
+def read_header(path: Path) -> CacheHeader:
+    """Return the header of a PC2 file; CacheError if it is missing, cut short or none at all."""
+    try:
+        with open(path, "rb") as stream:
+            head = stream.read(_HEADER.size)
+            size = stream.seek(0, 2)
+    except OSError as error:
+        raise CacheError(f"{path} cannot be read ({error.strerror}). "
+                         "Open the branch folder again where it is now.") from error
+    if len(head) < _HEADER.size or not head.startswith(b"POINTCACHE2\0"):
+        raise CacheError(f"{path} is not a PC2 file. Run the stage that makes it again.")
+    _, _, vertex_count, _, _, frame_count = _HEADER.unpack(head)
+    if size != _HEADER.size + 12 * vertex_count * frame_count:
+        raise CacheError(f"{path} is cut short. Run the stage that makes it again.")
+    return CacheHeader(vertex_count, frame_count)
+
+
+def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1) -> CacheHeader:
+    """Let the PC2 file at ``path`` move ``target``, its first frame at ``frame_start``.
+
+    The path is kept relative to the .blend where that is saved, so that both can move together.
+
+    Raises:
+        CacheError: the file is not whole, or has another number of vertices.
+    """
+    header = read_header(path)
+    if header.vertex_count != len(target.data.vertices):
+        raise CacheError(
+            f"{path} moves {header.vertex_count} vertices; {target.name} has "
+            f"{len(target.data.vertices)}. It belongs to another mesh: open the result again.")
+    modifier = target.modifiers.get(MODIFIER) or target.modifiers.new(MODIFIER, "MESH_CACHE")
+    modifier.cache_format = "PC2"
+    modifier.filepath = shown_path(path)
+    modifier.frame_start = frame_start
+    modifier.interpolation = "LINEAR"
+    return header
+
+
+def cache_trouble(target: bpy.types.Object) -> str:
+    """Return why the cache of ``target`` does not play, or nothing if it does."""
+    modifier = target.modifiers.get(MODIFIER)
+    if modifier is None:
+        return "It has no motion yet: plan a path first."
+    path = Path(bpy.path.abspath(modifier.filepath))
+    try:
+        header = read_header(path)
+    except CacheError as error:
+        return str(error)
+    if header.vertex_count != len(target.data.vertices):
+        return f"{path} belongs to another mesh. Open the result again."
+    return ""
+
+
+def shown_path(path: Path) -> str:
+    """Return ``path`` as Blender keeps it: relative to a saved .blend, absolute otherwise."""
+    path = Path(path).resolve()
+    if not bpy.data.filepath:
+        return str(path)
+    try:
+        return bpy.path.relpath(str(path))
+    except ValueError:
+        # Another drive on Windows: there is no relative path.
+        return str(path)
+
+
+def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 1) -> None:
+    """Key the place of ``target`` frame by frame to ``points`` [m], shape [frames, 3]."""
+    for number, point in enumerate(np.asarray(points, float)):
+        target.location = point
+        target.keyframe_insert("location", frame=frame_start + number)

@@ -1,0 +1,143 @@
+"""Meshes and their named attributes, to and from arrays."""
+
+import bmesh
+import bpy
+import numpy as np
+
+
+def new_mesh(name: str, vertices: np.ndarray, faces: np.ndarray | None = None) -> bpy.types.Mesh:
+    """Make a mesh of triangles, or of points alone.
+
+    Args:
+        name: Of the data block.
+        vertices: Positions [m], shape [v, 3].
+        faces: Vertex indices, shape [f, 3].
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, or indices out of range.
+    """
+    vertices = _checked(vertices, 3, "vertices")
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(len(vertices))
+    set_positions(mesh, vertices)
+    if faces is not None and len(faces):
+        _add_faces(mesh, np.asarray(faces), len(vertices))
+    mesh.update(calc_edges=True)
+    return mesh
+
+
+def _add_faces(mesh: bpy.types.Mesh, faces: np.ndarray, vertex_count: int) -> None:
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= vertex_count:
+        raise ValueError(f"faces of shape {faces.shape} do not index {vertex_count} vertices")
+    mesh.loops.add(faces.size)
+    mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(faces, np.int32).ravel())
+    mesh.polygons.add(len(faces))
+    mesh.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    mesh.polygons.foreach_set("use_smooth", np.ones(len(faces), bool))
+
+
+def set_positions(mesh: bpy.types.Mesh, vertices: np.ndarray) -> None:
+    """Write all vertex positions [m], shape [v, 3]; by the attribute, 50 times as fast as co."""
+    values = np.ascontiguousarray(_checked(vertices, 3, "vertices"), np.float32)
+    if len(values) != len(mesh.vertices):
+        raise ValueError(f"{len(values)} positions for {len(mesh.vertices)} vertices")
+    attribute = mesh.attributes.get("position")
+    if attribute is None:
+        attribute = mesh.attributes.new("position", "FLOAT_VECTOR", "POINT")
+    attribute.data.foreach_set("vector", values.ravel())
+    mesh.update_tag()
+
+
+def positions(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return all vertex positions [m], float32, shape [v, 3]."""
+    values = np.empty(3 * len(mesh.vertices), np.float32)
+    if len(values):
+        mesh.attributes["position"].data.foreach_get("vector", values)
+    return values.reshape(-1, 3)
+
+
+def faces(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return the triangles of a mesh made of triangles, shape [f, 3]."""
+    values = np.empty(len(mesh.loops), np.int32)
+    mesh.loops.foreach_get("vertex_index", values)
+    return values.reshape(-1, 3)
+
+
+def set_scalars(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
+    """Write one number a vertex as FLOAT attribute ``name``, in its real unit; shape [v]."""
+    values = _checked(values, None, name)
+    _attribute(mesh, name, "FLOAT", len(values)).data.foreach_set(
+        "value", np.ascontiguousarray(values, np.float32))
+    mesh.update_tag()
+
+
+def scalars(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
+    """Return FLOAT attribute ``name``, shape [v]; KeyError if there is none."""
+    values = np.empty(len(mesh.vertices), np.float32)
+    mesh.attributes[name].data.foreach_get("value", values)
+    return values
+
+
+def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
+    """Write a linear RGBA colour a vertex and make it the one that Solid mode shows; [v, 4]."""
+    values = _checked(values, 4, name)
+    _attribute(mesh, name, "FLOAT_COLOR", len(values)).data.foreach_set(
+        "color", np.ascontiguousarray(values, np.float32).ravel())
+    mesh.color_attributes.active_color = mesh.color_attributes[name]
+    mesh.update_tag()
+
+
+def new_sphere(name: str, radius: float) -> bpy.types.Mesh:
+    """Make a smooth sphere of ``radius`` [m] about the origin."""
+    return _primitive(name, lambda mesh: bmesh.ops.create_uvsphere(
+        mesh, u_segments=32, v_segments=16, radius=radius))
+
+
+def new_cylinder(name: str, radius: float, height: float) -> bpy.types.Mesh:
+    """Make a cylinder of ``radius`` and ``height`` [m] about the origin, along z."""
+    return _primitive(name, lambda mesh: bmesh.ops.create_cone(
+        mesh, cap_ends=True, segments=64, radius1=radius, radius2=radius, depth=height))
+
+
+def new_rectangle(name: str, width: float, height: float) -> bpy.types.Mesh:
+    """Make a rectangle in the xy plane, its lower left corner at the origin [m].
+
+    FLOAT attribute ``height`` runs from 0 at the bottom to 1 at the top.
+    """
+    corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]], float)
+    mesh = new_mesh(name, corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    set_scalars(mesh, "height", np.array([0.0, 0.0, 1.0, 1.0]))
+    return mesh
+
+
+def _primitive(name, make) -> bpy.types.Mesh:
+    builder = bmesh.new()
+    try:
+        make(builder)
+        mesh = bpy.data.meshes.new(name)
+        builder.to_mesh(mesh)
+    finally:
+        builder.free()
+    for polygon in mesh.polygons:
+        polygon.use_smooth = len(polygon.vertices) == 4 or len(mesh.polygons) > 100
+    return mesh
+
+
+def _attribute(mesh: bpy.types.Mesh, name: str, kind: str, count: int):
+    if count != len(mesh.vertices):
+        raise ValueError(f"{name}: {count} values for {len(mesh.vertices)} vertices")
+    attribute = mesh.attributes.get(name)
+    if attribute is not None and (attribute.data_type, attribute.domain) != (kind, "POINT"):
+        mesh.attributes.remove(attribute)
+        attribute = None
+    return attribute or mesh.attributes.new(name, kind, "POINT")
+
+
+def _checked(values: np.ndarray, columns: int | None, name: str) -> np.ndarray:
+    values = np.asarray(values)
+    wanted = values.ndim == 1 if columns is None else values.ndim == 2
+    if not wanted or (columns is not None and values.shape[1] != columns):
+        raise ValueError(f"{name} has shape {values.shape}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds values that are not finite")
+    return values

@@ -1,0 +1,79 @@
+"""Reads the points of a scan, to show them; the worker reads the file itself."""
+
+from pathlib import Path
+
+import numpy as np
+
+_PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4",
+              "uint": "u4", "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1",
+              "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4",
+              "float64": "f8"}
+_PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+def read_points(path: Path) -> np.ndarray:
+    """Return the points of a PLY, XYZ, TXT or CSV file in its own unit, shape [n, 3].
+
+    Raises:
+        ValueError: not readable as points; says what to do.
+    """
+    try:
+        points = _read_ply(path) if path.suffix.lower() == ".ply" else _read_text(path)
+    except (OSError, ValueError, IndexError, KeyError, StopIteration) as error:
+        raise ValueError(f"{path} cannot be shown as points ({error}). The worker reads more "
+                         "kinds of files: it may still reconstruct this one.") from error
+    if len(points) == 0 or not np.isfinite(points).all():
+        raise ValueError(f"{path} has no points, or points that are not finite. "
+                         "Export the scan again.")
+    return points
+
+
+def _read_text(path: Path) -> np.ndarray:
+    with open(path, encoding="utf-8", errors="replace") as stream:
+        first = stream.readline()
+        delimiter = next((mark for mark in ",;" if mark in first), None)
+    skipped = 0 if _is_numbers(first, delimiter) else 1
+    return np.loadtxt(path, delimiter=delimiter, skiprows=skipped, usecols=(0, 1, 2), ndmin=2)
+
+
+def _is_numbers(line: str, delimiter: str | None) -> bool:
+    try:
+        return [float(part) for part in line.split(delimiter)[:3]] != []
+    except ValueError:
+        return False
+
+
+def _read_ply(path: Path) -> np.ndarray:
+    with open(path, "rb") as stream:
+        order, count, columns = _read_ply_header(stream)
+        if order == "=":
+            rows = np.loadtxt(stream, max_rows=count, ndmin=2)
+            names = [name for name, _ in columns]
+            return rows[:, [names.index(axis) for axis in "xyz"]]
+        kind = np.dtype([(name, order + code) for name, code in columns])
+        content = stream.read(count * kind.itemsize)
+    if len(content) < count * kind.itemsize:
+        raise ValueError("it is cut short")
+    rows = np.frombuffer(content, kind)
+    return np.column_stack([rows[axis].astype(float) for axis in "xyz"])
+
+
+def _read_ply_header(stream) -> tuple[str, int, list[tuple[str, str]]]:
+    """Return byte order, vertex count and the columns (name, numpy type) of the vertices."""
+    if stream.readline().strip() != b"ply":
+        raise ValueError("it does not begin as a PLY file")
+    order, count, columns, element = "", 0, [], ""
+    for line in iter(stream.readline, b""):
+        words = line.decode("ascii", "replace").split()
+        if words[:1] == ["format"]:
+            order = _PLY_ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            if words[1] != "vertex" and not columns:
+                raise ValueError("its first element is not the vertices")
+            element = words[1]
+            count = int(words[2]) if element == "vertex" else count
+        elif words[:1] == ["property"] and element == "vertex":
+            columns.append((words[2], _PLY_TYPES[words[1]]))
+        elif words == ["end_header"]:
+            return order, count, columns
+    raise ValueError("its header has no end")

@@ -1,0 +1,21 @@
+"""What differs between Blender 4.2 and 5.2, and between builds, in one place."""
+
+import bpy
+
+IS_MODULE = bool(getattr(bpy.app, "module", False))
+"""Whether this is the ``bpy`` package in a plain Python, not Blender's program."""
+
+
+def can_denoise() -> bool:
+    """Whether Cycles has OpenImageDenoise; Debian's build has not, and renders nothing with it."""
+    try:
+        import _cycles
+    except ImportError:
+        return False
+    return bool(getattr(_cycles, "with_openimagedenoise", False))
+
+
+def eevee_engine() -> str:
+    """Return EEVEE's identifier: it was BLENDER_EEVEE_NEXT from 4.2 to 4.5."""
+    engines = bpy.types.RenderSettings.bl_rna.properties["engine"].enum_items.keys()
+    return "BLENDER_EEVEE_NEXT" if "BLENDER_EEVEE_NEXT" in engines else "BLENDER_EEVEE"

@@ -1,0 +1,111 @@
+"""The legend of a picture: text and colour keys that stand still before the camera."""
+
+import bpy
+from mathutils import Vector
+
+from .bridge import materials, meshes
+from .scene import COLORS, ShownBranch, add_object
+from .scene_data import SceneData
+
+# In picture heights.
+_MARGIN = 0.04
+_TITLE = 0.046
+_TEXT = 0.027
+_LINE = 0.044
+_BAR_WIDTH = 0.032
+_BAR_HEIGHT = 0.26
+
+
+class _Sheet:
+    """A plane before the camera on which things are laid from the top left corner down."""
+
+    def __init__(self, scene: bpy.types.Scene, camera: bpy.types.Object):
+        self.collection = bpy.data.collections.new("Legend")
+        scene.collection.children.link(self.collection)
+        self.camera = camera
+        frame = camera.data.view_frame(scene=scene)
+        # Just behind the near plane, so that nothing of the scene gets before it.
+        depth = 2.0 * camera.data.clip_start
+        corners = [corner * (depth / -corner.z) for corner in frame]
+        left = min(corner.x for corner in corners)
+        top = max(corner.y for corner in corners)
+        self.unit = top - min(corner.y for corner in corners)
+        self.corner = Vector((left, top, -depth))
+        self.x, self.y = _MARGIN, _MARGIN
+        self.ink = materials.flat_material("Legend ink", (0.012, 0.014, 0.018))
+
+    def put(self, name: str, data: bpy.types.ID, material: bpy.types.Material,
+            x: float, y: float) -> bpy.types.Object:
+        """Put an object at ``x`` right of and ``y`` below the corner, in picture heights."""
+        thing = add_object(self.collection, name, data, material)
+        thing.parent = self.camera
+        thing.location = self.corner + Vector((x, -y, 0.0)) * self.unit
+        for ray in ("diffuse", "glossy", "transmission", "volume_scatter", "shadow"):
+            setattr(thing, f"visible_{ray}", False)
+        return thing
+
+    def text(self, words: str, *, size: float = _TEXT, x: float = 0.0, y: float | None = None,
+             ) -> None:
+        """Write ``words`` with their upper edge at ``y``."""
+        curve = bpy.data.curves.new(f"Legend {words[:20]}", "FONT")
+        curve.body = words
+        curve.size = size * self.unit
+        curve.align_y = "CENTER"
+        middle = (self.y if y is None else y) + size / 2
+        self.put(f"Legend: {words[:40]}", curve, self.ink, self.x + x, middle)
+
+    def swatch(self, color: tuple[float, float, float], width: float, height: float) -> None:
+        """Lay a bar of one colour on the current line."""
+        mesh = meshes.new_rectangle("Legend key", width * self.unit, height * self.unit)
+        material = materials.flat_material("Legend key", color)
+        self.put("Legend key", mesh, material, self.x + (0.05 - width) / 2,
+                 self.y + _TEXT / 2 + height / 2)
+
+
+def add_legend(scene: bpy.types.Scene, camera: bpy.types.Object, data: SceneData,
+               shown: ShownBranch) -> bpy.types.Collection:
+    """Write what the picture shows, with units, left of the branch; returns the collection."""
+    sheet = _Sheet(scene, camera)
+    sheet.text(data.info["name"].replace("_", " "), size=_TITLE)
+    sheet.y += 1.6 * _TITLE
+    for note in data.info["notes"]:
+        sheet.text(note)
+        sheet.y += _LINE
+    sheet.y += 0.6 * _LINE
+    for name, scale in data.info["scalars"].items():
+        if shown.surface.data.materials[0].name.endswith(scale["title"]):
+            _add_color_bar(sheet, name, scale)
+    _add_keys(sheet, data, shown)
+    return sheet.collection
+
+
+def _add_color_bar(sheet: _Sheet, name: str, scale: dict) -> None:
+    sheet.text(scale["title"] + (", log scale" if scale["log"] else ""))
+    sheet.y += 1.3 * _LINE
+    mesh = meshes.new_rectangle("Legend colours", _BAR_WIDTH * sheet.unit,
+                                _BAR_HEIGHT * sheet.unit)
+    material = materials.scalar_material(f"Legend {name}", "height", low=0.0, high=1.0,
+                                         log=False, stops=scale["stops"], flat=True)
+    sheet.put("Legend colours", mesh, material, sheet.x, sheet.y + _BAR_HEIGHT)
+    for share, tick in zip((1.0, 0.5, 0.0), scale["ticks"], strict=True):
+        sheet.text(tick, x=_BAR_WIDTH + 0.018, y=sheet.y + share * _BAR_HEIGHT - _TEXT / 2)
+    sheet.y += _BAR_HEIGHT + 1.2 * _LINE
+
+
+def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
+    thin, dot = (0.05, 0.009), (0.022, 0.022)
+    keys = [(f"path:{key}", f"{about['title']} path", about["note"], thin)
+            for key, about in data.info["paths"].items()]
+    goal = (data.info.get("goal") or {}).get("kind", "grasp")
+    keys += [("goal", f"goal of the {goal}", "", dot), ("grasp", "grasp", "", dot),
+             ("control_points", "control points", "", dot), ("rest", "rest shape", "", dot),
+             ("base", "fixed base", "", dot)]
+    for name, words, note, (width, height) in keys:
+        if name not in shown.objects:
+            continue
+        sheet.swatch(COLORS[name], width, height)
+        sheet.text(words, x=0.066)
+        sheet.y += _LINE
+        if note:
+            sheet.text(note, x=0.066, y=sheet.y - 0.2 * _LINE)
+            sheet.y += 0.9 * _LINE

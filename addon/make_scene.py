@@ -1,0 +1,76 @@
+"""Makes a scene file and its picture; `limber scene` runs this in a process that has bpy.
+
+    blender -b --factory-startup --python make_scene.py -- DATA.npz SCENE.blend [PICTURE.png]
+
+Standard output carries JSON lines as every stage's does; the last one has ``status``.
+"""
+
+import importlib
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import bpy
+
+
+def _load_addon():
+    """Import the folder of this file as a package, whatever it is called there."""
+    folder = Path(__file__).resolve().parent
+    spec = importlib.util.spec_from_file_location(
+        "limber_addon", folder / "__init__.py", submodule_search_locations=[str(folder)])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+
+
+def _say(**content) -> None:
+    # The new line first: Blender leaves half-written lines of its own on standard output.
+    print("\n" + json.dumps(content), flush=True)
+
+
+def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None) -> dict:
+    """Build the scene of ``data_path``, save it and render its last frame; returns a summary."""
+    _load_addon()
+    scenes = importlib.import_module("limber_addon.scene")
+    studio = importlib.import_module("limber_addon.studio")
+    legend = importlib.import_module("limber_addon.legend")
+    scene_data = importlib.import_module("limber_addon.scene_data")
+    data = scene_data.read_scene_data(data_path)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    # Saved before it is filled: from then on paths are kept relative to it.
+    bpy.ops.wm.save_as_mainfile(filepath=str(scene_path), compress=True)
+    scene = bpy.context.scene
+    scene.name = data.info["name"]
+    scene.unit_settings.system = "METRIC"
+    shown = scenes.show_branch(scene, data)
+    camera = studio.set_up_studio(scene, data)
+    legend.add_legend(scene, camera, data, shown)
+    _say(progress=0.2, message="scene built")
+    scene.frame_set(scene.frame_end if shown.frame_count > 1 else 1)
+    bpy.ops.wm.save_as_mainfile(filepath=str(scene_path), compress=True)
+    _say(progress=0.3, message="scene saved")
+    if picture_path is not None:
+        _say(progress=0.3, message="rendering")
+        scene.render.filepath = str(picture_path)
+        bpy.ops.render.render(write_still=True)
+    return {"object_count": len(scene.objects), "frame_count": shown.frame_count,
+            "blender": bpy.app.version_string}
+
+
+def main(arguments: list[str]) -> int:
+    """Run with the arguments after ``--``; returns the exit code."""
+    data, scene, *picture = (Path(argument) for argument in arguments)
+    try:
+        summary = make_scene(data, scene, picture[0] if picture else None)
+    except (ValueError, RuntimeError, OSError) as error:
+        _say(status="failed", error=str(error))
+        return 3
+    _say(status="done", error=None, **summary)
+    return 0
+
+
+if __name__ == "__main__":
+    code = main(sys.argv[sys.argv.index("--") + 1:])
+    if code:
+        sys.exit(code)

@@ -1,0 +1,33 @@
+"""Ask the worker what it is and what it lacks."""
+
+import bpy
+
+from .. import preferences
+from .worker_operator import WorkerOperator
+
+
+class LIMBER_OT_check_worker(WorkerOperator, bpy.types.Operator):
+    """Start the worker and show its version and what is missing there"""
+
+    bl_idname = "limber.check_worker"
+    bl_label = "Check the Worker"
+    title = "Checking the worker"
+
+    def arguments(self, context):
+        return ["doctor"]
+
+    def finish(self, context, result):
+        missing = ", ".join(result.get("missing", [])) or "nothing"
+        status = f"Python {result['python']} on {result['system']}\nMissing there: {missing}"
+        chosen = preferences.get(context)
+        if chosen is not None:
+            chosen.worker_status = status
+        self.report({"INFO"}, status.replace("\n", ". "))
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_check_worker)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(LIMBER_OT_check_worker)

@@ -1,0 +1,67 @@
+"""Open a branch folder: its surface coloured and moving, paths, goal and marks."""
+
+import tempfile
+from pathlib import Path
+
+import bpy
+
+from .. import scene, scene_data
+from .worker_operator import WorkerOperator
+
+
+class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
+    """Show what the branch folder holds"""
+
+    bl_idname = "limber.open_result"
+    bl_label = "Open Result"
+    title = "Opening"
+
+    directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
+    _temporary = None
+
+    def arguments(self, context):
+        settings = context.scene.limber
+        if self.directory:
+            settings.branch_folder = self.directory
+        folder = Path(bpy.path.abspath(settings.branch_folder)) if settings.branch_folder else None
+        if folder is None or not (folder / "branch.json").is_file():
+            raise ValueError("Choose a branch folder: one that holds a file branch.json.")
+        self._temporary = tempfile.TemporaryDirectory(prefix="limber-open-")
+        plan = ["--plan", settings.plan] if settings.plan else []
+        return ["scene", str(folder), "--data", str(self._data_path), *plan]
+
+    def finish(self, context, result):
+        with self._temporary:
+            data = scene_data.read_scene_data(self._data_path)
+        shown = scene.show_branch(context.scene, data)
+        _look_at(context, shown)
+        self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")
+
+    @property
+    def _data_path(self) -> Path:
+        return Path(self._temporary.name) / "scene.npz"
+
+
+def _look_at(context: bpy.types.Context, shown: scene.ShownBranch) -> None:
+    """Let the 3D views show the colours, and the branch fill them."""
+    if bpy.app.background or context.window is None:
+        return
+    for thing in context.selected_objects:
+        thing.select_set(False)
+    shown.surface.select_set(True)
+    context.view_layer.objects.active = shown.surface
+    for area in context.window.screen.areas:
+        if area.type != "VIEW_3D":
+            continue
+        area.spaces.active.shading.color_type = "VERTEX"
+        region = next(region for region in area.regions if region.type == "WINDOW")
+        with context.temp_override(area=area, region=region):
+            bpy.ops.view3d.view_selected()
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_open_result)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(LIMBER_OT_open_result)

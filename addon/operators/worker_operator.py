@@ -1,0 +1,105 @@
+"""What operators share that run a command of the worker: as a job with progress, or waiting."""
+
+import bpy
+
+from .. import jobs, preferences
+from ..worker import WorkerNotFound
+
+_INTERVAL_SECONDS = 0.1
+
+
+class WorkerOperator:
+    """Mix-in: ``arguments`` says what to run, ``finish`` what to do with the result.
+
+    Called from a button it runs beside the interface; from a script or without a window it waits.
+    """
+
+    title = "Working"
+    _timer = None
+    _job: jobs.Job | None = None
+
+    @classmethod
+    def poll(cls, context):
+        if jobs.is_running():
+            cls.poll_message_set("The worker is busy")
+            return False
+        return True
+
+    def arguments(self, context: bpy.types.Context) -> list[str]:
+        """Return the worker's arguments, without --json; ValueError says what is missing."""
+        raise NotImplementedError
+
+    def finish(self, context: bpy.types.Context, result: dict) -> None:
+        """Use the worker's result; ValueError says why it cannot be used."""
+        raise NotImplementedError
+
+    def execute(self, context):
+        if not self._start(context):
+            return {"CANCELLED"}
+        self._job.wait()
+        return self._end(context)
+
+    def invoke(self, context, event):
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        if not self._start(context):
+            return {"CANCELLED"}
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(_INTERVAL_SECONDS, window=context.window)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        _redraw_sidebars(context)
+        if self._job.poll() is jobs.JobState.RUNNING:
+            return {"PASS_THROUGH"}
+        self._remove_timer(context)
+        return self._end(context)
+
+    def cancel(self, context):
+        """Blender closes or loads another file: the worker must not live on unseen."""
+        self._remove_timer(context)
+        if self._job is not None:
+            self._job.stop_now()
+            self._job.poll()
+
+    def _start(self, context) -> bool:
+        try:
+            command = [*preferences.worker_command(), *self.arguments(context),
+                       "--json", "--progress", "json"]
+            self._job = jobs.start(self.title, command)
+        except (ValueError, RuntimeError, OSError, WorkerNotFound) as error:
+            self.report({"ERROR"}, str(error))
+            return False
+        return True
+
+    def _end(self, context):
+        job = self._job
+        for warning in job.result.get("warnings", []):
+            self.report({"WARNING"}, warning)
+        if job.state is jobs.JobState.CANCELLED:
+            self.report({"INFO"}, f"{self.title}: cancelled")
+            return {"CANCELLED"}
+        if job.state is jobs.JobState.FAILED:
+            self.report({"ERROR"}, job.error)
+            return {"CANCELLED"}
+        try:
+            self.finish(context, job.result)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def _remove_timer(self, context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+
+
+def _redraw_sidebars(context: bpy.types.Context) -> None:
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()

@@ -1,0 +1,1 @@
+"""The sidebar tab "Limber": one step of the work a file."""

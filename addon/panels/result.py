@@ -1,0 +1,41 @@
+"""Step 3: what a branch folder holds, and what its colours mean."""
+
+import json
+
+import bpy
+
+from .. import scene
+from .sidebar import SidebarPanel
+
+
+class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
+    bl_idname = "LIMBER_PT_result"
+    bl_label = "3  Result"
+    bl_order = 3
+
+    def draw(self, context):
+        settings = context.scene.limber
+        self.layout.prop(settings, "branch_folder")
+        self.layout.prop(settings, "plan")
+        self.layout.operator("limber.open_result", icon="FILE_FOLDER")
+        surface = scene.find_surface(context.scene)
+        if surface is not None:
+            _draw_legend(self.layout, json.loads(surface[scene.INFO_KEY]))
+
+
+def _draw_legend(layout: bpy.types.UILayout, info: dict) -> None:
+    column = layout.column(align=True)
+    for note in info["notes"]:
+        column.label(text=note)
+    for name, scale in info["scalars"].items():
+        row = layout.row(align=True)
+        row.operator("limber.color_by", text=scale["title"], icon="COLOR").scalar = name
+        layout.label(text=f"{scale['ticks'][0]} to {scale['ticks'][-1]}")
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_PT_result)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(LIMBER_PT_result)

@@ -1,0 +1,9 @@
+"""What the panels of the sidebar share."""
+
+
+class SidebarPanel:
+    """Mix-in: a panel of the tab "Limber" in the 3D view."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "Limber"

@@ -1,0 +1,190 @@
+"""A branch in a Blender scene: its surface coloured and moving, paths, goal and other marks."""
+
+import json
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from .bridge import animation, curves, materials, meshes
+from .scene_data import SceneData
+
+FOLDER_KEY = "limber_folder"
+INFO_KEY = "limber_info"
+ENERGY_KEY = "limber_energy_j"
+
+# Linear colours. Those of the marks stand apart from the colour map of the branch.
+COLORS = {
+    "path:plan": (0.78, 0.015, 0.06),
+    "path:baseline": (0.01, 0.13, 0.62),
+    "goal": (0.02, 0.42, 0.08),
+    "grasp": (0.95, 0.25, 0.0),
+    "control_points": (0.62, 0.02, 0.55),
+    "base": (0.10, 0.075, 0.06),
+    "rest": (0.22, 0.22, 0.22),
+}
+
+
+@dataclass
+class ShownBranch:
+    """What :func:`show_branch` made: the objects by what they show."""
+
+    collection: bpy.types.Collection
+    surface: bpy.types.Object
+    objects: dict[str, list[bpy.types.Object]] = field(default_factory=dict)
+    frame_count: int = 1
+
+
+def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = None,
+                ) -> ShownBranch:
+    """Put the branch into a collection of ``scene``; one shown before from that folder goes.
+
+    Args:
+        scene: Where to.
+        data: What the worker found in the branch folder.
+        scalar: What the colours mean: a name of ``data.info["scalars"]``, the first by default.
+
+    Raises:
+        bridge.animation.CacheError: the frames cannot move this surface.
+    """
+    shown = _new_branch(scene, data, scalar)
+    _add_paths(shown, data)
+    _add_points(shown, data)
+    _add_goal(shown, data)
+    _add_base(shown, data)
+    _add_motion(scene, shown, data)
+    return shown
+
+
+def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """Return the surface of the branch last opened in ``scene``, if there is one."""
+    for collection in reversed(scene.collection.children_recursive):
+        if FOLDER_KEY in collection:
+            return next((thing for thing in collection.objects if INFO_KEY in thing), None)
+    return None
+
+
+def color_by(surface: bpy.types.Object, name: str) -> None:
+    """Colour ``surface`` by scalar ``name``, in Solid mode and in rendering.
+
+    Raises:
+        KeyError: the branch has no such scalar.
+    """
+    scale = json.loads(surface[INFO_KEY])["scalars"][name]
+    label = f"{surface.name} {scale['title']}"
+    material = bpy.data.materials.get(label) or materials.scalar_material(
+        label, name, low=scale["low"], high=scale["high"], log=scale["log"],
+        stops=scale["stops"])
+    surface.data.materials.clear()
+    surface.data.materials.append(material)
+    color = f"{name}_color"
+    surface.data.color_attributes.active_color = surface.data.color_attributes[color]
+
+
+def add_object(collection: bpy.types.Collection, name: str, data: bpy.types.ID,
+               material: bpy.types.Material | None = None) -> bpy.types.Object:
+    """Make an object of ``data`` in ``collection``."""
+    thing = bpy.data.objects.new(name, data)
+    collection.objects.link(thing)
+    if material is not None:
+        thing.data.materials.clear()
+        thing.data.materials.append(material)
+    return thing
+
+
+def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> ShownBranch:
+    name = data.info["name"]
+    _remove_shown(scene, str(data.folder))
+    collection = bpy.data.collections.new(name)
+    collection[FOLDER_KEY] = animation.shown_path(data.folder)
+    scene.collection.children.link(collection)
+    mesh = meshes.new_mesh(name, data.arrays["vertices"], data.arrays["faces"])
+    surface = add_object(collection, name, mesh)
+    surface[INFO_KEY] = json.dumps(data.info)
+    for key in data.info["scalars"]:
+        meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
+        meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
+    names = list(data.info["scalars"])
+    if names:
+        color_by(surface, scalar if scalar in names else names[0])
+    return ShownBranch(collection, surface)
+
+
+def _remove_shown(scene: bpy.types.Scene, folder: str) -> None:
+    for collection in list(scene.collection.children):
+        if FOLDER_KEY not in collection:
+            continue
+        if bpy.path.abspath(collection[FOLDER_KEY]) == folder:
+            for thing in list(collection.objects):
+                bpy.data.objects.remove(thing)
+            bpy.data.collections.remove(collection)
+
+
+def _add_paths(shown: ShownBranch, data: SceneData) -> None:
+    # The baseline is a little thinner: where both run together, both are seen.
+    for key, share in (("plan", 0.0035), ("baseline", 0.0026)):
+        name = f"path:{key}"
+        if name not in data.arrays:
+            continue
+        title = data.info["paths"][key]["title"]
+        curve = curves.new_polyline(title, data.arrays[name], share * data.info["size_m"])
+        material = materials.plain_material(title, COLORS[name], roughness=0.4)
+        shown.objects[name] = [add_object(shown.collection, f"{title} path", curve, material)]
+
+
+def _add_points(shown: ShownBranch, data: SceneData) -> None:
+    for name, title, share in (("control_points", "Control point", 0.011),
+                               ("grasp", "Grasp", 0.013)):
+        points = data.arrays.get(name, np.empty((0, 3)))
+        if len(points) == 0:
+            continue
+        ball = meshes.new_sphere(title, share * data.info["size_m"])
+        material = materials.plain_material(title, COLORS[name], roughness=0.35)
+        shown.objects[name] = []
+        for number, point in enumerate(points):
+            thing = add_object(shown.collection, f"{title} {number + 1}", ball, material)
+            thing.location = point
+            shown.objects[name].append(thing)
+
+
+def _add_goal(shown: ShownBranch, data: SceneData) -> None:
+    goal = data.info.get("goal")
+    if not goal:
+        return
+    ball = meshes.new_sphere("Goal", goal["radius_m"] or 0.02 * data.info["size_m"])
+    material = materials.plain_material("Goal", COLORS["goal"], alpha=0.3)
+    thing = add_object(shown.collection, "Goal", ball, material)
+    thing.location = goal["centre_m"]
+    shown.objects["goal"] = [thing]
+
+
+def _add_base(shown: ShownBranch, data: SceneData) -> None:
+    base = data.info.get("base")
+    if not base:
+        return
+    size = data.info["size_m"]
+    bottom = min(data.info["ground_m"], base["centre_m"][2]) - 0.03 * size
+    height = base["top_m"] - bottom
+    block = meshes.new_cylinder("Fixed base", max(2.2 * base["radius_m"], 0.03 * size), height)
+    material = materials.plain_material("Fixed base", COLORS["base"], roughness=0.8)
+    thing = add_object(shown.collection, "Fixed base", block, material)
+    thing.location = (*base["centre_m"][:2], bottom + height / 2)
+    shown.objects["base"] = [thing]
+
+
+def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> None:
+    frames = data.info.get("frames")
+    if not frames:
+        return
+    rest = shown.surface.data.copy()
+    rest.materials.clear()
+    material = materials.plain_material("Rest shape", COLORS["rest"], alpha=0.25)
+    shown.objects["rest"] = [add_object(shown.collection, "Rest shape", rest, material)]
+    header = animation.attach_cache(shown.surface, data.folder / frames["file"])
+    shown.frame_count = header.frame_count
+    scene.frame_start, scene.frame_end = 1, header.frame_count
+    scene.frame_set(1)
+    if "grasp_motion" in data.arrays and "grasp" in shown.objects:
+        animation.move_along(shown.objects["grasp"][0], data.arrays["grasp_motion"])
+    if "frame_energy" in data.arrays:
+        shown.surface[ENERGY_KEY] = [float(value) for value in data.arrays["frame_energy"]]

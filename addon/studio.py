@@ -1,0 +1,126 @@
+"""Ground, light, camera and rendering around a branch, so that its picture explains itself."""
+
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from mathutils import Vector
+
+from . import compat
+from .bridge import materials, meshes
+from .scene import add_object
+from .scene_data import SceneData
+
+# Share of the picture's width that is kept free on the left, for the legend.
+LEGEND_SHARE = 0.30
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Size of a rendered picture [pixels] and how many samples a pixel may take."""
+
+    width: int = 1120
+    height: int = 840
+    samples: int = 32
+
+
+def set_up_studio(scene: bpy.types.Scene, data: SceneData,
+                  picture: Picture = Picture()) -> bpy.types.Object:  # noqa: B008 (frozen)
+    """Add ground, lights and a camera that sees all of ``view_points``; returns the camera."""
+    collection = bpy.data.collections.new("Studio")
+    scene.collection.children.link(collection)
+    _set_rendering(scene, picture)
+    _set_world(scene)
+    _add_ground(collection, data)
+    _add_lights(collection, data)
+    return _add_camera(scene, collection, data)
+
+
+def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
+    render = scene.render
+    render.engine = "CYCLES"
+    render.resolution_x, render.resolution_y = picture.width, picture.height
+    render.resolution_percentage = 100
+    render.image_settings.file_format = "PNG"
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.use_denoising = compat.can_denoise()
+    # Without a denoiser, more samples stand in for it.
+    cycles.samples = picture.samples if compat.can_denoise() else 4 * picture.samples
+    # Most of the picture is plain background: few samples there, and a tenth of the time.
+    cycles.use_adaptive_sampling = True
+    if hasattr(cycles, "denoising_quality"):
+        cycles.denoising_quality = "BALANCED"
+    cycles.adaptive_min_samples = 4
+    cycles.adaptive_threshold = 0.1 if compat.can_denoise() else 0.03
+    cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces = 2, 1, 1
+    cycles.transparent_max_bounces = 16
+    cycles.use_light_tree = False
+    # Colours mean numbers here: no filmic curve may bend them.
+    scene.view_settings.view_transform = "Standard"
+
+
+def _set_world(scene: bpy.types.Scene) -> None:
+    world = scene.world or bpy.data.worlds.new("World")
+    scene.world = world
+    world.use_nodes = True
+    world.cycles.sampling_method = "NONE"
+    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
+    background.inputs["Color"].default_value = (0.82, 0.85, 0.88, 1.0)
+    background.inputs["Strength"].default_value = 0.95
+
+
+def _add_ground(collection: bpy.types.Collection, data: SceneData) -> None:
+    size = data.info["size_m"]
+    # A round plate: it takes the shadow, and no horizon crosses the branch.
+    plate = meshes.new_cylinder("Ground", 0.24 * size, 0.01 * size)
+    material = materials.plain_material("Ground", (0.36, 0.37, 0.36), roughness=0.9)
+    thing = add_object(collection, "Ground", plate, material)
+    middle = (data.info.get("base") or {}).get("centre_m", data.arrays["view_points"].mean(axis=0))
+    thing.location = (middle[0], middle[1], data.info["ground_m"] - 0.035 * size)
+
+
+def _add_lights(collection: bpy.types.Collection, data: SceneData) -> None:
+    towards = Vector(data.arrays["view_direction"])
+    side = towards.cross(Vector((0.0, 0.0, 1.0))).normalized()
+    for name, direction, strength, angle in (
+            ("Key light", towards - 0.9 * side + Vector((0, 0, -1.1)), 1.9, 0.12),
+            ("Fill light", towards + 1.2 * side + Vector((0, 0, -0.4)), 0.5, 0.6)):
+        light = bpy.data.lights.new(name, "SUN")
+        light.energy, light.angle = strength, angle
+        thing = bpy.data.objects.new(name, light)
+        thing.rotation_mode = "QUATERNION"
+        thing.rotation_quaternion = direction.to_track_quat("-Z", "Y")
+        collection.objects.link(thing)
+
+
+def _add_camera(scene: bpy.types.Scene, collection: bpy.types.Collection,
+                data: SceneData) -> bpy.types.Object:
+    lens = bpy.data.cameras.new("Camera")
+    camera = bpy.data.objects.new("Camera", lens)
+    collection.objects.link(camera)
+    scene.camera = camera
+    lens.sensor_fit = "VERTICAL"
+    lens.lens = 55
+    lens.clip_start, lens.clip_end = 0.01 * data.info["size_m"], 100 * data.info["size_m"]
+    camera.rotation_mode = "QUATERNION"
+    camera.rotation_quaternion = Vector(data.arrays["view_direction"]).to_track_quat("-Z", "Y")
+    _fit(scene, camera, data.arrays["view_points"])
+    return camera
+
+
+def _fit(scene: bpy.types.Scene, camera: bpy.types.Object, points: np.ndarray) -> None:
+    """Move the camera back until all ``points`` [m] are seen, right of the legend."""
+    render = scene.render
+    width = render.resolution_x
+    render.resolution_x = round(width * (1 - LEGEND_SHARE) * 0.92)
+    bpy.context.view_layer.update()
+    place, _ = camera.camera_fit_coords(
+        bpy.context.evaluated_depsgraph_get(), np.asarray(points, np.float32).ravel())
+    render.resolution_x = width
+    towards = camera.rotation_quaternion @ Vector((0.0, 0.0, -1.0))
+    distance = (Vector(points.mean(axis=0)) - place).dot(towards)
+    camera.location = place - 0.10 * distance * towards
+    # The shift is in sensor heights (sensor_fit is VERTICAL).
+    camera.data.shift_x = -LEGEND_SHARE / 2 * width / render.resolution_y
+    bpy.context.view_layer.update()
