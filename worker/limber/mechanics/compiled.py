@@ -1,0 +1,40 @@
+"""How the kernels are compiled: once, into the user's cache folder.
+
+numba keeps compiled code beside the source by default. An installed Limber may be read-only, and
+Blender's and the user's Python differ, so it goes to the user's cache folder instead; an explicit
+NUMBA_CACHE_DIR wins. Where no folder can be written the kernels are compiled for the process.
+"""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import platformdirs
+
+
+def cache_folder() -> Path | None:
+    """Return the folder for compiled kernels, or None if it cannot be written to."""
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR")
+                  or platformdirs.user_cache_path("limber") / "numba")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        return None
+
+
+def compiled(function: Callable) -> Callable:
+    """Compile ``function`` with numba; the result is kept in :func:`cache_folder`."""
+    folder = cache_folder()
+    options = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+    if folder is None:
+        return numba.njit(**options)(function)
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder)
+    try:
+        return numba.njit(cache=True, **options)(function)
+    finally:
+        numba.config.CACHE_DIR = before

@@ -1,0 +1,164 @@
+"""A grasp: the patch of nodes that a gripper holds, and poses."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics.elements import node_weights
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """A patch of nodes held by a gripper.
+
+    Attributes:
+        nodes: Indices of the patch's nodes, sorted.
+        weights: Parts of a force that the nodes take, shape [k]; they sum to 1. The position of
+            a pinned grasp is the mean of the nodes with these weights, so that force and
+            position are work-conjugate.
+        centre: The patch's weighted centre at rest [m], shape [3].
+        mode: ``clamped``: the patch moves as a rigid body with the pose. ``pinned``: its mean
+            position follows the pose, its rotation is free.
+    """
+
+    nodes: np.ndarray
+    weights: np.ndarray
+    centre: np.ndarray
+    mode: Literal["clamped", "pinned"] = "clamped"
+
+    @property
+    def rest_pose(self) -> np.ndarray:
+        """Pose [m, rad] of the undeformed branch, shape [6]: the centre, not turned."""
+        return np.concatenate([self.centre, np.zeros(3)])
+
+    @classmethod
+    def at(cls, mesh: TetMesh, point: np.ndarray, radius: float,
+           mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
+        """Return the grasp of all nodes within ``radius`` [m] of ``point`` [m].
+
+        A radius of 0 takes the nearest node.
+
+        Raises:
+            InputError: no node is there (and the radius is not 0), or the patch touches the
+                fixed base.
+        """
+        distance = np.linalg.norm(mesh.nodes - np.asarray(point, float), axis=1)
+        nodes = np.flatnonzero(distance <= radius) if radius > 0 else distance.argmin()[None]
+        if not len(nodes):
+            raise InputError(
+                f"No node lies within {radius:g} m of ({', '.join(f'{x:.4g}' for x in point)}) m;"
+                f" the nearest is {distance.min():.4g} m away.", "The gripper would hold nothing.",
+                "Move the point onto the branch or widen the radius; check the units (metres).")
+        return cls.of_nodes(mesh, nodes, mode)
+
+    @classmethod
+    def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
+        """Return the grasp marked in the mesh's point data ``grasp``.
+
+        Raises:
+            InputError: none is marked.
+        """
+        nodes = np.flatnonzero(mesh.point_data.get("grasp", np.zeros(mesh.node_count)))
+        if not len(nodes):
+            raise InputError("The mesh marks no grasp.", "Point data `grasp` is missing or 0.",
+                             "Reconstruct again, or give a grasp point.")
+        return cls.of_nodes(mesh, nodes, mode)
+
+    @classmethod
+    def of_nodes(cls, mesh: TetMesh, nodes: np.ndarray,
+                 mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
+        """Return the grasp of the given nodes.
+
+        Raises:
+            InputError: unknown mode, or a node is fixed.
+        """
+        if mode not in ("clamped", "pinned"):
+            raise InputError(f"Grasp mode {mode!r} is unknown.",
+                             "A grasp holds position and rotation, or position alone.",
+                             "Use 'clamped' or 'pinned'.")
+        nodes = np.unique(np.asarray(nodes, np.int64))
+        fixed = mesh.point_data.get("fixed")
+        if fixed is not None and np.any(fixed[nodes]):
+            raise InputError("The grasp lies in the fixed base.",
+                             f"{np.count_nonzero(fixed[nodes])} of its {len(nodes)} nodes cannot"
+                             " move.", "Grasp farther out, or with a smaller radius.")
+        weights = _patch_weights(mesh, nodes)
+        return cls(nodes, weights, weights @ mesh.nodes[nodes], mode)
+
+    def key(self) -> tuple[str, bytes, bytes]:
+        """Return what tells constraints of different grasps apart."""
+        return self.mode, self.nodes.tobytes(), self.weights.tobytes()
+
+    def displacement(self, rest: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return the displacement [m] of the patch's nodes at ``pose``, shape [k, 3].
+
+        Args:
+            rest: Rest positions of all nodes [m], shape [node_count, 3].
+            pose: Position [m] and rotation vector [rad] of the grasp, shape [6].
+        """
+        arm = rest[self.nodes] - self.centre
+        return pose[:3] + arm @ rotation_matrix(pose[3:]).T - rest[self.nodes]
+
+    def pose_of(self, rest: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+        """Return the pose [m, rad] that fits a displaced patch best, shape [6].
+
+        Args:
+            rest, displacement: Of all nodes [m], shape [node_count, 3].
+        """
+        arm = rest[self.nodes] - self.centre
+        positions = rest[self.nodes] + displacement[self.nodes]
+        mean = self.weights @ positions
+        if len(self.nodes) < 3:
+            return np.concatenate([mean, np.zeros(3)])
+        left, _, right = np.linalg.svd((self.weights[:, None] * (positions - mean)).T @ arm)
+        turn = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+        return np.concatenate([mean, rotation_vector(left @ turn @ right)])
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """Return the matrix of a rotation vector [rad] (Rodrigues)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """Return the rotation vector [rad] of a rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrix).as_rotvec()
+
+
+def pose_between(first: np.ndarray, second: np.ndarray, part: float) -> np.ndarray:
+    """Return the pose at ``part`` of the way, on a straight line and the shortest rotation."""
+    from scipy.spatial.transform import Rotation
+
+    start, end = Rotation.from_rotvec(first[3:]), Rotation.from_rotvec(second[3:])
+    turn = (end * start.inv()).as_rotvec() * part
+    return np.concatenate([first[:3] + part * (second[:3] - first[:3]),
+                           (Rotation.from_rotvec(turn) * start).as_rotvec()])
+
+
+def check_pose(pose: np.ndarray) -> np.ndarray:
+    """Return a pose as float array of shape [6].
+
+    Raises:
+        InputError: wrong shape or not finite.
+    """
+    pose = np.asarray(pose, float)
+    if pose.shape != (6,) or not np.isfinite(pose).all():
+        raise InputError(f"A pose of shape {pose.shape} or with values that are not finite.",
+                         "A pose is x, y, z [m] and a rotation vector [rad].",
+                         "Give six numbers.")
+    return pose
+
+
+def _patch_weights(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    touching = np.isin(mesh.tets, nodes).any(axis=1)
+    part = TetMesh(mesh.nodes, mesh.tets[touching])
+    volume = np.zeros(mesh.node_count)
+    np.add.at(volume, part.tets, node_weights(part)[1])
+    return volume[nodes] / volume[nodes].sum()

@@ -1,0 +1,365 @@
+"""The branch model: a mesh with its material, loads and constraints, ready for the solvers."""
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from limber.errors import InputError
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics import elements
+from limber.mechanics.assembly import internal_force, tangent_times
+from limber.mechanics.equations import Equations
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.materials import (
+    Material,
+    RayleighDamping,
+    check_poisson,
+    check_young,
+    lame,
+    per_tet,
+)
+from limber.store import Branch
+
+GRAVITY = (0.0, 0.0, -9.80665)
+"""Standard gravity [m/s^2] along -z."""
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A mass that hangs on the branch (a twig, a fruit, a flower).
+
+    Attributes:
+        position: Where [m]; it is tied to the nearest node.
+        mass: [kg].
+    """
+
+    position: tuple[float, float, float]
+    mass: float
+
+
+@dataclass(frozen=True)
+class InternalState:
+    """Internal forces of one state.
+
+    Attributes:
+        force: Internal force on the nodes [N], shape [node_count, 3].
+        tet_energy: Strain energy of each tetrahedron [J], shape [tet_count].
+        min_det_f: Smallest determinant of the deformation gradient at a quadrature point.
+    """
+
+    force: np.ndarray
+    tet_energy: np.ndarray
+    min_det_f: float
+
+    @property
+    def strain_energy(self) -> float:
+        return float(self.tet_energy.sum())
+
+
+class _MeshData:
+    """What depends on the mesh alone; shared by all models of it."""
+
+    def __init__(self, mesh: TetMesh, fixed: np.ndarray):
+        self.mesh, self.fixed = mesh, fixed
+        self.tets = np.ascontiguousarray(mesh.tets, np.int32)
+        self.rule = elements.stiffness_quadrature(mesh)
+        self.gradients, self.weights = elements.element_gradients(mesh, self.rule)
+        self.volume_weights = elements.volume_weights(mesh)
+        self.equations: dict[tuple, Equations] = {}
+        edge = mesh.nodes[mesh.tets[:, 1]] - mesh.nodes[mesh.tets[:, 0]]
+        self.edge = float(np.linalg.norm(edge, axis=1).mean())
+        self.extent = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+
+
+class BranchModel:
+    """A branch of tetrahedra: immutable; variants share what the mesh determines.
+
+    Args:
+        mesh: Linear or quadratic tetrahedra, positively oriented, in one piece.
+        young: Young's modulus [Pa], a number or one a tetrahedron.
+        poisson: Poisson's ratio, likewise.
+        density: Density [kg/m^3], likewise.
+        fixed: Fixed nodes, mask [node_count] or indices; default the mesh's point data ``fixed``.
+        gravity: Acceleration [m/s^2], or None.
+        material: Name of a limber.mechanics.materials.Material.
+        damping: Rayleigh damping, used in dynamics.
+        point_masses: Added masses.
+        lumped_mass: Diagonal mass matrix instead of the consistent one.
+
+    Attributes:
+        lame_lambda, lame_mu: Lamé coefficients [Pa], shape [tet_count].
+        gradients, weights: Strain operators at the quadrature points, from
+            limber.mechanics.elements.
+
+    Raises:
+        InputError: elements inverted or flat, several pieces, nodes without tetrahedra, too few
+            fixed nodes, material values out of range.
+    """
+
+    def __init__(self, mesh: TetMesh, *, young: float | np.ndarray, poisson: float | np.ndarray,
+                 density: float | np.ndarray, fixed: np.ndarray | None = None,
+                 gravity: Sequence[float] | None = GRAVITY,
+                 material: str | Material = "st_venant_kirchhoff",
+                 damping: RayleighDamping = RayleighDamping(),  # noqa: B008 (frozen)
+                 point_masses: Iterable[PointMass] = (), lumped_mass: bool = False):
+        check_mesh(mesh)
+        self._data = _MeshData(mesh, fixed_mask(mesh, fixed))
+        self.gravity = np.zeros(3) if gravity is None else np.asarray(gravity, float)
+        self.material = Material.named(material)
+        self.damping = damping
+        self.lumped_mass = lumped_mass
+        self.point_masses = tuple(point_masses)
+        self._set(young, poisson, density)
+
+    @classmethod
+    def from_branch(cls, branch: Branch, **overrides: object) -> "BranchModel":
+        """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for the class.
+
+        Raises:
+            BranchFolderError: there is no mesh. InputError: it lacks material data.
+        """
+        mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
+        values = {}
+        for name in ("young", "poisson", "density"):
+            value = overrides.pop(name, None)
+            if value is None and name not in mesh.cell_data:
+                raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
+                                 "The material is not known.", "Reconstruct again.")
+            values[name] = mesh.cell_data[name] if value is None else value
+        return cls(mesh, **values, **overrides)
+
+    @property
+    def mesh(self) -> TetMesh:
+        return self._data.mesh
+
+    @property
+    def fixed(self) -> np.ndarray:
+        """Whether a node is fixed, shape [node_count]."""
+        return self._data.fixed
+
+    @property
+    def gradients(self) -> np.ndarray:
+        return self._data.gradients
+
+    @property
+    def weights(self) -> np.ndarray:
+        return self._data.weights
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the bounding box [m]."""
+        return self._data.extent
+
+    @property
+    def mean_edge(self) -> float:
+        """Mean length of an edge [m]."""
+        return self._data.edge
+
+    def with_young(self, young: float | np.ndarray) -> "BranchModel":
+        """Return the model with another Young's modulus [Pa], sharing all that stays."""
+        return self.with_parameters(young=young)
+
+    def with_parameters(self, *, young: float | np.ndarray | None = None,
+                        poisson: float | np.ndarray | None = None,
+                        density: float | np.ndarray | None = None,
+                        damping: RayleighDamping | None = None,
+                        gravity: Sequence[float] | None = None) -> "BranchModel":
+        """Return the model with other parameters, sharing what depends on the mesh alone."""
+        other = copy.copy(self)
+        if damping is not None:
+            other.damping = damping
+        if gravity is not None:
+            other.gravity = np.asarray(gravity, float)
+        other._set(self.young if young is None else young,
+                   self.poisson if poisson is None else poisson,
+                   self.density if density is None else density)
+        return other
+
+    def equations(self, grasps: Sequence[Grasp] = ()) -> Equations:
+        """Return the equations with these grasps held; made once for each set of patches.
+
+        Raises:
+            InputError: a grasp lies in the fixed base, or two overlap.
+        """
+        key = tuple(grasp.key() for grasp in grasps)
+        if key not in self._data.equations:
+            self._check_grasps(grasps)
+            data = self._data
+            data.equations[key] = Equations(data.tets, data.gradients, data.weights, data.fixed,
+                                            grasps)
+        return self._data.equations[key]
+
+    def internal(self, displacement: np.ndarray, velocity: np.ndarray | None = None, *,
+                 lame_pair: tuple[np.ndarray, np.ndarray] | None = None,
+                 viscosity: float = 0.0) -> InternalState:
+        """Return internal force and energy at a displacement [m], shape [node_count, 3].
+
+        Args:
+            velocity: [m/s], shape [node_count, 3], where ``viscosity`` [s] is not 0.
+            lame_pair: Lamé coefficients instead of the model's; the force is linear in them.
+        """
+        data = self._data
+        lam, mu = lame_pair or (self.lame_lambda, self.lame_mu)
+        displacement = np.ascontiguousarray(displacement, float)
+        velocity = displacement if velocity is None else np.ascontiguousarray(velocity, float)
+        force, energies = np.empty((self.mesh.node_count, 3)), np.empty(self.mesh.tet_count)
+        det = internal_force(displacement, velocity, data.gradients, data.weights, lam, mu,
+                             data.tets, int(self.material), float(viscosity), force, energies)
+        return InternalState(force, energies, float(det))
+
+    def tangent_times(self, displacement: np.ndarray, direction: np.ndarray,
+                      velocity: np.ndarray | None = None,
+                      rate_direction: np.ndarray | None = None,
+                      viscosity: float = 0.0) -> np.ndarray:
+        """Return the exact derivative of the internal force [N] along ``direction`` [m].
+
+        With ``viscosity`` [s], also along ``rate_direction`` [m/s] of the velocity.
+        """
+        data = self._data
+        direction = np.ascontiguousarray(direction, float)
+        product = np.empty((self.mesh.node_count, 3))
+        tangent_times(np.ascontiguousarray(displacement, float),
+                      direction if velocity is None else np.ascontiguousarray(velocity, float),
+                      direction, direction if rate_direction is None
+                      else np.ascontiguousarray(rate_direction, float),
+                      data.gradients, data.weights, self.lame_lambda, self.lame_mu, data.tets,
+                      int(self.material), float(viscosity), product)
+        return product
+
+    @property
+    def weight_force(self) -> np.ndarray:
+        """Force of gravity on the nodes [N], shape [node_count, 3]."""
+        return self.mass_load[:, None] * self.gravity
+
+    @property
+    def mass_load(self) -> np.ndarray:
+        """Mass that gravity acts on at each node [kg], consistent, shape [node_count]."""
+        load = np.bincount(self.mesh.tets.ravel(),
+                           (self._data.volume_weights * self.density[:, None]).ravel(),
+                           self.mesh.node_count)
+        for node, mass in self._added:
+            load[node] += mass
+        return load
+
+    @property
+    def total_mass(self) -> float:
+        """Mass of the branch with all that hangs on it [kg]."""
+        return float(self.mass_load.sum())
+
+    @property
+    def mass_matrix(self) -> sp.csr_matrix:
+        """Mass matrix [kg] for each axis, shape [node_count, node_count]."""
+        if "matrix" not in self._mass:
+            self._mass["matrix"] = self._make_mass_matrix()
+        return self._mass["matrix"]
+
+    @property
+    def _added(self) -> list[tuple[int, float]]:
+        found = []
+        for point in self.point_masses:
+            if not (np.isfinite(point.mass) and point.mass >= 0):
+                raise InputError(f"An added mass of {point.mass} kg.", "It must be 0 or more.",
+                                 "Give the mass in kilograms.")
+            distance = np.linalg.norm(self.mesh.nodes - np.asarray(point.position), axis=1)
+            found.append((int(distance.argmin()), point.mass))
+        return found
+
+    def _make_mass_matrix(self) -> sp.csr_matrix:
+        consistent, lumped = elements.node_weights(self.mesh)
+        tets, n = self.mesh.tets, self.mesh.node_count
+        if self.lumped_mass:
+            diagonal = np.bincount(tets.ravel(), (lumped * self.density[:, None]).ravel(), n)
+            matrix = sp.diags(diagonal).tocsr()
+        else:
+            per_tet_count = tets.shape[1]
+            rows = np.repeat(tets, per_tet_count, axis=1).ravel()
+            columns = np.tile(tets, (1, per_tet_count)).ravel()
+            matrix = sp.csr_matrix(
+                ((consistent * self.density[:, None, None]).ravel(), (rows, columns)), (n, n))
+        added = np.zeros(n)
+        for node, mass in self._added:
+            added[node] += mass
+        return (matrix + sp.diags(added)).tocsr() if added.any() else matrix
+
+    def _set(self, young: float | np.ndarray, poisson: float | np.ndarray,
+             density: float | np.ndarray) -> None:
+        count = self.mesh.tet_count
+        self.young = per_tet("Young's modulus", young, count)
+        self.poisson = per_tet("Poisson's ratio", poisson, count)
+        check_young(self.young)
+        check_poisson(self.poisson)
+        changed = not hasattr(self, "density") or density is not self.density
+        self.density = per_tet("Density", density, count)
+        if self.density.min() <= 0:
+            raise InputError(f"Density is {self.density.min():g} kg/m3.", "It must be positive.",
+                             "Green wood has 500 to 1100 kg/m3.")
+        self.lame_lambda, self.lame_mu = lame(self.young, self.poisson)
+        if changed:
+            # Shared by the models that are made of this one with the same density.
+            self._mass: dict[str, sp.csr_matrix] = {}
+
+    def _check_grasps(self, grasps: Sequence[Grasp]) -> None:
+        taken = self.fixed.copy()
+        for grasp in grasps:
+            if taken[grasp.nodes].any():
+                where = "the fixed base" if self.fixed[grasp.nodes].any() else "another grasp"
+                raise InputError(f"A grasp overlaps {where}.",
+                                 "A node cannot follow two masters.",
+                                 "Move the grasp, or make its radius smaller.")
+            taken[grasp.nodes] = True
+        if taken.all():
+            raise InputError("Every node is fixed or grasped.", "Nothing is left to compute.",
+                             "Use a smaller grasp or a finer mesh.")
+
+
+def fixed_mask(mesh: TetMesh, fixed: np.ndarray | None) -> np.ndarray:
+    """Return the mask of fixed nodes.
+
+    Raises:
+        InputError: fewer than three, or all on a line, so that the branch could turn freely.
+    """
+    if fixed is None:
+        fixed = mesh.point_data.get("fixed", np.zeros(mesh.node_count))
+        fixed = np.asarray(fixed) > 0.5
+    fixed = np.asarray(fixed)
+    if fixed.dtype != bool:
+        mask = np.zeros(mesh.node_count, bool)
+        mask[fixed] = True
+        fixed = mask
+    points = mesh.nodes[fixed]
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) else [0]
+    if len(points) < 3 or spread[1] < 1e-6 * max(spread[0], 1e-12):
+        raise InputError(f"{len(points)} nodes are fixed, or all on one line.",
+                         "The branch could move freely; statics has no solution.",
+                         "Mark the nodes of the base in point data `fixed`.")
+    return fixed
+
+
+def check_mesh(mesh: TetMesh) -> None:
+    """Raise InputError for a mesh that cannot be computed: not finite, unused nodes, pieces."""
+    if not np.isfinite(mesh.nodes).all():
+        raise InputError("The mesh has nodes that are not finite.", "Positions are missing.",
+                         "Mesh the surface again.")
+    if mesh.tets.ndim != 2 or mesh.tets.shape[1] not in (4, 10) or not mesh.tet_count:
+        raise InputError(f"Tetrahedra of shape {mesh.tets.shape}.",
+                         "4 or 10 nodes each are needed.", "Mesh the surface again.")
+    used = np.zeros(mesh.node_count, bool)
+    used[mesh.tets] = True
+    if not used.all():
+        raise InputError(f"{np.count_nonzero(~used)} nodes belong to no tetrahedron.",
+                         "They would float freely.", "Remove them from the mesh.")
+    corners = mesh.tets[:, :4]
+    links = sp.csr_matrix((np.ones(3 * len(corners)), (np.repeat(corners[:, 0], 3),
+                                                       corners[:, 1:].ravel())),
+                          (mesh.node_count, mesh.node_count))
+    count, label = connected_components(links, directed=False)
+    pieces = np.unique(label[np.unique(corners)], return_counts=True)[1]
+    if len(pieces) > 1:
+        raise InputError(
+            f"The mesh is in {len(pieces)} pieces, of {', '.join(map(str, sorted(pieces)[::-1]))}"
+            " corner nodes.", "What is not joined to the fixed base would float freely.",
+            "Join the parts of the surface before meshing, or keep the largest.")

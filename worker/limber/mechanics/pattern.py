@@ -1,0 +1,137 @@
+"""Where each element's stiffness goes: elimination order, sparsity pattern, vector layout."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+
+from limber.mechanics.factor import elimination_order
+from limber.mechanics.stiffness import LANES
+
+_SCRATCH = 9
+"""Numbers behind the values into which entries of constrained nodes go."""
+
+
+class Pattern:
+    """Lower triangle by columns of the free nodes' stiffness, three rows and columns a node.
+
+    Args:
+        tets: Node indices, shape [tet_count, n].
+        node_count: Nodes of the mesh.
+        free: Whether a node is free, shape [node_count].
+        cliques: Further groups of nodes that are coupled with each other (pinned patches).
+
+    Attributes:
+        order: Free nodes in elimination order; position: its inverse, -1 where constrained.
+        rows, columns: Entries, shape [value_count].
+        diagonal: Where the diagonal is, shape [3 free nodes].
+    """
+
+    def __init__(self, tets: np.ndarray, node_count: int, free: np.ndarray,
+                 cliques: Sequence[np.ndarray] = ()):
+        graph = _node_graph(tets, node_count, cliques)
+        kept = np.flatnonzero(free)
+        self.order = kept[elimination_order(graph[kept][:, kept])]
+        self.position = np.full(node_count, -1)
+        self.position[self.order] = np.arange(len(self.order))
+        lower = sp.tril(graph[self.order][:, self.order]).tocsc()
+        lower.sort_indices()
+        count = np.diff(lower.indptr)
+        self._first = lower.indptr
+        self._keys = np.repeat(np.arange(len(count)), count) * node_count + lower.indices
+        self.length = 3 * count
+        self.start = np.concatenate([[0], np.cumsum(9 * count - 3)])
+        self.value_count = int(self.start[-1])
+        begin = self.start[:-1]
+        self.diagonal = np.stack([begin, begin + self.length, begin + 2 * self.length - 1],
+                                 axis=1).ravel()
+        self.rows, self.columns = self._entries(lower)
+
+    @property
+    def size(self) -> int:
+        """Number of equations."""
+        return 3 * len(self.order)
+
+    def scratch_values(self) -> np.ndarray:
+        """Return zeros for the values, with the scratch behind them."""
+        return np.zeros(self.value_count + _SCRATCH)
+
+    def slots(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return, for pairs of nodes, where their block starts and that column's length."""
+        one, two = self.position[first], self.position[second]
+        row, column = np.maximum(one, two), np.minimum(one, two)
+        inside = column >= 0
+        key = np.where(inside, column * len(self.position) + row, self._keys[0])
+        found = np.searchsorted(self._keys, key)
+        safe = np.where(inside, column, 0)
+        slot = self.start[safe] + 3 * (found - self._first[safe])
+        return (np.where(inside, slot, self.value_count),
+                np.where(inside, self.length[safe], 4))
+
+    def scalar_entries(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Return where entries xx, yy and zz of pairs of nodes are, shape [..., 3]."""
+        slot, length = self.slots(first, second)
+        return np.stack([slot, slot + length, slot + 2 * length - 1], axis=-1)
+
+    def _entries(self, lower: sp.csc_matrix) -> tuple[np.ndarray, np.ndarray]:
+        rows = np.empty(self.value_count, np.int64)
+        columns = np.empty(self.value_count, np.int64)
+        block_column = np.repeat(np.arange(len(self.length)), np.diff(lower.indptr))
+        rank = np.arange(len(lower.indices)) - lower.indptr[block_column]
+        for j in range(3):
+            base = (self.start[block_column] + j * self.length[block_column]
+                    - (1 if j == 2 else 0) + 3 * rank - j)
+            for i in range(3):
+                keep = (rank > 0) | (i >= j)
+                rows[base[keep] + i] = 3 * lower.indices[keep] + i
+                columns[base[keep] + i] = 3 * block_column[keep] + j
+        return rows, columns
+
+
+class LaneLayout:
+    """Elements of a pattern in batches, the element the last axis, earlier eliminated nodes first.
+
+    Attributes:
+        nodes [batch, n, LANES], gradients [batch, q, 3, n, LANES], weights [batch, q, LANES],
+        slots and lengths [batch, pairs, LANES]: what the stiffness kernels take.
+    """
+
+    def __init__(self, pattern: Pattern, tets: np.ndarray, gradients: np.ndarray,
+                 weights: np.ndarray):
+        position = pattern.position[tets]
+        turn = np.argsort(position, axis=1, kind="stable")
+        # Neighbours in the elimination are neighbours in memory.
+        order = np.argsort(position.max(axis=1), kind="stable")
+        padding = -len(order) % LANES
+        self._order = np.concatenate([order, np.repeat(order[-1:], padding)])
+        self._real = len(order)
+        turn = turn[self._order]
+        nodes = np.take_along_axis(tets[self._order], turn, axis=1)
+        self.nodes = _lanes(nodes.astype(np.int32))
+        weights = weights[self._order].copy()
+        weights[self._real:] = 0.0
+        self.weights = _lanes(weights)
+        self.gradients = _lanes(np.take_along_axis(
+            gradients[self._order], turn[:, None, None, :], axis=3))
+        later, earlier = np.tril_indices(tets.shape[1])
+        slots, lengths = pattern.slots(nodes[:, later], nodes[:, earlier])
+        self.slots, self.lengths = _lanes(slots.astype(np.int32)), _lanes(lengths.astype(np.int32))
+
+    def per_element(self, values: np.ndarray) -> np.ndarray:
+        """Return one number a tetrahedron in this layout, shape [batch, LANES]."""
+        return values[self._order].reshape(-1, LANES)
+
+
+def _lanes(array: np.ndarray) -> np.ndarray:
+    batched = array.reshape(-1, LANES, *array.shape[1:])
+    return np.ascontiguousarray(np.moveaxis(batched, 1, -1))
+
+
+def _node_graph(tets: np.ndarray, node_count: int, cliques: Sequence[np.ndarray]) -> sp.csr_matrix:
+    per_tet = tets.shape[1]
+    nodes = np.concatenate([tets.ravel(), *(np.asarray(c).ravel() for c in cliques)])
+    sizes = np.concatenate([np.full(len(tets), per_tet), [len(c) for c in cliques]]).astype(int)
+    groups = np.repeat(np.arange(len(sizes)), sizes)
+    incidence = sp.csr_matrix((np.ones(len(nodes), np.float32), (groups, nodes)),
+                              shape=(len(sizes), node_count))
+    return (incidence.T @ incidence).tocsr()

@@ -1,0 +1,80 @@
+"""Strain, stretch and stress of a displaced branch, for reports and limits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.mechanics.materials import Material
+from limber.mechanics.model import BranchModel
+
+
+@dataclass(frozen=True)
+class Place:
+    """A value and where it is: tetrahedron and rest position of its centroid [m]."""
+
+    value: float
+    tet: int
+    position: tuple[float, float, float]
+
+    @property
+    def at(self) -> str:
+        """In words."""
+        return "at ({:.3f}, {:.3f}, {:.3f}) m".format(*self.position)
+
+
+@dataclass(frozen=True)
+class StrainState:
+    """Mean over each tetrahedron, shape [tet_count] or [tet_count, 3].
+
+    Attributes:
+        energy_density: Strain energy density [J/m^3].
+        principal_strain: Principal Green-Lagrange strains, ascending.
+        principal_stress: Principal Cauchy stresses [Pa], ascending.
+    """
+
+    energy_density: np.ndarray
+    principal_strain: np.ndarray
+    principal_stress: np.ndarray
+
+
+def deformation_gradients(model: BranchModel, displacement: np.ndarray) -> np.ndarray:
+    """Return F at all quadrature points, shape [tet_count, q, 3, 3]."""
+    local = displacement[model.mesh.tets]
+    H = np.matmul(model.gradients, local[:, None])
+    return np.swapaxes(H, 2, 3) + np.eye(3)
+
+
+def principal_stretch(model: BranchModel, displacement: np.ndarray) -> Place:
+    """Return the largest principal stretch of any tetrahedron (1: unstretched), and where."""
+    F = deformation_gradients(model, displacement).mean(axis=1)
+    largest = np.sqrt(np.linalg.eigvalsh(np.swapaxes(F, 1, 2) @ F)[:, -1])
+    tet = int(largest.argmax())
+    place = tuple(float(x) for x in model.mesh.centroids[tet])
+    return Place(float(largest[tet]), tet, place)
+
+
+def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
+    """Return energy density, principal strain and stress of every tetrahedron."""
+    F = deformation_gradients(model, displacement)
+    part = model.weights / model.weights.sum(axis=1, keepdims=True)
+    F_t = np.swapaxes(F, 2, 3)
+    green = 0.5 * (F_t @ F - np.eye(3))
+    strain = np.einsum("eq,eqij->eij", part, green)
+    energy = model.internal(displacement).tet_energy / model.weights.sum(axis=1)
+    stress = np.einsum("eq,eqij->eij", part, _cauchy(model, F, green))
+    return StrainState(energy, np.linalg.eigvalsh(strain), np.linalg.eigvalsh(stress))
+
+
+def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray) -> np.ndarray:
+    lam, mu = (values[:, None, None, None] for values in (model.lame_lambda, model.lame_mu))
+    eye = np.eye(3)
+    if model.material == Material.linear:
+        small = 0.5 * (F + np.swapaxes(F, 2, 3)) - eye
+        trace = np.trace(small, axis1=2, axis2=3)[..., None, None]
+        return lam * trace * eye + 2 * mu * small
+    det = np.linalg.det(F)[..., None, None]
+    left = F @ np.swapaxes(F, 2, 3)
+    if model.material == Material.stable_neo_hookean:
+        return mu / det * left + ((lam + mu) * (det - 1) - mu) * eye
+    trace = np.trace(green, axis1=2, axis2=3)[..., None, None]
+    return F @ (lam * trace * eye + 2 * mu * green) @ np.swapaxes(F, 2, 3) / det
