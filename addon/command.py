@@ -6,7 +6,7 @@ import sys
 
 import bpy
 
-from . import preferences
+from . import compat, preferences
 from .worker import WorkerNotFound, worker_environment
 
 _handles = []
@@ -19,7 +19,9 @@ def run_command(arguments: list[str]) -> int:
     except WorkerNotFound as error:
         print(f"error: {error}", file=sys.stderr)
         return 3
+    # The worker's last line must stay the last one: readers of --json rely on it.
     sys.stdout.flush()
+    compat.flush_native_output()
     process = subprocess.Popen(command, env=worker_environment())
     previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     try:

@@ -1,5 +1,8 @@
 """What differs between Blender 4.2 and 5.2, and between builds, in one place."""
 
+import ctypes
+import os
+
 import bpy
 
 IS_MODULE = bool(getattr(bpy.app, "module", False))
@@ -19,3 +22,9 @@ def eevee_engine() -> str:
     """Return EEVEE's identifier: it was BLENDER_EEVEE_NEXT from 4.2 to 4.5."""
     engines = bpy.types.RenderSettings.bl_rna.properties["engine"].enum_items.keys()
     return "BLENDER_EEVEE_NEXT" if "BLENDER_EEVEE_NEXT" in engines else "BLENDER_EEVEE"
+
+
+def flush_native_output() -> None:
+    """Write out what Blender's C code has printed so far, lest it come after later output."""
+    if os.name == "posix":
+        ctypes.CDLL(None).fflush(None)

@@ -156,16 +156,16 @@ def _json_object(line: str) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-_current: Job | None = None
+_last: list[Job] = []
 
 
 def current() -> Job | None:
     """Return the job that runs, or the last one; one runs at a time."""
-    return _current
+    return _last[0] if _last else None
 
 
 def is_running() -> bool:
-    return _current is not None and _current.state is JobState.RUNNING
+    return bool(_last) and _last[0].state is JobState.RUNNING
 
 
 def start(title: str, command: list[str]) -> Job:
@@ -175,19 +175,17 @@ def start(title: str, command: list[str]) -> Job:
         RuntimeError: another job is running.
         OSError: the program cannot be started.
     """
-    global _current
     if is_running():
-        raise RuntimeError(f"{_current.title} is still running; wait for it or cancel it.")
-    _current = Job(title, command)
-    return _current
+        raise RuntimeError(f"{_last[0].title} is still running; wait for it or cancel it.")
+    _last[:] = [Job(title, command)]
+    return _last[0]
 
 
 def forget() -> None:
     """End the current job, if any, and forget it: the add-on goes away or Blender closes."""
-    global _current
-    if _current is not None:
-        _current.stop_now()
-    _current = None
+    for job in _last:
+        job.stop_now()
+    _last.clear()
 
 
 atexit.register(forget)

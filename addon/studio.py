@@ -25,7 +25,7 @@ class Picture:
 
 
 def set_up_studio(scene: bpy.types.Scene, data: SceneData,
-                  picture: Picture = Picture()) -> bpy.types.Object:  # noqa: B008 (frozen)
+                  picture: Picture = Picture()) -> bpy.types.Object:
     """Add ground, lights and a camera that sees all of ``view_points``; returns the camera."""
     collection = bpy.data.collections.new("Studio")
     scene.collection.children.link(collection)

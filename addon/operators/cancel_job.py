@@ -25,4 +25,5 @@ def register() -> None:
 
 
 def unregister() -> None:
+    jobs.forget()
     bpy.utils.unregister_class(LIMBER_OT_cancel_job)

@@ -1,6 +1,7 @@
 """Import a scan, to look at it."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import bpy
 
@@ -16,7 +17,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
 
     bl_idname = "limber.import_cloud"
     bl_label = "Import Scan"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: bpy.props.StringProperty(default="*.ply;*.xyz;*.txt;*.csv", options={"HIDDEN"})

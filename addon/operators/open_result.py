@@ -43,7 +43,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
 
 
 def _look_at(context: bpy.types.Context, shown: scene.ShownBranch) -> None:
-    """Let the 3D views show the colours, and the branch fill them."""
+    """Let the 3D views show the colours, and the branch fill them; one step for undo."""
     if bpy.app.background or context.window is None:
         return
     for thing in context.selected_objects:
@@ -57,6 +57,7 @@ def _look_at(context: bpy.types.Context, shown: scene.ShownBranch) -> None:
         region = next(region for region in area.regions if region.type == "WINDOW")
         with context.temp_override(area=area, region=region):
             bpy.ops.view3d.view_selected()
+    bpy.ops.ed.undo_push(message="Open Result")
 
 
 def register() -> None:

@@ -1,5 +1,7 @@
 """Play the motion of the branch along its path."""
 
+from typing import ClassVar
+
 import bpy
 
 from .. import scene
@@ -36,7 +38,7 @@ class LIMBER_OT_color_by(bpy.types.Operator):
 
     bl_idname = "limber.color_by"
     bl_label = "Colour By"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     scalar: bpy.props.StringProperty()
 
