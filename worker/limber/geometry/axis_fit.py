@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.spatial import cKDTree
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton import CLAMPED, INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.sweep import resample, tangents
@@ -160,6 +160,17 @@ def median_radii(skeleton: Skeleton, points: np.ndarray, neighbours: int = 24) -
     return np.median(distance, axis=1)
 
 
+def nearest_cylinders(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each point the node whose cylinder is nearest, and its distance [m] from it."""
+    segments, residuals = [], []
+    for begin in range(0, len(points), 100_000):
+        match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
+                       points[begin:begin + 100_000])
+        segments.append(match.segment)
+        residuals.append(match.residual)
+    return np.concatenate(segments), np.concatenate(residuals)
+
+
 @dataclass(frozen=True)
 class _Match:
     segment: np.ndarray
@@ -218,11 +229,11 @@ class _System:
 def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _Match,
             weight: np.ndarray, noise: float) -> _System:
     data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight)
-    smooth, stiff = _smoothness(skeleton, nodes, radius, per_node, noise)
+    smooth = _smoothness(skeleton, nodes, radius, per_node, noise)
     state = np.column_stack([nodes, radius]).ravel()
     anchor = _anchor(skeleton, nodes, per_node)
     matrix = (data + smooth + anchor).tocsc()
-    return _System(matrix, right - smooth @ state + 0 * stiff)
+    return _System(matrix, right - smooth @ state)
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: _Match, weight: np.ndarray,
@@ -254,7 +265,7 @@ def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: _Match, weight: np
 
 
 def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_node: np.ndarray,
-                noise: float) -> tuple[sparse.csc_matrix, float]:
+                noise: float) -> sparse.csc_matrix:
     """Second differences along each run, weighted as a smoothing spline of a given bandwidth.
 
     A spline with penalty lambda on the squared second derivative and rho data a length averages
@@ -281,14 +292,14 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
         count += len(chain) - 2
     size = len(nodes)
     if count == 0:
-        return sparse.csc_matrix((4 * size, 4 * size)), density
+        return sparse.csc_matrix((4 * size, 4 * size))
     second = sparse.coo_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         (count, size)).tocsr()
     along = second.T @ sparse.diags(np.concatenate(scale_axis)) @ second
     thick = second.T @ sparse.diags(np.concatenate(scale_radius)) @ second
     return (sparse.kron(along, sparse.diags([1.0, 1, 1, 0]))
-            + sparse.kron(thick, sparse.diags([0.0, 0, 0, 1]))).tocsc(), density
+            + sparse.kron(thick, sparse.diags([0.0, 0, 0, 1]))).tocsc()
 
 
 def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> sparse.csc_matrix:
@@ -301,8 +312,7 @@ def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> spar
     block = np.zeros((len(nodes), 4, 4))
     block[:, :3, :3] = typical * direction[:, :, None] * direction[:, None, :]
     block[:, range(4), range(4)] += 1e-3 * typical
-    return sparse.block_diag(list(block), format="csc") if len(nodes) < 3 else sparse.bsr_matrix(
-        (block, np.arange(len(nodes)), np.arange(len(nodes) + 1))).tocsc()
+    return sparse.bsr_matrix((block, np.arange(len(nodes)), np.arange(len(nodes) + 1))).tocsc()
 
 
 def _uncertainty(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _Match,
@@ -318,11 +328,6 @@ def _uncertainty(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, matc
         unit[4 * chosen + 3, np.arange(len(chosen))] = 1.0
         variance[chosen] = factor.solve(unit)[4 * chosen + 3, np.arange(len(chosen))]
     return noise * np.sqrt(np.maximum(variance, 0)), per_node > 2.0
-
-
-def attach_radius(skeleton: Skeleton, run: int) -> float:
-    """Radius [m] of the node that side run ``run`` starts from."""
-    return float(skeleton.radius[skeleton.runs()[run][0]])
 
 
 def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:

@@ -72,6 +72,9 @@ def patch_nodes(mesh: TetMesh, skeleton: Skeleton, fraction: float) -> np.ndarra
         chosen = (along < width * radius) & (across < 1.6 * radius)
         if chosen.sum() >= 6:
             break
+    else:
+        chosen = np.zeros(mesh.node_count, bool)
+        chosen[np.argsort(np.linalg.norm(offset, axis=1))[:6]] = True
     return _checked(chosen, "grasp patch")
 
 

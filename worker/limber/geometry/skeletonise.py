@@ -1,6 +1,6 @@
 """A scan's skeleton: thin, contract, connect, root, prune, fit."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
-from limber.geometry.axis_fit import attached, clamped, fit_axes, resampled
+from limber.geometry.axis_fit import attached, clamped, fit_axes, nearest_cylinders, resampled
 from limber.geometry.contraction import Contraction, contract
 from limber.geometry.curve_graph import CurveGraph, curve_graph, prune_spurs, rooted
 from limber.geometry.skeleton import Skeleton
@@ -75,13 +75,15 @@ class SkeletonResult:
 
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
-                root: np.ndarray | None = None, progress: Progress = SILENT) -> SkeletonResult:
+                root: np.ndarray | None = None, up: np.ndarray | None = None,
+               progress: Progress = SILENT) -> SkeletonResult:
     """Find the rooted skeleton of a cloud.
 
     Args:
         points: Scanned points [m], shape [n, 3].
         settings: How.
         root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
+        up: Which way is up, shape [3]; None: z.
         progress: Called as it goes.
 
     Raises:
@@ -95,15 +97,29 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     graph = curve_graph(points[thin], contraction.points, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal)
     _check_branch_like(points[thin], contraction, graph, diagonal)
-    first, pruned = _first_skeleton(graph, settings, root)
+    first, pruned = _first_skeleton(graph, settings, root, up)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
-    skeleton, segment, residual = _nearest(fitted.skeleton, points)
+    segment, residual = nearest_cylinders(fitted.skeleton, points)
     result = SkeletonResult(
-        skeleton, contraction, segment, residual, fitted.noise, graph.bridges, graph.split_off,
-        graph.loops, pruned + more)
+        fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
+        graph.split_off, graph.loops, pruned + more)
     result.warnings.extend(_warnings(result, len(points)))
-    progress(1.0, "skeleton", nodes=skeleton.node_count)
+    progress(1.0, "skeleton", nodes=fitted.skeleton.node_count)
+    return result
+
+
+def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
+    """Wrap a user's own skeleton, in the cloud's frame; nothing is changed in it."""
+    segment, residual = nearest_cylinders(skeleton, points)
+    noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+    nothing = Contraction(points[:0], np.empty(0), 0, "skeleton given")
+    result = SkeletonResult(skeleton, nothing, segment, residual, noise)
+    far = float(np.mean(np.abs(residual) > 3 * skeleton.radius[segment]))
+    if far > 0.5:
+        result.warnings.append(
+            f"{100 * far:.0f} % of the points are far from the given skeleton: is it in the "
+            "cloud's coordinates and unit?")
     return result
 
 
@@ -128,8 +144,8 @@ def thinned(points: np.ndarray, limit: int) -> np.ndarray:
 
 
 def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, root: np.ndarray | None,
-                    ) -> tuple[Skeleton, int]:
-    start = _root_node(graph, root)
+                    up: np.ndarray | None) -> tuple[Skeleton, int]:
+    start = _root_node(graph, root, np.array([0.0, 0.0, 1.0]) if up is None else up)
     parent = rooted(graph.nodes, graph.edges, start)
     keep, pruned = prune_spurs(graph.nodes, parent, graph.thickness, settings.prune)
     new_index = np.cumsum(keep) - 1
@@ -138,8 +154,8 @@ def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, root: np.ndar
     return Skeleton.from_edges(graph.nodes[keep], moved, radius), pruned
 
 
-def _root_node(graph: CurveGraph, root: np.ndarray | None) -> int:
-    """The tip nearest to ``root``, or the tip of the thickest end."""
+def _root_node(graph: CurveGraph, root: np.ndarray | None, up: np.ndarray) -> int:
+    """The tip nearest to ``root``, or the tip of the thickest end; of several the lowest."""
     degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
     tips = np.flatnonzero(degree == 1)
     if root is not None:
@@ -150,7 +166,7 @@ def _root_node(graph: CurveGraph, root: np.ndarray | None) -> int:
                       for tip in tips])
     # Among ends of nearly the same thickness the lowest is the root.
     candidates = tips[thick >= 0.75 * thick.max()]
-    return int(candidates[np.argmin(graph.nodes[candidates, 2])])
+    return int(candidates[np.argmin(graph.nodes[candidates] @ up)])
 
 
 def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
@@ -162,14 +178,13 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, skeleton.radius, settings.prune)
     skeleton = resampled(clamped(skeleton.subset(keep), low, high), 1.0)
     fit = fit_axes(skeleton, points, progress=progress.part(0.5, 1.0))
-    from dataclasses import replace
     return replace(fit, skeleton=clamped(fit.skeleton, low, high)), pruned
 
 
 def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleton:
     """Lengthen the ends that the contraction drew in, as far as there are points."""
     nodes = skeleton.nodes.copy()
-    _, segment, _ = _nearest(skeleton, points)
+    segment, _ = nearest_cylinders(skeleton, points)
     tips = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
     inner = int(np.flatnonzero(skeleton.parent == 0)[0])
     for end, before, is_root in [(t, b, False) for t, b in tips] + [(0, inner, True)]:
@@ -195,16 +210,6 @@ def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleto
     return skeleton.moved(nodes)
 
 
-def _nearest(skeleton: Skeleton, points: np.ndarray):
-    from limber.geometry.axis_fit import _match
-
-    segments, residuals = [], []
-    for begin in range(0, len(points), 100_000):
-        match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                       points[begin:begin + 100_000])
-        segments.append(match.segment)
-        residuals.append(match.residual)
-    return skeleton, np.concatenate(segments), np.concatenate(residuals)
 
 
 def _check_branch_like(points: np.ndarray, contraction: Contraction, graph: CurveGraph,

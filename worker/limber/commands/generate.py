@@ -1,0 +1,23 @@
+"""``limber generate``: a generated branch with known truth, and its scan."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli import Run, settings_options, stage_command
+from limber.geometry.generated import BranchSpec, generate_branch, write_generated
+
+
+@stage_command("generate")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of all that is random.")
+@settings_options(BranchSpec)
+def command(run: Run, folder: Path, seed: int, settings: BranchSpec) -> dict[str, Any]:
+    """A generated branch with known truth, scanned as a scanner would.
+
+    Writes cloud.ply, and the truth: truth_skeleton.swc, truth_surface.ply and truth.json.
+    `limber reconstruct FOLDER/cloud.ply` takes the truth along.
+    """
+    run.progress(0.1, "generating")
+    return write_generated(generate_branch(seed, **settings.model_dump()), folder)

@@ -1,0 +1,196 @@
+"""The stage `mesh`: a closed surface of any slender body becomes a branch folder."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.errors import InputError
+from limber.geometry.control_points import FRACTIONS
+from limber.geometry.marks import GRASP_FRACTION, mark
+from limber.geometry.mesh_quality import measure_quality
+from limber.geometry.reconstruct import peak_memory_mb, require_file
+from limber.geometry.skeleton import Skeleton
+from limber.geometry.skeleton_files import UNIT_METRES
+from limber.geometry.surface import Surface
+from limber.geometry.surface_checks import check_surface
+from limber.geometry.tetrahedra import MeshSettings, tetrahedralise
+from limber.geometry.upright import shortest_turn
+from limber.progress import SILENT, Progress
+from limber.store import Alignment, Branch, file_digest
+
+GRAVITY = 9.80665  # [m/s^2]
+
+
+class MeshSurfaceSettings(BaseModel):
+    """What a closed surface becomes."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
+    up: tuple[float, float, float] = Field(
+        (0.0, 0.0, 1.0), description="Which way is up in the file's axes.")
+    root: tuple[float, float, float] | None = Field(
+        None, description="A point near the end that is held, in the file's coordinates; else "
+        "the thicker end.")
+    upright: bool = Field(True, description="Turn the long axis to z; gravity is turned with it.")
+    elements_across: float = Field(
+        3.0, gt=0.2, le=20, description="Elements across the body's thickness.")
+    mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's time limit [s].")
+    mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
+    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
+    poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
+    density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
+    grasp_fraction: float = Field(
+        GRASP_FRACTION, gt=0, le=1, description="Where the body is held, along its axis.")
+
+
+def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None = None, *,
+                 force: bool = False, progress: Progress = SILENT,
+                 warn: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+    """Fill a closed surface with tetrahedra and mark base, control points and grasp.
+
+    Args:
+        path: STL, PLY, OBJ or OFF.
+        folder: The branch folder to make or renew.
+        settings: How.
+        force: Run even if nothing has changed.
+        progress: Called as it goes.
+        warn: Gets each thing that the user should know.
+
+    Raises:
+        InputError: the surface cannot be read, has holes, or crosses itself.
+        MeshingError: fTetWild failed.
+    """
+    settings = settings or MeshSurfaceSettings()
+    scale = UNIT_METRES[settings.unit]
+    surface = _closed(Surface.read(require_file(path, "A surface"), scale=scale), path)
+    branch = Branch.create(folder)
+    digests = {"surface": file_digest(path)}
+    if not force and branch.is_current("mesh", settings, digests=digests):
+        return branch.manifest.stages["mesh"].result
+    with branch.stage("mesh", settings, digests=digests) as stage:
+        skeleton = section_axis(
+            surface, None if settings.root is None else np.array(settings.root) * scale)
+        alignment, surface, skeleton = _aligned(surface, skeleton, scale, settings)
+        thick = float(np.median(skeleton.radius))
+        limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
+                              mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
+        mesh, cached = tetrahedralise(
+            surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
+            settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
+        mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
+                    density=settings.density, fractions=FRACTIONS,
+                    grasp_fraction=settings.grasp_fraction)
+        stage.manifest.alignment = alignment
+        stage.manifest.source = {"file": Path(path).name, "unit": settings.unit,
+                                 "sha256": digests["surface"]}
+        skeleton.write_swc(stage.path("skeleton.swc"))
+        surface.write_ply(stage.path("surface.ply"))
+        mesh.write(stage.path("mesh.vtu"))
+        up = np.array(settings.up) / np.linalg.norm(settings.up)
+        quality = measure_quality(mesh, surface.volume, skeleton)
+        stage.result.update({
+            "point_count": len(surface.vertices), "node_count": skeleton.node_count,
+            "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,
+            "radius_min_m": float(skeleton.radius.min()),
+            "radius_max_m": float(skeleton.radius.max()), "clamped_radius_count": 0,
+            "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
+            "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count,
+            "mesher": "ftetwild (cached)" if cached else "ftetwild", "watertight": True,
+            "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb(),
+            "gravity_m_s2": -GRAVITY * np.array(alignment.rotation) @ up, "warnings": []})
+        progress(1.0, "meshed", tets=mesh.tet_count)
+    return branch.manifest.stages["mesh"].result
+
+
+def section_axis(surface: Surface, root: np.ndarray | None, count: int = 24) -> Skeleton:
+    """Return the axis of a slender solid: centroids of its cross-sections along its length.
+
+    Radii are those of circles of the sections' areas. The body is one unforked run; it starts at
+    ``root``, or at the thicker end.
+
+    Args:
+        surface: Closed.
+        root: A point near the end that is held [m], shape [3], or None.
+        count: Number of sections.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    inertia = mesh.principal_inertia_vectors
+    # The long axis is the one of the least moment of inertia.
+    axis = inertia[int(np.argmin(mesh.principal_inertia_components))]
+    along = surface.vertices @ axis
+    low, high = float(along.min()), float(along.max())
+    middle = mesh.center_mass
+    centres, radii = [], []
+    for at in low + (high - low) * (np.arange(count) + 0.5) / count:
+        section = mesh.section(plane_origin=middle + (at - middle @ axis) * axis,
+                               plane_normal=axis)
+        if section is None:
+            continue
+        flat, to_space = section.to_2D()
+        areas = [(polygon.area, np.array(polygon.centroid.coords[0]))
+                 for polygon in flat.polygons_full]
+        area = sum(a for a, _ in areas)
+        if area <= 0:
+            continue
+        centre = sum(a * c for a, c in areas) / area
+        centres.append((to_space @ np.array([*centre, 0.0, 1.0]))[:3])
+        radii.append(np.sqrt(area / np.pi))
+    if len(centres) < 4:
+        raise InputError("The surface has no clear long axis.", "It is not slender.",
+                         "Use a surface that is longer than it is thick.")
+    return _to_the_ends(np.array(centres), np.array(radii), axis, low, high, root)
+
+
+def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: float,
+                 high: float, root: np.ndarray | None) -> Skeleton:
+    first = centres[0] + (low - centres[0] @ axis) * axis
+    last = centres[-1] + (high - centres[-1] @ axis) * axis
+    nodes = np.vstack([first, centres, last])
+    radius = np.concatenate([radii[:1], radii, radii[-1:]])
+    if root is not None:
+        turn = np.linalg.norm(nodes[-1] - root) < np.linalg.norm(nodes[0] - root)
+    else:
+        quarter = max(len(radius) // 4, 1)
+        turn = radius[-quarter:].mean() > 1.02 * radius[:quarter].mean()
+    if turn:
+        nodes, radius = nodes[::-1], radius[::-1]
+    return Skeleton.from_edges(nodes, np.arange(len(nodes)) - 1, radius)
+
+
+def _closed(surface: Surface, path: Path) -> Surface:
+    if surface.volume < 0:
+        surface = Surface(surface.vertices, surface.faces[:, ::-1])
+    check = check_surface(surface)
+    if not check.watertight:
+        raise InputError(
+            f"{path} has {len(check.open_edges)} open or double edges, one at "
+            f"{np.round(check.open_edges[0], 4).tolist()} m.", "The surface must be closed.",
+            "Close its holes (in Blender: select non-manifold, fill), then mesh it again.")
+    if not check.oriented:
+        raise InputError(f"{path}: faces point in and out.", "They must be oriented alike.",
+                         "Recalculate its normals (in Blender: Shift N).")
+    if len(check.crossings):
+        raise InputError(
+            f"{path} crosses itself in {len(check.crossings)} places, one at "
+            f"{np.round(check.crossings[0], 4).tolist()} m.", "A solid does not overlap itself.",
+            "Unite its parts (in Blender: a Boolean modifier with Self), then mesh it again.")
+    return surface
+
+
+def _aligned(surface: Surface, skeleton: Skeleton, scale: float, settings: MeshSurfaceSettings,
+             ) -> tuple[Alignment, Surface, Skeleton]:
+    from limber.geometry.upright import upright_rotation
+
+    root = skeleton.nodes[0]
+    rotation = upright_rotation(skeleton, np.array(settings.up), settings.upright) \
+        if settings.upright else shortest_turn(np.array(settings.up), np.array([0.0, 0.0, 1.0]))
+    alignment = Alignment(scale=scale, origin=tuple(root.tolist()),
+                          rotation=tuple(map(tuple, rotation.tolist())))
+    return (alignment, Surface((surface.vertices - root) @ rotation.T, surface.faces),
+            skeleton.moved((skeleton.nodes - root) @ rotation.T))

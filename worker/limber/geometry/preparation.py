@@ -1,0 +1,152 @@
+"""From a file's points to a cloud that can be worked on: unit, origin, crop, outliers, thinning."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial import cKDTree
+
+from limber.errors import InputError
+from limber.geometry.cloud import Cloud
+
+POINT_MINIMUM = 50
+_LARGEST_EXTENT = 60.0  # [m]: taller than that is no plant that anybody scans as a branch
+_SMALLEST_EXTENT = 0.02
+
+
+class PreparationSettings(BaseModel):
+    """How the cloud is cleaned."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    crop_low: tuple[float, float, float] | None = Field(
+        None, description="Lower corner of the part to keep, in the file's coordinates.")
+    crop_high: tuple[float, float, float] | None = Field(
+        None, description="Upper corner of the part to keep.")
+    outlier_ratio: float = Field(
+        5.0, ge=0, description="Drop points whose neighbours are so many times as far as is usual "
+        "around them; 0 keeps all.")
+    outlier_neighbours: int = Field(8, ge=2, le=64, description="Neighbours that are looked at.")
+    outlier_radius: float = Field(
+        0.0, ge=0, description="Drop points with fewer neighbours than that within this radius "
+        "[m]; 0: off.")
+    voxel: float = Field(
+        0.0, ge=0, description="Keep one point a cell of this size [m]; 0 keeps all.")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A cleaned cloud in metres near the origin, and what was done.
+
+    Attributes:
+        cloud: The points that stayed, recentred.
+        origin: What was subtracted [m], in the file's axes, shape [3].
+        counts: Number of points dropped, by reason.
+        warnings: What the user should know.
+    """
+
+    cloud: Cloud
+    origin: np.ndarray
+    counts: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None) -> Prepared:
+    """Crop, convert to metres, recentre, and drop duplicates and outliers.
+
+    Args:
+        cloud: As the file has it.
+        scale: Metres per unit of the file.
+        settings: How.
+
+    Raises:
+        InputError: too few points, or all of them at one place.
+    """
+    settings = settings or PreparationSettings()
+    counts = {"read": len(cloud)}
+    cloud = _cropped(cloud, settings)
+    counts["cropped"] = counts["read"] - len(cloud)
+    _enough(cloud, "The cloud")
+    # Subtracted in float64 before anything else: map coordinates leave no digits to a float32.
+    scaled = cloud.points * scale
+    origin = np.round(scaled.mean(axis=0), 3)
+    points = scaled - origin
+    if np.ptp(points, axis=0).max() <= 1e-9 * max(float(np.abs(scaled).max()), 1e-9):
+        raise InputError(f"All {len(points)} points are at one place.",
+                         "A branch has an extent.", "Check the export's columns and digits.")
+    cloud = cloud.with_points(points)
+    _, first = np.unique(points, axis=0, return_index=True)
+    counts["duplicates"] = len(cloud) - len(first)
+    cloud = cloud.subset(np.sort(first))
+    keep = _without_outliers(cloud.points, settings)
+    counts["outliers"] = int((~keep).sum())
+    cloud = cloud.subset(keep)
+    if settings.voxel > 0:
+        chosen = voxel_thinned(cloud.points, settings.voxel)
+        counts["thinned"] = len(cloud) - len(chosen)
+        cloud = cloud.subset(chosen)
+    _enough(cloud, "After cropping and cleaning the cloud")
+    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts))
+
+
+def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
+    """Indices of the first point in each cell of ``size`` [m], sorted."""
+    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+    extent = cell.max(axis=0) + 1
+    if float(extent[0]) * float(extent[1]) * float(extent[2]) > 2.0**62:
+        raise InputError(f"Cells of {size:g} m are too small for this cloud.",
+                         "Their number overflows.", "Choose a larger --voxel.")
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    return np.sort(np.unique(key, return_index=True)[1])
+
+
+def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
+    keep = np.ones(len(cloud), bool)
+    if settings.crop_low is not None:
+        keep &= (cloud.points >= np.array(settings.crop_low)).all(axis=1)
+    if settings.crop_high is not None:
+        keep &= (cloud.points <= np.array(settings.crop_high)).all(axis=1)
+    if not keep.any():
+        low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+        raise InputError("The crop box holds no points.",
+                         f"The cloud reaches from {low.tolist()} to {high.tolist()}.",
+                         "Give the box in the file's own coordinates and unit.")
+    return cloud if keep.all() else cloud.subset(keep)
+
+
+def _enough(cloud: Cloud, what: str) -> None:
+    if len(cloud) < POINT_MINIMUM:
+        raise InputError(f"{what} has {len(cloud)} points.",
+                         f"A skeleton needs at least {POINT_MINIMUM}.",
+                         "Scan more densely, or crop less.")
+
+
+def _without_outliers(points: np.ndarray, settings: PreparationSettings) -> np.ndarray:
+    """Mask of the points that stay; what is usual is taken nearby, since scans are uneven."""
+    keep = np.ones(len(points), bool)
+    if settings.outlier_ratio > 0:
+        count = min(settings.outlier_neighbours + 1, len(points))
+        distance, near = cKDTree(points).query(points, k=count)
+        own = distance[:, 1:].mean(axis=1)
+        # The median over the neighbours is itself wide for a lone point among lone points, so
+        # the whole cloud's counts too.
+        usual = np.maximum(np.median(own[near], axis=1), np.median(own))
+        keep &= own <= settings.outlier_ratio * np.minimum(usual, 3 * np.median(own))
+    if settings.outlier_radius > 0:
+        number = cKDTree(points).query_ball_point(
+            points, settings.outlier_radius, return_length=True)
+        keep &= number > settings.outlier_neighbours
+    return keep
+
+
+def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
+    texts = []
+    extent = float(np.ptp(points, axis=0).max())
+    if extent > _LARGEST_EXTENT:
+        texts.append(f"The cloud is {extent:.0f} m long: are its units millimetres (--unit mm)?")
+    if extent < _SMALLEST_EXTENT:
+        texts.append(f"The cloud is {1000 * extent:.1f} mm long: are its units really these?")
+    lost = counts.get("outliers", 0)
+    if lost > 0.1 * len(points):
+        texts.append(f"{lost} points were dropped as outliers (--outlier-ratio).")
+    return texts

@@ -1,0 +1,263 @@
+"""The stage `reconstruct`: a scan becomes a branch folder with skeleton, surface and mesh."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from limber.errors import InputError
+from limber.geometry.cloud import Cloud
+from limber.geometry.cloud_files import read_points
+from limber.geometry.control_points import FRACTIONS
+from limber.geometry.marks import GRASP_FRACTION, mark
+from limber.geometry.mesh_quality import measure_quality
+from limber.geometry.preparation import PreparationSettings, Prepared, prepare
+from limber.geometry.skeleton import CLAMPED, INTERPOLATED, Skeleton
+from limber.geometry.skeleton_files import UNIT_METRES, read_skeleton, write_cylinders
+from limber.geometry.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
+from limber.geometry.surface import Surface
+from limber.geometry.surface_checks import check_surface
+from limber.geometry.tetrahedra import MeshResult, MeshSettings, mesh_branch
+from limber.geometry.tubes import branch_surface
+from limber.geometry.upright import upright_rotation
+from limber.progress import SILENT, Progress
+from limber.store import Alignment, Branch, file_digest
+
+GRAVITY = 9.80665  # [m/s^2]
+
+
+class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
+    """Everything that decides what a scan becomes."""
+
+    unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
+    up: tuple[float, float, float] = Field(
+        (0.0, 0.0, 1.0), description="Which way is up in the file's axes.")
+    root: tuple[float, float, float] | None = Field(
+        None, description="A point near the root, in the file's coordinates; else the thick end.")
+    upright: bool = Field(
+        True, description="Turn the branch so that it grows along z; gravity is turned with it.")
+    twig_radius: float = Field(
+        0.0, ge=0, description="Leave out twigs thinner than that [m], keep their mass.")
+    twig_order: int = Field(
+        9, ge=0, le=9, description="Leave out twigs of a higher branching order, keep their mass.")
+    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
+    poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
+    density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
+    grasp_fraction: float = Field(
+        GRASP_FRACTION, gt=0, le=1, description="Where the branch is held, along its main path.")
+
+
+def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
+                skeleton_path: Path | None = None, force: bool = False,
+                progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
+                ) -> dict[str, Any]:
+    """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+
+    Args:
+        cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
+        folder: The branch folder to make or renew.
+        settings: How.
+        skeleton_path: The user's own skeleton in the scan's coordinates and unit (SWC or
+            cylinder CSV), instead of ours.
+        force: Run even if nothing has changed.
+        progress: Called as it goes.
+        warn: Gets each thing that the user should know.
+
+    Returns:
+        The stage's result (DESIGN's keys and more).
+
+    Raises:
+        InputError: the scan, the skeleton or the folder cannot be used.
+        WorkError: the work failed; the folder is as it was.
+    """
+    settings = settings or ReconstructSettings()
+    raw = read_points(cloud_path)
+    branch = Branch.create(folder)
+    digests = {"cloud": file_digest(cloud_path)}
+    if skeleton_path is not None:
+        digests["skeleton"] = file_digest(skeleton_path)
+    if not force and branch.is_current("reconstruct", settings, digests=digests):
+        return branch.manifest.stages["reconstruct"].result
+    warnings: list[str] = []
+
+    def tell(text: str) -> None:
+        warnings.append(text)
+        warn(text)
+
+    with branch.stage("reconstruct", settings, digests=digests) as stage:
+        prepared = prepare(raw, UNIT_METRES[settings.unit], settings)
+        for text in prepared.warnings:
+            tell(text)
+        found = _skeleton(prepared, settings, skeleton_path, progress.part(0.02, 0.55))
+        for text in found.warnings:
+            tell(text)
+        alignment, cloud, skeleton = _aligned(prepared, found, settings)
+        stage.manifest.alignment = alignment
+        stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
+                                 "sha256": digests["cloud"]}
+        up = np.array(settings.up) / np.linalg.norm(settings.up)
+        gravity = -GRAVITY * np.array(alignment.rotation) @ up
+        result = write_geometry(stage, skeleton, settings, tell, progress.part(0.55, 0.98))
+        cloud.write_ply(stage.path("cloud.ply"))
+        if _copy_truth(Path(cloud_path), stage, alignment):
+            stage.manifest.source["truth"] = "truth/truth.json"
+        stage.result.update(result | found.report() | {
+            "point_count": len(cloud), "dropped_points": prepared.counts,
+            "gravity_m_s2": gravity, "warnings": warnings})
+        progress(1.0, "reconstructed")
+    return branch.manifest.stages["reconstruct"].result
+
+
+def write_geometry(stage: Any, skeleton: Skeleton, settings: ReconstructSettings,
+                   warn: Callable[[str], None], progress: Progress) -> dict[str, Any]:
+    """Write skeleton, surface and mesh of an aligned skeleton; return their numbers."""
+    kept, masses = leave_out_twigs(skeleton, settings)
+    surface = branch_surface(kept)
+    check = check_surface(surface)
+    check.require()
+    progress(0.1, "surface", faces=len(surface.faces))
+    meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
+    for text in meshed.warnings:
+        warn(text)
+    mesh = mark(meshed.mesh, kept, young=settings.young, poisson=settings.poisson,
+                density=settings.density, fractions=FRACTIONS,
+                grasp_fraction=settings.grasp_fraction)
+    skeleton.write_swc(stage.path("skeleton.swc"))
+    write_cylinders(skeleton, stage.path("skeleton.csv"))
+    surface.write_ply(stage.path("surface.ply"))
+    mesh.write(stage.path("mesh.vtu"))
+    if masses:
+        stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n")
+    progress(1.0, "mesh", tets=mesh.tet_count)
+    return _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
+        "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses)}
+
+
+def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed: MeshResult,
+             kept: Skeleton) -> dict[str, Any]:
+    quality = measure_quality(meshed.mesh, surface.volume, kept)
+    return {
+        "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
+        "length_m": skeleton.length, "main_length_m": float(
+            skeleton.arc_length[skeleton.main_path()[-1]]),
+        "radius_min_m": float(skeleton.radius.min()), "radius_max_m": float(skeleton.radius.max()),
+        "radius_sigma_median_m": float(np.median(skeleton.radius_sigma)),
+        "clamped_radius_count": int((skeleton.radius_state == CLAMPED).sum()),
+        "interpolated_radius_count": int((skeleton.radius_state == INTERPOLATED).sum()),
+        "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
+        "tet_count": meshed.mesh.tet_count, "mesh_node_count": meshed.mesh.node_count,
+        "mesher": meshed.mesher, "watertight": check["watertight"], "surface_check": check,
+        "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb()}
+
+
+def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
+                    ) -> tuple[Skeleton, list[dict[str, Any]]]:
+    """Cut off thin or high-order side twigs; their mass stays, at their place.
+
+    Returns:
+        The skeleton to mesh, and for each twig cut off ``mass_kg``, its ``centre_m`` and
+        ``attached_m``, the point on the kept axis that carries it.
+    """
+    keep = np.ones(skeleton.node_count, bool)
+    masses: list[dict[str, Any]] = []
+    for run, members in enumerate(skeleton.runs()[1:], start=1):
+        own = members[1:]
+        carried = not keep[members[0]]
+        thin = float(np.median(skeleton.radius[own])) < settings.twig_radius
+        if not (carried or thin or skeleton.order[own[0]] > settings.twig_order):
+            continue
+        keep[own] = False
+        base = members[0]
+        while not keep[base]:
+            base = skeleton.parent[base]
+        up = skeleton.parent[own]
+        length = np.linalg.norm(skeleton.nodes[own] - skeleton.nodes[up], axis=1)
+        volume = np.pi * skeleton.radius[own]**2 * length
+        centre = np.average((skeleton.nodes[own] + skeleton.nodes[up]) / 2, axis=0,
+                            weights=np.maximum(volume, 1e-300))
+        masses.append({"mass_kg": float(settings.density * volume.sum()),
+                       "centre_m": centre.tolist(), "attached_m": skeleton.nodes[base].tolist(),
+                       "branch": run})
+    return (skeleton, []) if keep.all() else (skeleton.subset(keep), masses)
+
+
+def peak_memory_mb() -> float:
+    """Most memory that this process has held [MB]."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        import psutil
+
+        return psutil.Process().memory_info().peak_wset / 1e6
+    import sys
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: Path | None,
+              progress: Progress) -> SkeletonResult:
+    scale = UNIT_METRES[settings.unit]
+    if skeleton_path is not None:
+        from limber.geometry.skeletonise import given_skeleton
+
+        own = read_skeleton(skeleton_path, scale=scale)
+        return given_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
+    root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
+    return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
+                       progress=progress)
+
+
+def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,
+             ) -> tuple[Alignment, Cloud, Skeleton]:
+    """Move the root to the origin and turn the branch upright."""
+    root = found.skeleton.nodes[0]
+    rotation = upright_rotation(found.skeleton, np.array(settings.up), settings.upright)
+    skeleton = found.skeleton.moved((found.skeleton.nodes - root) @ rotation.T)
+    attributes = dict(prepared.cloud.attributes)
+    if "normal" in attributes:
+        attributes["normal"] = (attributes["normal"] @ rotation.T).astype(np.float32)
+    attributes["skeleton_node"] = found.node_of_point.astype(np.int32)
+    attributes["residual"] = found.residual.astype(np.float32)
+    cloud = Cloud((prepared.cloud.points - root) @ rotation.T, attributes)
+    alignment = Alignment(scale=UNIT_METRES[settings.unit],
+                          origin=tuple((prepared.origin + root).tolist()),
+                          rotation=tuple(map(tuple, rotation.tolist())))
+    return alignment, cloud, skeleton
+
+
+def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
+    """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
+    source = cloud_path.parent / "truth.json"
+    skeleton_path = cloud_path.parent / "truth_skeleton.swc"
+    if not (source.is_file() and skeleton_path.is_file()):
+        return False
+    truth = json.loads(source.read_text(encoding="utf-8"))
+    if truth.get("cloud_sha256") != file_digest(cloud_path):
+        return False
+    skeleton = Skeleton.read_swc(skeleton_path)
+    skeleton.moved(alignment.apply(skeleton.nodes)).write_swc(stage.path("truth/skeleton.swc"))
+    truth["control_points_m"] = alignment.apply(np.array(truth["control_points_m"])).tolist()
+    stage.path("truth/truth.json").write_text(json.dumps(truth, indent=1) + "\n")
+    surface_path = cloud_path.parent / "truth_surface.ply"
+    if surface_path.is_file():
+        surface = Surface.read(surface_path)
+        Surface(alignment.apply(surface.vertices), surface.faces).write_ply(
+            stage.path("truth/surface.ply"))
+    else:
+        stage.remove("truth/surface.ply")
+    return True
+
+
+def require_file(path: Path, what: str) -> Path:
+    """Return ``path`` if it is a file.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"There is no file {path}.", f"{what} was expected.", "Check the path.")
+    return Path(path)
