@@ -31,6 +31,8 @@ def read_points(path: Path) -> np.ndarray:
 def _read_text(path: Path) -> np.ndarray:
     with open(path, encoding="utf-8", errors="replace") as stream:
         first = stream.readline()
+        if not first:
+            raise ValueError("it is empty")
         delimiter = next((mark for mark in ",;" if mark in first), None)
     skipped = 0 if _is_numbers(first, delimiter) else 1
     return np.loadtxt(path, delimiter=delimiter, skiprows=skipped, usecols=(0, 1, 2), ndmin=2)

@@ -24,6 +24,12 @@ def eevee_engine() -> str:
     return "BLENDER_EEVEE_NEXT" if "BLENDER_EEVEE_NEXT" in engines else "BLENDER_EEVEE"
 
 
+def use_nodes(thing: bpy.types.Material | bpy.types.World) -> None:
+    """Give a material or world its nodes; from 5.0 on it always has them."""
+    if bpy.app.version < (5, 0, 0):
+        thing.use_nodes = True
+
+
 def flush_native_output() -> None:
     """Write out what Blender's C code has printed so far, lest it come after later output."""
     if os.name == "posix":

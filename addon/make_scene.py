@@ -1,6 +1,6 @@
 """Makes a scene file and its picture; `limber scene` runs this in a process that has bpy.
 
-    blender -b --factory-startup --python make_scene.py -- DATA.npz SCENE.blend [PICTURE.png]
+    blender -b --factory-startup --python make_scene.py -- DATA.npz SCENE.blend [PICTURE.png WIDTH]
 
 Standard output carries JSON lines as every stage's does; the last one has ``status``.
 """
@@ -29,9 +29,11 @@ def _say(**content) -> None:
     print("\n" + json.dumps(content), flush=True)
 
 
-def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None) -> dict:
+def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = None,
+               width: int = 1120) -> dict:
     """Build the scene of ``data_path``, save it and render its last frame; returns a summary."""
     _load_addon()
+    animation = importlib.import_module("limber_addon.bridge.animation")
     scenes = importlib.import_module("limber_addon.scene")
     studio = importlib.import_module("limber_addon.studio")
     legend = importlib.import_module("limber_addon.legend")
@@ -44,15 +46,16 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None) -> 
     scene.name = data.info["name"]
     scene.unit_settings.system = "METRIC"
     shown = scenes.show_branch(scene, data)
-    camera = studio.set_up_studio(scene, data)
+    camera = studio.set_up_studio(scene, data, studio.Picture(width))
     legend.add_legend(scene, camera, data, shown)
     _say(progress=0.2, message="scene built")
+    target = picture_path or scene_path.with_suffix(".png")
+    scene.render.filepath = animation.shown_path(target)
     scene.frame_set(scene.frame_end if shown.frame_count > 1 else 1)
     bpy.ops.wm.save_as_mainfile(filepath=str(scene_path), compress=True)
     _say(progress=0.3, message="scene saved")
     if picture_path is not None:
         _say(progress=0.3, message="rendering")
-        scene.render.filepath = str(picture_path)
         bpy.ops.render.render(write_still=True)
     return {"object_count": len(scene.objects), "frame_count": shown.frame_count,
             "blender": bpy.app.version_string}
@@ -60,9 +63,10 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None) -> 
 
 def main(arguments: list[str]) -> int:
     """Run with the arguments after ``--``; returns the exit code."""
-    data, scene, *picture = (Path(argument) for argument in arguments)
+    data, scene, *picture = arguments
     try:
-        summary = make_scene(data, scene, picture[0] if picture else None)
+        summary = make_scene(Path(data), Path(scene),
+                             *((Path(picture[0]), int(picture[1])) if picture else ()))
     except (ValueError, RuntimeError, OSError) as error:
         _say(status="failed", error=str(error))
         return 3

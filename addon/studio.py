@@ -17,11 +17,14 @@ LEGEND_SHARE = 0.30
 
 @dataclass(frozen=True)
 class Picture:
-    """Size of a rendered picture [pixels] and how many samples a pixel may take."""
+    """Width of a rendered picture [pixels] and how many samples a pixel may take."""
 
     width: int = 1120
-    height: int = 840
     samples: int = 32
+
+    @property
+    def height(self) -> int:
+        return self.width * 3 // 4
 
 
 def set_up_studio(scene: bpy.types.Scene, data: SceneData,
@@ -63,7 +66,7 @@ def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
 def _set_world(scene: bpy.types.Scene) -> None:
     world = scene.world or bpy.data.worlds.new("World")
     scene.world = world
-    world.use_nodes = True
+    compat.use_nodes(world)
     world.cycles.sampling_method = "NONE"
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     background.inputs["Color"].default_value = (0.82, 0.85, 0.88, 1.0)

@@ -4,6 +4,8 @@ import math
 
 import bpy
 
+from .. import compat
+
 
 def plain_material(name: str, color: tuple[float, float, float], *, alpha: float = 1.0,
                    roughness: float = 0.5) -> bpy.types.Material:
@@ -70,7 +72,7 @@ def scalar_material(name: str, attribute: str, *, low: float, high: float, log: 
 
 def _new(name: str) -> tuple[bpy.types.Material, bpy.types.Node]:
     material = bpy.data.materials.new(name)
-    material.use_nodes = True
+    compat.use_nodes(material)
     nodes = material.node_tree.nodes
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     return material, shader

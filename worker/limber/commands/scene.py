@@ -27,11 +27,13 @@ _SCRIPT = Path(__file__).parents[3] / "addon" / "make_scene.py"
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The .blend to write.")
 @click.option("--render", "picture", type=click.Path(path_type=Path),
               help="Also render a picture (PNG) of the end of the path.")
+@click.option("--width", type=click.IntRange(160, 8192), default=1120, show_default=True,
+              help="Of the picture [pixels]; its height is three quarters of it.")
 @click.option("--plan", help="Which path to show.  [default: the newest]")
 @click.option("--data", "data_path", type=click.Path(path_type=Path),
               help="Write only what a scene shows, as arrays (.npz): what the add-on opens.")
 def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | None,
-            plan: str | None, data_path: Path | None) -> dict[str, Any]:
+            width: int, plan: str | None, data_path: Path | None) -> dict[str, Any]:
     """A Blender scene with the branch, its motion and paths (needs bpy or Blender)."""
     from limber.scene_data import scene_data
 
@@ -47,7 +49,7 @@ def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | 
         prepared = Path(temporary) / "scene.npz"
         data.write(prepared)
         result = _make_scene(prepared, _writable(output), picture and _writable(picture),
-                             run.progress.part(0.1, 1.0))
+                             width, run.progress.part(0.1, 1.0))
     return result | {"scene": output, "picture": picture}
 
 
@@ -60,11 +62,11 @@ def _writable(path: Path) -> Path:
     return path.resolve()
 
 
-def _make_scene(data: Path, output: Path, picture: Path | None,
+def _make_scene(data: Path, output: Path, picture: Path | None, width: int,
                 progress: Progress) -> dict[str, Any]:
     from limber.jobs.process import run_json_process
 
-    arguments = ["--", str(data), str(output), *([str(picture)] if picture else [])]
+    arguments = ["--", str(data), str(output), *([str(picture), str(width)] if picture else [])]
     progress(0.0, "starting Blender")
     result = run_json_process("scene", [*blender_command(), *arguments], progress,
                               fix="`limber doctor` says which Blender was used.")

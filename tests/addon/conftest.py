@@ -1,0 +1,145 @@
+"""What tests of the add-on share: branch folders with known motion, bpy, the add-on, a Blender."""
+
+import csv
+import importlib.util
+import json
+import os
+import shutil
+import struct
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.geometry.cylinder_mesh import straight_beam
+from limber.geometry.tet_mesh import TetMesh
+from limber.store import Branch
+
+ROOT = Path(__file__).parents[2]
+ADDON = ROOT / "addon"
+PATH_COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
+                "strain")
+
+
+@dataclass(frozen=True)
+class BeamBranch:
+    """A branch folder of a beam that bends by a formula: every frame is known."""
+
+    folder: Path
+    mesh: TetMesh
+    surface: np.ndarray
+    frames: np.ndarray
+    path: np.ndarray
+
+
+def write_pc2(path: Path, frames: np.ndarray) -> None:
+    """Write frames [f, v, 3] m as PC2, independently of the code under test."""
+    head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, frames.shape[1], 0.0, 1.0, len(frames))
+    path.write_bytes(head + np.ascontiguousarray(frames, "<f4").tobytes())
+
+
+def bent(points: np.ndarray, amount: float) -> np.ndarray:
+    """Return ``points`` [n, 3] bent towards x by ``amount`` times the square of the height."""
+    moved = np.array(points, float)
+    moved[:, 0] += amount * points[:, 2] ** 2
+    return moved
+
+
+def make_beam_branch(folder: Path, frame_count: int = 6, *, plan: bool = True) -> BeamBranch:
+    """Write a branch folder with a mesh, a plan, its baseline and frames."""
+    mesh = straight_beam(0.6, 0.012, 0.005, slice_count=12, grasp_fraction=0.67)
+    height = mesh.centroids[:, 2] / 0.6
+    mesh = mesh.with_data(cell_data={"young": 2.5e7 * np.exp(-2.5 * height)})
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    amounts = np.linspace(0.0, 1.0, frame_count)
+    frames = np.array([bent(surface, amount) for amount in amounts])
+    grasp = mesh.nodes[mesh.point_data["grasp"] > 0].mean(axis=0)
+    path = np.vstack([bent(grasp[None], amount) for amount in amounts])
+    branch = Branch.create(folder)
+    with branch.stage("reconstruct") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+        stage.result["length_m"] = 0.6
+    if plan:
+        with branch.stage("plan:to-goal", reads=["mesh.vtu"]) as stage:
+            _write_plan(stage, path)
+            write_pc2(stage.path("frames/to-goal.pc2"), frames)
+            stage.path("frames/to-goal.json").write_text(json.dumps(
+                {"frame_count": frame_count, "energies_j": list(0.01 * amounts)}))
+    return BeamBranch(folder, mesh, surface, frames, path)
+
+
+def _write_plan(stage, path: np.ndarray) -> None:
+    for name, points in (("to-goal", path), ("to-goal-baseline", path + [[0.0, 0.01, 0.0]])):
+        with open(stage.path(f"plans/{name}.csv"), "w", newline="") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(PATH_COLUMNS)
+            writer.writerows([0.0, *point, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] for point in points)
+    stage.path("plans/to-goal.json").write_text(json.dumps({
+        "goal": {"kind": "grasp", "position_m": list(path[-1]), "tolerance_m": 0.02},
+        "plan": {"length_m": 0.13, "energy_sum_nmm": 4.5},
+        "baseline": {"length_m": 0.11, "energy_sum_nmm": 6.5},
+        "energy_saved_percent": 31.0, "length_added_percent": 18.0}))
+
+
+@pytest.fixture()
+def beam(tmp_path: Path) -> BeamBranch:
+    """A fresh branch folder of a bending beam."""
+    return make_beam_branch(tmp_path / "beam.branch")
+
+
+@pytest.fixture()
+def bare_beam(tmp_path: Path) -> BeamBranch:
+    """A branch folder as it is after reconstruction: no plan, no frames."""
+    return make_beam_branch(tmp_path / "bare.branch", plan=False)
+
+
+@pytest.fixture()
+def bpy():
+    """The bpy module with an empty file, before the test and after it."""
+    module = pytest.importorskip("bpy", reason="NO BPY: pip install 'limber[blender]'")
+    module.ops.wm.read_factory_settings(use_empty=True)
+    yield module
+    module.ops.wm.read_factory_settings(use_empty=True)
+
+
+@pytest.fixture()
+def addon(bpy):
+    """The add-on as a package called ``limber_addon``, not registered."""
+    if "limber_addon" not in sys.modules:
+        spec = importlib.util.spec_from_file_location(
+            "limber_addon", ADDON / "__init__.py", submodule_search_locations=[str(ADDON)])
+        sys.modules["limber_addon"] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules["limber_addon"])
+    return sys.modules["limber_addon"]
+
+
+@pytest.fixture()
+def registered(addon, monkeypatch):
+    """The add-on, registered, with this Python as the worker's."""
+    monkeypatch.setenv("LIMBER_PYTHON", sys.executable)
+    addon.register()
+    yield addon
+    addon.unregister()
+
+
+@pytest.fixture(scope="session")
+def blender() -> str:
+    """The real Blender's program."""
+    path = os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
+    if not path:
+        pytest.skip("NO REAL BLENDER: set LIMBER_BLENDER=$(scripts/provision_blender | tail -1)")
+    return path
+
+
+@pytest.fixture(scope="session")
+def extension_zip(tmp_path_factory) -> Path:
+    """The extension, built as a user would."""
+    out = tmp_path_factory.mktemp("build")
+    done = subprocess.run([ROOT / "scripts" / "build_extension", "--output-dir", out], check=False,
+                          capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "valid, says" in done.stderr
+    return Path(done.stdout.splitlines()[-1])

@@ -1,0 +1,153 @@
+"""The worker as a process: progress, results, failures, and a cancel that leaves nothing alive."""
+
+import importlib
+import os
+import sys
+import textwrap
+import time
+
+import pytest
+
+
+@pytest.fixture()
+def jobs(addon):
+    module = importlib.import_module("limber_addon.jobs")
+    yield module
+    module.forget()
+
+
+def _worker(tmp_path, body):
+    script = tmp_path / "worker.py"
+    script.write_text("import json, os, signal, subprocess, sys, time\n"
+                      "def say(**x): print(json.dumps(x), flush=True)\n" + textwrap.dedent(body))
+    return [sys.executable, str(script)]
+
+
+def _poll_until(job, condition, seconds=15.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        job.poll()
+        assert time.monotonic() < end, f"{job.state} {job.message} {list(job.log)}"
+        time.sleep(0.02)
+
+
+def _alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    with open(f"/proc/{pid}/stat") as stat:
+        return stat.read().split(")")[1].split()[0] != "Z"
+
+
+def test_progress_and_result(jobs, tmp_path):
+    """Progress lines arrive while it runs, lines of native libraries are passed over."""
+    job = jobs.start("Trying", _worker(tmp_path, """
+        say(progress=0.5, message="half")
+        print("Blender 4.3.2", flush=True)
+        sys.stdin.read()
+        time.sleep(0.3)
+        say(status="done", answer=42)
+        print("Blender quit", flush=True)
+        """))
+    _poll_until(job, lambda: job.fraction == 0.5)
+    assert job.message == "half"
+    assert jobs.is_running()
+    with pytest.raises(RuntimeError, match="still running"):
+        jobs.start("Second", [sys.executable, "-c", ""])
+    assert job.wait() is jobs.JobState.DONE
+    assert job.result["answer"] == 42
+    assert not jobs.is_running()
+
+
+def test_failure_says_why(jobs, tmp_path):
+    """The worker's own error is kept; without one, the end of its standard error is."""
+    job = jobs.start("Trying", _worker(tmp_path, """
+        say(status="failed", error="The cloud is empty.")
+        sys.exit(2)
+        """))
+    assert job.wait() is jobs.JobState.FAILED
+    assert job.error == "The cloud is empty."
+    job = jobs.start("Trying", _worker(tmp_path, "raise ValueError('of a bug')"))
+    assert job.wait() is jobs.JobState.FAILED
+    assert "exit code 1" in job.error
+    assert "ValueError: of a bug" in job.error
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_cancel_is_asked_first(jobs, tmp_path):
+    """A cancel is SIGTERM, so that the worker can clean up; the state is then cancelled."""
+    job = jobs.start("Trying", _worker(tmp_path, """
+        def stop(*_):
+            say(status="cancelled", cleaned=True)
+            sys.exit(130)
+        signal.signal(signal.SIGTERM, stop)
+        say(progress=0.1)
+        time.sleep(60)
+        """))
+    _poll_until(job, lambda: job.fraction == 0.1)
+    job.cancel()
+    assert job.wait() is jobs.JobState.CANCELLED
+    assert job.result["cleaned"] is True
+
+
+@pytest.mark.skipif(not os.path.exists("/proc"), reason="reads /proc")
+def test_stubborn_worker_is_killed_with_its_children(jobs, tmp_path, monkeypatch):
+    """A worker that ignores SIGTERM is killed after a while, and what it started as well."""
+    monkeypatch.setattr(jobs, "_GRACE_SECONDS", 0.3)
+    job = jobs.start("Trying", _worker(tmp_path, """
+        ignore = "import signal, time; signal.signal(15, signal.SIG_IGN); time.sleep(60)"
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        child = subprocess.Popen([sys.executable, "-c", ignore])
+        time.sleep(0.3)
+        say(progress=child.pid)
+        time.sleep(60)
+        """))
+    _poll_until(job, lambda: job.fraction > 1)
+    child = int(job.fraction)
+    job.cancel()
+    assert job.wait() is jobs.JobState.CANCELLED
+    end = time.monotonic() + 5
+    while _alive(child) and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not _alive(child)
+
+
+def test_forget_ends_the_worker(jobs, tmp_path):
+    """When the add-on goes away its worker goes too."""
+    job = jobs.start("Trying", _worker(tmp_path, "say(progress=0.1)\ntime.sleep(60)"))
+    _poll_until(job, lambda: job.fraction == 0.1)
+    jobs.forget()
+    assert job._process.poll() is not None
+    assert jobs.current() is None
+
+
+def test_finding_the_worker(addon, tmp_path, monkeypatch):
+    """Preferences, LIMBER_PYTHON, the PATH, the fallback, in this order; else a helpful error."""
+    worker = importlib.import_module("limber_addon.worker")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("LIMBER_PYTHON", raising=False)
+    with pytest.raises(worker.WorkerNotFound, match="preferences"):
+        worker.worker_command()
+    assert worker.worker_command("", sys.executable) == [sys.executable, "-m", "limber"]
+    program = tmp_path / ("limber" if os.name == "posix" else "limber.exe")
+    program.write_text("")
+    program.chmod(0o755)
+    assert worker.worker_command("", sys.executable) == [str(program)]
+    monkeypatch.setenv("LIMBER_PYTHON", sys.executable)
+    assert worker.worker_command() == [sys.executable, "-m", "limber"]
+    other = tmp_path / "python"
+    other.write_text("")
+    assert worker.worker_command(str(other)) == [str(other), "-m", "limber"]
+    with pytest.raises(worker.WorkerNotFound, match="does not exist"):
+        worker.worker_command(str(tmp_path / "gone"))
+
+
+def test_worker_environment_is_not_blenders(addon, monkeypatch):
+    """Blender's PYTHONHOME and PYTHONPATH do not reach the worker's Python."""
+    worker = importlib.import_module("limber_addon.worker")
+    monkeypatch.setenv("PYTHONHOME", "/blender")
+    monkeypatch.setenv("PYTHONPATH", "/blender")
+    environment = worker.worker_environment()
+    assert not {"PYTHONHOME", "PYTHONPATH"} & set(environment)
+    assert environment["PYTHONUNBUFFERED"] == "1"

@@ -1,0 +1,167 @@
+"""`limber scene`: what stands in the file, that it moves rightly, and that it can be moved."""
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.cli import call
+
+ADDON = Path(__file__).parents[2] / "addon"
+
+
+@pytest.fixture()
+def positions(bpy):
+    """A function that returns an object's vertices as evaluated at a frame, shape [v, 3]."""
+    def at(name, frame, subframe=0.0):
+        bpy.context.scene.frame_set(frame, subframe=subframe)
+        thing = bpy.data.objects[name].evaluated_get(bpy.context.evaluated_depsgraph_get())
+        values = np.empty(3 * len(thing.data.vertices), np.float32)
+        thing.data.attributes["position"].data.foreach_get("vector", values)
+        return values.reshape(-1, 3)
+    return at
+
+
+def _scene_in_process(addon, branch, path, bpy):
+    """Build the scene here, as the process of `limber scene` does, without rendering."""
+    from limber.scene_data import scene_data
+    from limber.store import Branch
+
+    scenes = importlib.import_module("limber_addon.scene")
+    reader = importlib.import_module("limber_addon.scene_data")
+    data_path = path.parent / "scene.npz"
+    scene_data(Branch.open(branch)).write(data_path)
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(data_path))
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return shown
+
+
+def test_frames_play_after_save_reopen_and_move(bpy, addon, beam, positions, tmp_path):
+    """Every vertex is at its place at every frame, also when file and folder moved together."""
+    _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
+    for number, frame in enumerate(beam.frames):
+        np.testing.assert_allclose(positions("beam", 1 + number), frame, atol=1e-6)
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    shutil.move(beam.folder, moved / beam.folder.name)
+    shutil.move(tmp_path / "scene.blend", moved / "scene.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "scene.blend"))
+    for number, frame in enumerate(beam.frames):
+        np.testing.assert_allclose(positions("beam", 1 + number), frame, atol=1e-6)
+    middle = (beam.frames[2] + beam.frames[3]) / 2
+    np.testing.assert_allclose(positions("beam", 3, 0.5), middle, atol=1e-6)
+    np.testing.assert_allclose(positions("beam", 99), beam.frames[-1], atol=1e-6)
+    np.testing.assert_allclose(positions("Rest shape", 4), beam.surface, atol=1e-6)
+
+
+def test_content(bpy, addon, beam, tmp_path):
+    """Surface with E, both paths, control points, goal, grasp and base are where they should."""
+    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    curves = importlib.import_module("limber_addon.bridge.curves")
+    shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
+    objects = bpy.data.objects
+    mesh = objects["beam"].data
+    np.testing.assert_allclose(meshes.positions(mesh), beam.surface, atol=1e-7)
+    young = meshes.scalars(mesh, "young")
+    # E falls by exp(-2.5) from the base to the tip; vertices see the mean of their tetrahedra.
+    expected = 2.5e7 * np.exp(-2.5 * beam.surface[:, 2] / 0.6)
+    np.testing.assert_allclose(young, expected, rtol=0.15)
+    colours = np.empty(4 * len(young), np.float32)
+    mesh.color_attributes.active_color.data.foreach_get("color", colours)
+    red = colours.reshape(-1, 4)[:, 0]
+    assert red[young.argmax()] > 0.8, "stiffest: yellow"
+    assert red[young.argmin()] < 0.1, "softest: violet"
+    np.testing.assert_allclose(curves.polyline_points(objects["D-RRT* path"].data), beam.path,
+                               atol=1e-6)
+    assert objects["RRT* path"].active_material != objects["D-RRT* path"].active_material
+    assert len(shown.objects["control_points"]) == 4
+    heights = [thing.location.z for thing in shown.objects["control_points"]]
+    np.testing.assert_allclose(heights, [0.12, 0.24, 0.36, 0.48], atol=0.03)
+    np.testing.assert_allclose(objects["Goal"].location, beam.path[-1], atol=1e-6)
+    assert objects["Goal"].dimensions.x == pytest.approx(0.04, rel=0.02)
+    bpy.context.scene.frame_set(6)
+    np.testing.assert_allclose(objects["Grasp 1"].location, beam.path[-1], atol=1e-6)
+    assert objects["Fixed base"].location.z < 0.01
+
+
+def test_paths_are_relative(bpy, addon, beam, tmp_path):
+    """The cache is kept relative to the file, as Blender writes such paths."""
+    shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
+    assert shown.surface.modifiers[0].filepath.replace("\\", "/") == (
+        "//beam.branch/frames/to-goal.pc2")
+
+
+def test_a_branch_without_a_plan(bpy, addon, bare_beam, tmp_path):
+    """Just reconstructed: the surface and its marks, no motion and no error."""
+    shown = _scene_in_process(addon, bare_beam.folder, tmp_path / "scene.blend", bpy)
+    assert shown.frame_count == 1
+    assert not shown.surface.modifiers
+    assert "goal" not in shown.objects
+
+
+@pytest.mark.slow
+def test_command_makes_scene_and_picture(bpy, beam, tmp_path, capsys):
+    """`limber scene` writes a file that opens here and a picture that shows a coloured branch."""
+    from PIL import Image
+
+    scene, picture = tmp_path / "out" / "scene.blend", tmp_path / "out" / "scene.png"
+    code = call(["scene", str(beam.folder), "-o", str(scene), "--render", str(picture),
+                 "--width", "560", "--json"])
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert code == 0, result
+    assert result["frame_count"] == len(beam.frames)
+    bpy.ops.wm.open_mainfile(filepath=str(scene))
+    names = set(bpy.data.objects.keys())
+    assert {"beam", "D-RRT* path", "RRT* path", "Goal", "Camera", "Ground", "Fixed base"} <= names
+    texts = [thing.data.body for thing in bpy.data.objects if thing.type == "FONT"]
+    assert any(text.endswith("MPa") for text in texts)
+    assert {"D-RRT* path", "RRT* path", "control points"} <= set(texts)
+    assert bpy.context.scene.render.filepath.endswith("scene.png")
+    pixels = np.asarray(Image.open(picture).convert("RGB"), float)
+    assert pixels.shape == (420, 560, 3)
+    # Right of the legend: yellow at the base to violet at the tip, red and blue paths.
+    red, green, blue = np.moveaxis(pixels[:, 225:], 2, 0)
+    yellow = (red > 180) & (green > 170) & (blue < 110)
+    violet = (blue > red + 15) & (red > green + 10) & (blue < 170)
+    crimson = (red > 170) & (green < 110) & (blue < 130)
+    for mask in (yellow, violet, crimson):
+        assert mask.sum() > 25
+    assert np.nonzero(yellow)[0].mean() > np.nonzero(violet)[0].mean(), "the base is below"
+
+
+def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
+    """Neither bpy nor Blender: exit code 3 and what to install; no output: exit code 2."""
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name in ("LIMBER_BLENDER", "LIMBER_SCENE_BLENDER"):
+        monkeypatch.delenv(name, raising=False)
+    assert call(["scene", str(beam.folder), "-o", str(tmp_path / "scene.blend")]) == 3
+    assert "LIMBER_BLENDER" in capsys.readouterr().err
+    assert call(["scene", str(beam.folder)]) == 2
+
+
+def test_scene_script_reports_its_failure(bpy, beam, tmp_path):
+    """Frames of another mesh end the process with code 3 and a reason, not with a still branch."""
+    from limber.scene_data import scene_data
+    from limber.store import Branch
+
+    data = scene_data(Branch.open(beam.folder))
+    data.arrays["vertices"] = data.arrays["vertices"][:-1]
+    data.arrays["faces"] = data.arrays["faces"][:4]
+    for name in ("scalar:young", "color:young"):
+        data.arrays[name] = data.arrays[name][:-1]
+    data.arrays["faces"] = np.array([[0, 1, 2]])
+    data.write(tmp_path / "data.npz")
+    done = subprocess.run(
+        [sys.executable, ADDON / "make_scene.py", "--", tmp_path / "data.npz",
+         tmp_path / "scene.blend"], check=False, capture_output=True, text=True)
+    assert done.returncode == 3
+    assert "another mesh" in json.loads(done.stdout.splitlines()[-1])["error"]
