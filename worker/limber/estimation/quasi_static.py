@@ -1,0 +1,232 @@
+"""A slow pull, simulated frame by frame as a chain of equilibria, with exact derivatives."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.estimation.alignment import Frames
+from limber.estimation.grasping import grasp_on, pose_on
+from limber.estimation.key_frames import key_frames, smoothed, travel
+from limber.estimation.objective import Simulated
+from limber.estimation.parameters import Values
+from limber.estimation.points import point_operator
+from limber.estimation.recording import PullEntry
+from limber.mechanics.factor import NotPositiveDefiniteError
+from limber.mechanics.materials import RayleighDamping, lame, lame_by_poisson
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics import StaticResult, StaticSettings, solve_static
+
+SETTINGS = StaticSettings(tolerance=1e-6)
+YOUNG_STEP_LIMIT = 0.7
+"""A state is carried over to parameters by its derivative up to this change of a log E."""
+
+
+@dataclass
+class _Memory:
+    """State of one key frame under the last parameters: where the next solve starts."""
+
+    displacement: np.ndarray
+    slope: np.ndarray | None = None
+
+
+class QuasiStaticForward:
+    """Simulates one pull in equilibrium; see :class:`limber.estimation.objective.Forward`.
+
+    States of the key frames are kept from call to call: parameters change little from one
+    evaluation to the next, so that two Newton iterations a frame are enough.
+
+    Args:
+        name: The pull's name.
+        model: The branch; its Young's modulus is replaced.
+        weights: Young's modulus of the tetrahedra from the control points', [tet_count, K].
+        entry: The pull's settings.
+        frames: Aligned frames.
+        rest_points: Observed points at rest [m], shape [m, 3].
+        key_count: Frames that are simulated at most.
+    """
+
+    def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
+                 frames: Frames, rest_points: np.ndarray, *, key_count: int = 12):
+        self.name, self.frames = name, frames
+        self.drive = entry.drive
+        measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+        if self.drive == "force" and measured.sum() < 2:
+            raise InputError(f"{name}: a force-driven simulation without measured force.",
+                             "Nothing would pull.", "Use --drive pose, or record the force.")
+        self.uses_force = self.drive == "pose" and bool(measured.any())
+        self.weights = weights
+        self.rest_points = np.asarray(rest_points, float)
+        self.entry = entry
+        gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
+        self._model = model.with_parameters(gravity=gravity)
+        self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._operator = point_operator(model.mesh, self.rest_points)
+        self.set_key_count(key_count)
+
+    def set_key_count(self, count: int) -> None:
+        """Simulate at most ``count`` frames from now on."""
+        frames = self.frames
+        if self.drive == "pose":
+            along = travel(frames.poses)
+        else:
+            # A noisy force is not a path; time orders the frames.
+            along = frames.times - frames.times[0]
+        self.keys, self._spread = key_frames(along, count)
+        self._memory: list[_Memory | None] = [None] * len(self.keys)
+        self._values: np.ndarray | None = None
+        if self.drive == "pose":
+            self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
+                            for pose in frames.poses[self.keys]]
+        else:
+            self._drives = list(smoothed(frames.times, frames.wrenches[:, :3],
+                                         frames.times[self.keys]))
+
+    @property
+    def key_count(self) -> int:
+        return len(self.keys)
+
+    def model_with(self, values: Values) -> BranchModel:
+        """Return the branch with these parameters."""
+        return self._model.with_parameters(
+            young=self.weights @ values.young, poisson=values.poisson, density=values.density,
+            damping=RayleighDamping(*values.damping))
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None:
+        """Return the pull under ``values``; None where a frame finds no equilibrium."""
+        model = self.model_with(values)
+        log_young = np.log(values.young)
+        jump = None if self._values is None else log_young - self._values
+        shape = (len(self.keys), len(self.rest_points), 3)
+        count = len(values.young) + len(extra)
+        points, forces = np.empty(shape), np.empty((len(self.keys), 3))
+        d_points = np.empty((*shape, count)) if sensitivities else None
+        d_forces = np.empty((len(self.keys), 3, count)) if sensitivities else None
+        states: list[_Memory | None] = []
+        before: np.ndarray | None = None
+        for key, drive in enumerate(self._drives):
+            result = self._solved(model, drive, self._memory[key], jump, before)
+            if result is None:
+                return None
+            before = result.displacement
+            slope = None
+            points[key] = self.rest_points + self._observed(before)
+            forces[key] = result.reaction_force if self.drive == "pose" else drive
+            if sensitivities:
+                slope, d_forces[key] = self._slopes(model, values, extra, before)
+                for column in range(count):
+                    d_points[key, ..., column] = self._observed(slope[..., column])
+            states.append(_Memory(before, slope))
+        self._memory, self._values = states, log_young
+        return self._at_all_frames(points, forces, d_points, d_forces)
+
+    def displacements(self) -> list[np.ndarray]:
+        """Nodal displacements [m] of the key frames under the last parameters."""
+        return [memory.displacement for memory in self._memory if memory is not None]
+
+    def thinning_error(self, values: Values) -> float:
+        """Largest distance [m] between spline and simulation halfway between key frames."""
+        if len(self.keys) >= len(self.frames) or len(self.keys) < 4:
+            return 0.0
+        known = self.simulate(values, (), False)
+        model, worst = self.model_with(values), 0.0
+        for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
+            middle = (first + second) // 2
+            if middle in (first, second) or self.drive != "pose":
+                continue
+            start = self._memory[int(np.flatnonzero(self.keys == first)[0])]
+            drive = pose_on(self.grasp, self.entry.grasp, self.frames.poses[middle])
+            result = self._solve(model, drive, start.displacement)
+            if result is not None:
+                exact = self.rest_points + self._observed(result.displacement)
+                off = np.linalg.norm(exact - known.positions[middle], axis=1)
+                worst = max(worst, float(off.max()))
+        return worst
+
+    def _observed(self, displacement: np.ndarray) -> np.ndarray:
+        return (self._operator @ displacement.ravel()).reshape(-1, 3)
+
+    def _solve(self, model: BranchModel, drive: np.ndarray, start: np.ndarray | None,
+               ) -> StaticResult | None:
+        loads = {"pose": drive} if self.drive == "pose" else {"grasp_force": drive}
+        result = solve_static(model, grasp=self.grasp, start=start, settings=SETTINGS, **loads)
+        return result if result.converged else None
+
+    def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
+                jump: np.ndarray | None, before: np.ndarray | None) -> StaticResult | None:
+        starts = []
+        if memory is not None:
+            start = memory.displacement
+            near = jump is not None and np.abs(jump).max() < YOUNG_STEP_LIMIT
+            if memory.slope is not None and near:
+                start = start + memory.slope[..., :len(jump)] @ jump
+            starts.append(start)
+        starts += [before] if before is not None else []
+        for start in [*starts, None]:
+            try:
+                result = self._solve(model, drive, start)
+            except NotPositiveDefiniteError:
+                continue
+            if result is not None:
+                return result
+        return None
+
+    def _slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
+                displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of displacement [n, 3, p] and reaction [3, p], by implicit differentiation.
+
+        The equilibrium f(u, p) = g(p) gives K du = dg/dp - df/dp; K is factorised once, each
+        parameter costs a solve.
+        """
+        held = (self.grasp,) if self.drive == "pose" else ()
+        equations = model.equations(held)
+        equations.assemble(model, displacement, displacement)
+        equations.factorise()
+        slopes, reactions = [], []
+        for unbalanced in self._unbalanced(model, values, extra, displacement):
+            slope = equations.solve(-unbalanced)
+            out = model.tangent_times(displacement, slope) + unbalanced
+            slopes.append(slope)
+            nodes, weights = self.grasp.nodes, self.grasp.weights
+            if self.drive == "force":
+                reactions.append(np.zeros(3))
+            elif self.grasp.mode == "pinned":
+                reactions.append(weights @ out[nodes] / (weights @ weights))
+            else:
+                reactions.append(out[nodes].sum(axis=0))
+        return np.stack(slopes, axis=-1), np.stack(reactions, axis=-1)
+
+    def _unbalanced(self, model: BranchModel, values: Values, extra: tuple[str, ...],
+                    displacement: np.ndarray) -> list[np.ndarray]:
+        """Derivative of internal force less load to each parameter at fixed displacement."""
+        found = []
+        for column, young in zip(self.weights.T, values.young, strict=True):
+            pair = lame(column * young, model.poisson)
+            found.append(model.internal(displacement, lame_pair=pair).force)
+        for name in extra:
+            if name == "poisson":
+                pair = lame_by_poisson(model.young, model.poisson)
+                found.append(model.internal(displacement, lame_pair=pair).force)
+            elif name == "density":
+                found.append(-model.weight_force)
+            else:
+                raise InputError(f"{name} was asked for from a quasi-static pull.",
+                                 "Damping does nothing in equilibrium.",
+                                 "Use --motion dynamic, or leave it fixed.")
+        return found
+
+    def _at_all_frames(self, points: np.ndarray, forces: np.ndarray, d_points: np.ndarray | None,
+                       d_forces: np.ndarray | None) -> Simulated:
+        def spread(values: np.ndarray) -> np.ndarray:
+            return np.tensordot(self._spread, values, axes=1)
+        return Simulated(spread(points), spread(forces),
+                         None if d_points is None else spread(d_points),
+                         None if d_forces is None else spread(d_forces))
+
+
+def with_drive(entry: PullEntry, drive: str | None) -> PullEntry:
+    """Return the pull's settings with another drive, where one is given."""
+    return entry if drive is None else entry.model_copy(update={"drive": drive})
+
+

@@ -1,0 +1,243 @@
+"""Simulated pulls with a known Young's modulus and sensor noise, where no robot has been.
+
+The truth lives on another mesh than the fit: finer, swept along the axes, of the true geometry
+where the branch was generated. What is known of it goes into ``pull.toml`` under ``truth``, so
+that an estimate can be scored; nothing that estimates reads it.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.errors import InputError
+from limber.estimation.grasping import grasp_on
+from limber.estimation.gripper_path import pulled, sideways_forces
+from limber.estimation.points import point_operator
+from limber.estimation.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+    write_pull,
+)
+from limber.geometry.control_points import control_points
+from limber.geometry.marks import base_nodes
+from limber.geometry.skeleton import Skeleton
+from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tetrahedra import MeshSettings, mesh_branch
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics import StaticResult
+from limber.mechanics.young_field import young_weights
+from limber.perception.camera import D455, Camera, write_camera
+from limber.perception.observe import write_depth
+from limber.perception.simulated_camera import render_depth, with_noise
+from limber.progress import SILENT, Progress
+from limber.store import Branch
+
+DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
+"""A gradient like that of the paper's branches, at the stiffness of young wood."""
+GRAVITY = (0.0, 0.0, -9.80665)
+
+
+class VirtualPullSettings(BaseModel):
+    """A simulated pull."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    young: tuple[float, ...] = Field(
+        (), description="True Young's modulus at the control points [Pa]; without it that of a "
+        "generated branch, or a gradient from 160 to 40 MPa.")
+    poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
+    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
+    frames: int = Field(24, ge=2, description="Number of recorded frames.")
+    duration: float = Field(6.0, gt=0, description="Length of the recording [s].")
+    grasp_fraction: float = Field(
+        0.92, gt=0, le=1, description="Where the branch is held. Past the last control point: "
+        "what lies beyond the grasp is not bent and cannot be estimated.")
+    mode: Literal["clamped", "pinned"] = Field(
+        "pinned", description="pinned: held in a loop that lets the branch turn.")
+    reach: float = Field(
+        0.35, gt=0, le=0.8, description="Sideways travel of the grasp over its arc length.")
+    turn: float = Field(2.0, description="How far the pull's direction turns on the way [rad].")
+    phase: float | None = Field(
+        None, description="Direction in which it starts [rad]; without it drawn from the seed.")
+    position_noise: float = Field(1e-3, ge=0, description="Noise of observed points [m].")
+    force_noise: float = Field(
+        0.02, ge=0, description="Noise of the force over its largest size.")
+    gravity: bool = Field(
+        False, description="Let gravity bend the branch out of its scanned shape; without it "
+        "the scanned shape carries it already.")
+    camera: bool = Field(
+        False, description="Record depth images of a simulated D455 instead of points.")
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")
+    seed: int = Field(0, ge=0, description="Seed of all that is random.")
+
+
+@dataclass(frozen=True)
+class TrueBranch:
+    """What a virtual pull is made with.
+
+    Attributes:
+        mesh: With point data ``fixed``.
+        skeleton: True axes.
+        control_points: [m], shape [K, 3].
+        fractions: Their places on the main path.
+        young: [Pa], shape [K].
+    """
+
+    mesh: TetMesh
+    skeleton: Skeleton
+    control_points: np.ndarray
+    fractions: tuple[float, ...]
+    young: np.ndarray
+
+
+def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
+                 force: bool = False, progress: Progress = SILENT,
+                 warn: Any = lambda text: None) -> dict[str, Any]:
+    """Simulate a pull of a branch and write it as ``pulls/NAME``.
+
+    Returns:
+        ``pull``, ``young_true_pa``, ``control_points_m``, ``frame_count``, ``tet_count`` of the
+        truth's mesh, ``peak_force_n``, ``travel_m``.
+
+    Raises:
+        InputError: the branch has no skeleton, or the settings do not fit it.
+        WorkError: the branch cannot be pulled like that.
+    """
+    branch = Branch.open(branch_folder)
+    branch.require("skeleton.swc", "reconstruct")
+    key = f"pull:{name}"
+    reads = [file for file in ("skeleton.swc", "truth/skeleton.swc", "truth/truth.json")
+             if branch.has(file)]
+    if not force and branch.is_current(key, settings, reads=reads):
+        return branch.manifest.stages[key].result
+    progress(0.02, "meshing the true branch")
+    truth = true_branch(branch, settings)
+    with branch.stage(key, settings, reads=reads) as stage:
+        prefix = f"pulls/{name}/"
+        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+            stage.remove(old)
+        folder = stage.path(prefix + "pull.toml").parent
+        pull, states = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
+        write_pull(folder, pull)
+        if settings.camera:
+            _write_depth_frames(folder, truth, pull, states, settings)
+        reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
+        stage.result.update({
+            "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
+            "fractions": truth.fractions, "frame_count": len(pull.times),
+            "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
+            "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
+    return stage.result
+
+
+def true_branch(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
+    """Return the truth of a branch folder: that of its generator, or its own skeleton's."""
+    fractions, young, where = (0.2, 0.4, 0.6, 0.8), np.array(DEFAULT_YOUNG_PA), "skeleton.swc"
+    if branch.has("truth/truth.json"):
+        known = json.loads(branch.path("truth/truth.json").read_text(encoding="utf-8"))
+        fractions, young = tuple(known["fractions"]), np.array(known["young_pa"], float)
+        where = "truth/skeleton.swc"
+    if settings.young:
+        young = np.array(settings.young)
+        if len(young) != len(fractions):
+            raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
+                             "Each control point needs one.", "Give --young A,B,C,D.")
+    skeleton = Skeleton.read_swc(branch.path(where))
+    # Sixteen radii a slice would lock; two are finer than any mesh that is fitted.
+    meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=2.0))
+    mesh = meshed.mesh.with_data(point_data={"fixed": base_nodes(meshed.mesh, skeleton)})
+    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions, young)
+
+
+def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,
+                  progress: Progress = SILENT) -> tuple[Pull, list[StaticResult]]:
+    """Pull the true branch and measure it; returns the pull and the true states."""
+    rng = np.random.default_rng(settings.seed)
+    entry = _entry(truth, settings)
+    gravity = GRAVITY if settings.gravity else (0.0, 0.0, 0.0)
+    weights = young_weights(truth.mesh, truth.control_points)
+    model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
+                        density=settings.density, gravity=gravity)
+    grasp = grasp_on(truth.mesh, entry.grasp)
+    point = np.array(entry.grasp.point_m)
+    phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
+    directions = sideways_forces(point - truth.skeleton.nodes[0], settings.frames,
+                                 turn=settings.turn, phase=phase)
+    arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
+    states, forces = pulled(model, grasp, directions, settings.reach * arc, progress=progress)
+    poses = np.array([_pose(grasp, point, state) for state in states])
+    operator = point_operator(truth.mesh, truth.control_points)
+    positions = np.array([truth.control_points + (operator @ state.displacement.ravel()
+                                                  ).reshape(-1, 3) for state in states])
+    peak = np.linalg.norm(forces, axis=1).max()
+    forces = forces + settings.force_noise * peak * rng.standard_normal(forces.shape)
+    positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
+    stray = rng.random(positions.shape[:2]) < settings.outliers
+    positions[stray] += 0.05 * rng.standard_normal((int(stray.sum()), 3))
+    entry = entry.model_copy(update={"sensor": SensorEntry(
+        position_sigma_m=max(settings.position_noise, 1e-4),
+        force_sigma_n=max(settings.force_noise, 2e-3) * peak)})
+    times = np.linspace(0.0, settings.duration, settings.frames)
+    torque = np.full(forces.shape, 0.0 if settings.mode == "pinned" else np.nan)
+    observations = None if settings.camera else Observations(times, positions)
+    return Pull(name, entry, times, poses, np.hstack([forces, torque]), observations), states
+
+
+def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
+    point = truth.skeleton.point_at(settings.grasp_fraction)
+    radius = truth.skeleton.radius_at(settings.grasp_fraction)
+    known = {"young_pa": truth.young.tolist(), "poisson": settings.poisson,
+             "density": settings.density, "fractions": list(truth.fractions),
+             "control_points_m": truth.control_points.tolist(),
+             "tet_count": truth.mesh.tet_count, "seed": settings.seed}
+    return PullEntry(
+        observation="depth" if settings.camera else "markers",
+        gravity_m_s2=GRAVITY if settings.gravity else None,
+        grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.8 * radius),
+                         mode=settings.mode),
+        rest_points_m=None if settings.camera else tuple(
+            tuple(map(float, p)) for p in truth.control_points),
+        source="limber virtual-pull", truth=known)
+
+
+def _pose(grasp: Any, point: np.ndarray, state: StaticResult) -> np.ndarray:
+    mean = grasp.weights @ state.displacement[grasp.nodes]
+    turn = state.pose[3:]
+    if grasp.mode == "pinned":
+        return np.concatenate([point + mean, turn])
+    from limber.mechanics.grasp import rotation_matrix
+
+    # The pose belongs to the grasp point, which a clamped patch carries rigidly.
+    return np.concatenate([state.pose[:3] + rotation_matrix(turn) @ (point - grasp.centre), turn])
+
+
+def _write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, states: list[StaticResult],
+                        settings: VirtualPullSettings) -> None:
+    camera = viewing(truth.mesh.nodes, [state.displacement for state in states])
+    write_camera(folder / "camera.toml", camera)
+    (folder / "depth").mkdir(exist_ok=True)
+    faces = truth.mesh.surface_faces()
+    rng = np.random.default_rng([settings.seed, 1])
+    for time, state in zip(pull.times, states, strict=True):
+        depth = render_depth(camera, truth.mesh.nodes + state.displacement, faces)
+        write_depth(folder / "depth" / f"{time:.6f}.png", with_noise(camera, depth, rng), camera)
+
+
+def viewing(nodes: np.ndarray, displacements: list[np.ndarray], distance: float = 1.0) -> Camera:
+    """Return a D455 that sees all of a motion from ``distance`` [m], across its main extent."""
+    everything = np.vstack([nodes + moved for moved in displacements])
+    middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    _, _, axes = np.linalg.svd(everything - middle, full_matrices=False)
+    # The direction in which the motion spreads least: nothing hides behind anything else.
+    across = axes[2] * [1.0, 1.0, 0.0]
+    if np.linalg.norm(across) < 0.3:
+        across = np.array([0.0, -1.0, 0.0])
+    across = across / np.linalg.norm(across)
+    return D455.looking(eye=middle + distance * across, target=middle)
