@@ -35,6 +35,9 @@ from limber.version import VERSION
 
 FORMAT_VERSION = 1
 MANIFEST = "branch.json"
+GRAVITY = (0.0, 0.0, -9.80665)
+"""Standard gravity [m/s^2] along -z: that of a branch whose stages do not say otherwise."""
+
 _COMMIT = ".commit"
 _LOCK = ".lock"
 _PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
@@ -137,6 +140,14 @@ class Branch:
     @property
     def name(self) -> str:
         return self.manifest.name
+
+    @property
+    def gravity(self) -> tuple[float, float, float]:
+        """Gravity [m/s^2] in the branch's frame: the upright turn of a scan turns it too."""
+        for key in ("reconstruct", "mesh"):
+            if key in self.manifest.stages:
+                return tuple(self.manifest.stages[key].result.get("gravity_m_s2", GRAVITY))
+        return GRAVITY
 
     @classmethod
     def create(cls, folder: str | os.PathLike) -> "Branch":

@@ -20,12 +20,10 @@ _SHOWN_POINTS = 30_000
 
 def scan_and_skeleton(branch: Branch) -> "Figure":
     """Cloud, centreline tree and control points, from the front and from the side."""
-    import matplotlib.pyplot as plt
-
     skeleton = Skeleton.read_swc(branch.path("skeleton.swc"))
     points = _cloud_points(branch)
     mesh = TetMesh.read(branch.path("mesh.vtu")) if branch.has("mesh.vtu") else None
-    figure, axes = plt.subplots(1, 2, figsize=(11, 7.5))
+    figure, axes = _two_views(points)
     for axis, (first, label) in zip(axes, ((0, "x"), (1, "y")), strict=True):
         axis.scatter(points[:, first], points[:, 2], s=1.0, color=_CLOUD, linewidths=0)
         _draw_tree(axis, skeleton, first)
@@ -69,8 +67,9 @@ def mesh_by_modulus(branch: Branch) -> "Figure":
     mesh = TetMesh.read(branch.path("mesh.vtu"))
     faces, young = _coloured_faces(mesh)
     spread = young.max() / young.min()
-    norm = (LogNorm if spread > 10 else Normalize)(young.min() / 1e6, young.max() / 1e6)
-    figure, axes = plt.subplots(1, 2, figsize=(11, 7.5))
+    low, high = (young.min(), young.max()) if spread > 1.001 else (0.0, 1.5 * young.max())
+    norm = (LogNorm if spread > 10 else Normalize)(low / 1e6, high / 1e6)
+    figure, axes = _two_views(mesh.nodes)
     for axis, first, depth, label in ((axes[0], 0, 1, "x"), (axes[1], 1, 0, "y")):
         corners = mesh.nodes[faces]
         back_to_front = np.argsort(corners[:, :, depth].mean(axis=1) * (1 if first else -1))
@@ -78,15 +77,18 @@ def mesh_by_modulus(branch: Branch) -> "Figure":
         colours[:, :3] *= _shade(corners, depth)[:, None]
         axis.add_collection(PolyCollection(
             corners[back_to_front][:, :, [first, 2]], facecolors=colours[back_to_front],
-            edgecolors=(0, 0, 0, 0.25), linewidths=0.2))
+            edgecolors="face", linewidths=0.1))
         for name, colour in (("fixed", "black"), ("grasp", "#d1242f")):
             marked = mesh.nodes[np.asarray(mesh.point_data.get(name, [])).nonzero()[0]]
             axis.scatter(marked[:, first], marked[:, 2], s=3, color=colour, zorder=4)
         axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
         axis.autoscale_view()
         axis.grid(alpha=0.25)
-    scale = plt.cm.ScalarMappable(norm, "viridis")
-    figure.colorbar(scale, ax=axes, label="Young's modulus [MPa]", shrink=0.7)
+    if spread > 1.001:
+        scale = plt.cm.ScalarMappable(norm, "viridis")
+        figure.colorbar(scale, ax=axes, label="Young's modulus [MPa]", shrink=0.7)
+    else:
+        figure.suptitle(f"Young's modulus {young.mean() / 1e6:.4g} MPa everywhere", fontsize=10)
     return figure
 
 
@@ -124,6 +126,17 @@ def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.25)
     return figure
+
+
+def _two_views(points: np.ndarray) -> tuple["Figure", np.ndarray]:
+    """Return a figure of two axes, as wide as a front and a side view of ``points`` need."""
+    import matplotlib.pyplot as plt
+
+    extent = np.ptp(points, axis=0)
+    height = 7.0
+    widths = np.clip(height * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
+    return plt.subplots(1, 2, figsize=(widths.sum() + 2.5, height), layout="constrained",
+                        width_ratios=widths)
 
 
 def _draw_tree(axis: Any, skeleton: Skeleton, first: int) -> None:
