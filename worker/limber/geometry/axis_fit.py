@@ -19,7 +19,10 @@ from limber.geometry.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
 _CANDIDATES = 6
+_REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
+_SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
 _TUKEY = 4.685  # 95 % efficiency for normal noise
+_BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
 
 @dataclass(frozen=True)
@@ -60,16 +63,19 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         spread = max(noise, 0.6 * spread)
         weight = _tukey(match.residual, np.minimum(
             _TUKEY * spread, 0.9 * radius[match.segment] + noise))
-        system = _system(skeleton, nodes, radius, match, weight, noise)
+        # While axes are still far off, the misfit is no noise that smoothing could help against.
+        trusted = noise if number > rounds // 2 else 0.0
+        system = _system(skeleton, nodes, radius, match, weight, trusted)
         step = system.solve()
         limit = 0.5 * radius
         size = np.linalg.norm(step[:, :3], axis=1)
         shrink = np.minimum(1.0, limit / np.maximum(size, 1e-300))
         nodes = nodes + step[:, :3] * shrink[:, None]
-        radius = np.maximum(radius + np.clip(step[:, 3], -0.4 * radius, 0.8 * radius), 0.1 * floor)
+        radius = radius + np.clip(step[:, 3], -0.4 * radius, 0.8 * radius)
+        nodes, radius = _near_start(skeleton, nodes, radius)
         progress((number + 1) / rounds, "fitting axes", noise_m=noise)
         bias = noise
-        if number > 5 and size.max() < 1e-3 * floor and spread <= 1.01 * noise:
+        if number > rounds // 2 + 1 and size.max() < 1e-3 * floor and spread <= 1.01 * noise:
             break
     match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
     noise = _robust_sigma(match.residual, radius[match.segment])
@@ -80,6 +86,20 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     fitted = replace(skeleton, nodes=nodes, radius=radius, radius_sigma=sigma, radius_state=state)
     return AxisFit(fitted, match.segment, match.residual, noise)
+
+
+def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """Keep axes within reach of the contracted ones, which lie inside the branch or on its skin.
+
+    Without that, a run with few points may drift off and take those of others with it.
+    """
+    moved = nodes - skeleton.nodes
+    size = np.linalg.norm(moved, axis=1)
+    reach = _REACH * skeleton.radius
+    moved *= np.minimum(1.0, reach / np.maximum(size, 1e-300))[:, None]
+    return skeleton.nodes + moved, np.clip(
+        radius, skeleton.radius / (2 * _REACH), 2 * _REACH * skeleton.radius)
 
 
 def resampled(skeleton: Skeleton, spacing: float = 1.0) -> Skeleton:
@@ -271,24 +291,29 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
     A spline with penalty lambda on the squared second derivative and rho data a length averages
     over (lambda / rho)^(1/4); that length grows with the noise, in local radii.
     """
-    rows, columns, values, scale_axis, scale_radius = [], [], [], [], []
+    rows, columns, values, scale_axis, scale_radius, slopes = [], [], [], [], [], []
     count = 0
     density = float(per_node.sum()) / max(skeleton.length, 1e-300)
+    forks = skeleton.child_counts() > 1
     for run, members in enumerate(skeleton.runs()):
         chain = members if run == 0 else members[1:]
         if len(chain) < 3:
             continue
-        step = np.linalg.norm(np.diff(nodes[chain], axis=0), axis=1)
-        before, after = np.maximum(step[:-1], 1e-12), np.maximum(step[1:], 1e-12)
+        step = np.maximum(np.linalg.norm(np.diff(nodes[chain], axis=0), axis=1), 1e-12)
+        before, after = step[:-1], step[1:]
         mean = (before + after) / 2
-        thick = radius[chain[1:-1]]
-        band = thick * np.clip(1.5 + 8.0 * noise / thick, 1.5, 6.0)
+        # The first radii, since a radius that grows by mistake must not blur its own axis.
+        thick = np.minimum(radius, skeleton.radius)[chain[1:-1]]
+        band = thick * np.clip(_BAND + 8.0 * noise / thick, _BAND, _BAND_LIMIT)
+        # Axes kink at forks: a branch's leader gives way to a strong twig.
+        band *= np.where(forks[chain[1:-1]], 0.6, 1.0) * _straightness(skeleton.nodes[chain])
         index = count + np.arange(len(chain) - 2)
         rows += [index, index, index]
         columns += [chain[:-2], chain[1:-1], chain[2:]]
         values += [1 / before / mean, -(1 / before + 1 / after) / mean, 1 / after / mean]
         scale_axis.append(0.5 * density * band**4 * mean)
         scale_radius.append(density * (2.0 * band)**4 * mean)
+        slopes.append(_slope_terms(chain, step, radius, density, len(nodes)))
         count += len(chain) - 2
     size = len(nodes)
     if count == 0:
@@ -297,9 +322,30 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         (count, size)).tocsr()
     along = second.T @ sparse.diags(np.concatenate(scale_axis)) @ second
-    thick = second.T @ sparse.diags(np.concatenate(scale_radius)) @ second
+    thick = second.T @ sparse.diags(np.concatenate(scale_radius)) @ second + sum(slopes)
     return (sparse.kron(along, sparse.diags([1.0, 1, 1, 0]))
             + sparse.kron(thick, sparse.diags([0.0, 0, 0, 1]))).tocsc()
+
+
+def _straightness(nodes: np.ndarray) -> np.ndarray:
+    """1 where the contracted axis is straight, down to 0.3 at its kinks, shape [n - 2]."""
+    place = np.arange(1, len(nodes) - 1)
+    before = nodes[place] - nodes[np.maximum(place - 2, 0)]
+    after = nodes[np.minimum(place + 2, len(nodes) - 1)] - nodes[place]
+    cosine = np.einsum("ij,ij->i", before, after) / np.maximum(
+        np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1), 1e-300)
+    return np.clip(1.3 - np.arccos(np.clip(cosine, -1, 1)), 0.3, 1.0)
+
+
+def _slope_terms(chain: np.ndarray, step: np.ndarray, radius: np.ndarray, density: float,
+                 count: int) -> sparse.csr_matrix:
+    """Weak penalty on a radius's slope: branches are no cones, whatever stray points say."""
+    thick = (radius[chain[1:]] + radius[chain[:-1]]) / 2
+    index = np.arange(len(chain) - 1)
+    first = sparse.coo_matrix(
+        (np.concatenate([-1 / step, 1 / step]), (np.tile(index, 2), np.concatenate(
+            [chain[:-1], chain[1:]]))), (len(chain) - 1, count)).tocsr()
+    return first.T @ sparse.diags(density * (_SLOPE * thick)**2 * step) @ first
 
 
 def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> sparse.csc_matrix:
