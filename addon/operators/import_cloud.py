@@ -1,13 +1,13 @@
 """Import a scan, to look at it."""
 
 from pathlib import Path
-from typing import ClassVar
 
 import bpy
 
 from .. import clouds
 from ..bridge import meshes
 from ..scene import add_object
+from .viewing import look_at
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
@@ -17,7 +17,6 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
 
     bl_idname = "limber.import_cloud"
     bl_label = "Import Scan"
-    bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     filepath: bpy.props.StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
     filter_glob: bpy.props.StringProperty(default="*.ply;*.xyz;*.txt;*.csv", options={"HIDDEN"})
@@ -43,6 +42,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         settings.cloud_path = str(path)
         if not settings.branch_folder:
             settings.branch_folder = str(path.with_suffix(".branch"))
+        look_at(context, cloud)
         self.report({"INFO"}, f"{len(points)} points")
         return {"FINISHED"}
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import bpy
 
 from .. import scene, scene_data
+from .viewing import look_at
 from .worker_operator import WorkerOperator
 
 
@@ -34,30 +35,12 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         with self._temporary:
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
-        _look_at(context, shown)
+        look_at(context, shown.surface)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")
 
     @property
     def _data_path(self) -> Path:
         return Path(self._temporary.name) / "scene.npz"
-
-
-def _look_at(context: bpy.types.Context, shown: scene.ShownBranch) -> None:
-    """Let the 3D views show the colours, and the branch fill them; one step for undo."""
-    if bpy.app.background or context.window is None:
-        return
-    for thing in context.selected_objects:
-        thing.select_set(False)
-    shown.surface.select_set(True)
-    context.view_layer.objects.active = shown.surface
-    for area in context.window.screen.areas:
-        if area.type != "VIEW_3D":
-            continue
-        area.spaces.active.shading.color_type = "VERTEX"
-        region = next(region for region in area.regions if region.type == "WINDOW")
-        with context.temp_override(area=area, region=region):
-            bpy.ops.view3d.view_selected()
-    bpy.ops.ed.undo_push(message="Open Result")
 
 
 def register() -> None:

@@ -1,0 +1,24 @@
+"""Where the user looks after an action."""
+
+import bpy
+
+
+def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
+    """Select ``thing``, let the 3D views show it whole and in its colours; one step for undo.
+
+    Nothing happens without a window.
+    """
+    if bpy.app.background or context.window is None:
+        return
+    for other in context.selected_objects:
+        other.select_set(False)
+    thing.select_set(True)
+    context.view_layer.objects.active = thing
+    for area in context.window.screen.areas:
+        if area.type != "VIEW_3D":
+            continue
+        area.spaces.active.shading.color_type = "VERTEX"
+        region = next(region for region in area.regions if region.type == "WINDOW")
+        with context.temp_override(area=area, region=region):
+            bpy.ops.view3d.view_selected()
+    bpy.ops.ed.undo_push(message="Limber")

@@ -1,0 +1,185 @@
+"""Drives Limber's interface inside a Blender with a window; test_real_blender.py starts it.
+
+    blender --enable-event-simulate --python drive_interface.py -- FOLDER
+
+FOLDER has scan.xyz, slow_worker and beam.branch; log.json is written there. A step is a function
+that returns True when it is done; a timer calls the current one. A picture is asked for by a file
+NAME.request, and has been taken when that file is gone.
+"""
+
+import json
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+
+FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
+KEY = "bl_ext.user_default.limber"
+seen = {"error": None}
+started = {}
+
+
+def view():
+    """Return window, 3D view area and its sidebar region."""
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    return window, area, next(region for region in area.regions if region.type == "UI")
+
+
+def override():
+    window, area, _ = view()
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
+
+
+def jobs():
+    return sys.modules[f"{KEY}.jobs"]
+
+
+def waited(seconds):
+    """Whether the current step has lasted that long."""
+    return time.monotonic() - started["step"] > seconds
+
+
+def open_sidebar():
+    view()[1].spaces.active.show_region_ui = True
+    return True
+
+
+def open_tab():
+    _, area, sidebar = view()
+    if not waited(0.5):
+        return False
+    sidebar.active_panel_category = "Limber"
+    area.tag_redraw()
+    seen["category"] = sidebar.active_panel_category
+    bpy.context.scene.limber.cloud_path = str(FOLDER / "scan.xyz")
+    for thing in list(bpy.data.objects):
+        bpy.data.objects.remove(thing)
+    return True
+
+
+def picture(name):
+    def step():
+        request = FOLDER / f"{name}.request"
+        if "picture" not in started:
+            if not waited(1.0):
+                return False
+            started["picture"] = request
+            request.touch()
+        if request.exists():
+            return False
+        del started["picture"]
+        return True
+    return step
+
+
+def button_place(offset):
+    """Return window coordinates of the middle of the sidebar, ``offset`` pixels below its top."""
+    sidebar = view()[2]
+    return sidebar.x + sidebar.width // 2 - 10, sidebar.y + sidebar.height - offset
+
+
+def click(offset):
+    """Point at a button, press it a moment later, let it go a moment later still."""
+    def step():
+        window = view()[0]
+        x, y = button_place(offset)
+        phase = started.setdefault("click", 0)
+        if not waited(0.3 * (phase + 1)):
+            return False
+        kind, value = (("MOUSEMOVE", "NOTHING"), ("LEFTMOUSE", "PRESS"),
+                       ("LEFTMOUSE", "RELEASE"))[phase]
+        window.event_simulate(type=kind, value=value, x=x, y=y)
+        started["click"] += 1
+        if started["click"] == 3:
+            del started["click"]
+            return True
+        return False
+    return step
+
+
+def imported():
+    cloud = bpy.data.objects.get("scan scan")
+    if cloud is None:
+        return False
+    seen["imported_points"] = len(cloud.data.vertices)
+    return True
+
+
+def start_slow_job():
+    bpy.context.preferences.addons[KEY].preferences.python_path = str(FOLDER / "slow_worker")
+    with override():
+        bpy.ops.limber.check_worker("INVOKE_DEFAULT")
+    return True
+
+
+def slow_job_reports():
+    seen["progress_seen"] = jobs().current().fraction
+    return seen["progress_seen"] > 0
+
+
+def job_cancelled():
+    if jobs().is_running():
+        return False
+    seen["cancelled"] = jobs().current().state.value
+    bpy.context.preferences.addons[KEY].preferences.python_path = ""
+    return True
+
+
+def open_result():
+    with override():
+        bpy.ops.limber.open_result("INVOKE_DEFAULT", directory=str(FOLDER / "beam.branch"))
+    return True
+
+
+def opened():
+    names = [collection.name for collection in bpy.context.scene.collection.children
+             if "limber_folder" in collection]
+    seen["opened"] = names
+    return bool(names)
+
+
+def play():
+    with override():
+        bpy.ops.limber.play("INVOKE_DEFAULT")
+    return True
+
+
+def played():
+    if not waited(1.0):
+        return False
+    seen["playing"] = view()[0].screen.is_animation_playing
+    seen["frame_after_play"] = bpy.context.scene.frame_current
+    return bpy.context.scene.frame_current > 1
+
+
+STEPS = [open_sidebar, open_tab, picture("tab"), click(100), imported,
+         start_slow_job, slow_job_reports, picture("job"), click(124), job_cancelled,
+         open_result, opened, picture("opened"), play, played, picture("playing")]
+
+
+def run():
+    """Do what is next; called again after a while until all is done or something failed."""
+    try:
+        if "step" not in started:
+            started["step"] = time.monotonic()
+            started["name"] = getattr(STEPS[0], "__name__", "step")
+        if STEPS[0]():
+            STEPS.pop(0)
+            del started["step"]
+        elif waited(40):
+            raise TimeoutError(f"{started['name']}, {len(STEPS)} steps from the end")
+        if STEPS:
+            return 0.05
+    except Exception:
+        seen["error"] = traceback.format_exc()
+    (FOLDER / "log.json").write_text(json.dumps(seen))
+    bpy.ops.wm.quit_blender()
+    return None
+
+
+bpy.context.preferences.view.show_splash = False
+bpy.app.timers.register(run, first_interval=2.0)

@@ -1,0 +1,172 @@
+"""The extension as a user has it: the built zip, installed and enabled in a real Blender.
+
+A Blender is found by LIMBER_BLENDER or on the PATH; scripts/provision_blender brings one.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
+
+FOLDER = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    """An environment whose Blender keeps its settings in a folder of the test, with our worker."""
+    return os.environ | {"BLENDER_USER_RESOURCES": str(tmp_path_factory.mktemp("resources")),
+                         "LIMBER_PYTHON": sys.executable}
+
+
+@pytest.fixture(scope="module")
+def run(blender, environment, extension_zip):
+    """A function that runs Blender with the extension installed and enabled."""
+    def run(*arguments, timeout=120, **extra):
+        return subprocess.run([blender, *map(str, arguments)], check=False, capture_output=True,
+                              text=True, timeout=timeout, env=environment | extra)
+    installed = run("-b", "--command", "extension", "install-file", "-r", "user_default",
+                    "--enable", extension_zip)
+    assert installed.returncode == 0, installed.stdout + installed.stderr
+    assert 'Installed "limber"' in installed.stdout
+    return run
+
+
+def test_it_is_enabled(run):
+    """The installed extension is on: its operators and its preferences are there."""
+    done = run("-b", "--python-exit-code", "9", "--python-expr", (
+        "import bpy; key = 'bl_ext.user_default.limber';"
+        "assert key in bpy.context.preferences.addons;"
+        "assert bpy.context.preferences.addons[key].preferences.python_path == '';"
+        "assert bpy.types.LIMBER_PT_play.bl_category == 'Limber'"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_command_is_the_workers(run, beam):
+    """`blender -b --command limber ...`: help, a result as the last line, exit codes."""
+    done = run("-b", "--command", "limber", "--help")
+    assert done.returncode == 0
+    assert "reconstruct" in done.stdout
+    out = beam.folder.parent / "data.npz"
+    done = run("-b", "--command", "limber", "scene", beam.folder, "--data", out, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["status"] == "done"
+    assert out.is_file()
+    done = run("-b", "--command", "limber", "scene", "nowhere", "-o", "x.blend", "--json")
+    assert done.returncode == 2
+    assert "There is no folder" in json.loads(done.stdout.splitlines()[-1])["error"]
+
+
+def test_without_a_worker(run):
+    """No worker: exit code 3 and what to do about it."""
+    done = run("-b", "--command", "limber", "doctor", LIMBER_PYTHON="")
+    assert done.returncode == 3
+    assert "LIMBER_PYTHON" in done.stderr
+
+
+def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
+    """`limber scene` by this Blender; the file opens in it and its frames are right."""
+    from limber.cli import call
+
+    monkeypatch.setenv("LIMBER_SCENE_BLENDER", blender)
+    scene = beam.folder.parent / "scene.blend"
+    picture = scene.with_suffix(".png")
+    code = call(["scene", str(beam.folder), "-o", str(scene), "--render", str(picture),
+                 "--width", "240", "--json"])
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert code == 0, result
+    assert picture.stat().st_size > 5000
+    script = scene.with_name("look.py")
+    script.write_text(
+        "import bpy, json\n"
+        "found = []\n"
+        "for frame in (1, 6):\n"
+        "    bpy.context.scene.frame_set(frame)\n"
+        "    depsgraph = bpy.context.evaluated_depsgraph_get()\n"
+        "    mesh = bpy.data.objects['beam'].evaluated_get(depsgraph).data\n"
+        "    found.append([list(v.co) for v in mesh.vertices])\n"
+        f"json.dump(found, open({str(scene.with_name('found.json'))!r}, 'w'))\n")
+    done = run("-b", scene, "--python-exit-code", "9", "--python", script)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(scene.with_name("found.json").read_text())
+    for index, frame in ((0, 0), (1, 5)):
+        difference = abs(beam.frames[frame] - found[index]).max()
+        assert difference < 1e-6
+
+
+def test_interface(run, blender, environment, beam, tmp_path):
+    """In a window, by events: the tab opens, a scan is imported, a job cancelled, a result opened
+    by the worker beside the interface, and played."""
+    missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"NO {' AND '.join(missing)}: scripts/provision_blender --gui-test brings it")
+    scan, slow = tmp_path / "scan.xyz", tmp_path / "slow_worker"
+    scan.write_text("".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in beam.surface))
+    slow.write_text("#!/bin/sh\necho '{\"progress\": 0.4, \"message\": \"slowly\"}'\n"
+                    "exec sleep 100\n")
+    slow.chmod(0o755)
+    with virtual_screen() as display:
+        process = subprocess.Popen(
+            [blender, "--enable-event-simulate", "--window-geometry", "0", "0", "1280", "800",
+             "--python", str(FOLDER / "drive_interface.py"), "--", str(tmp_path)],
+            env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, text=True)
+        try:
+            _take_pictures(tmp_path, display, process)
+        finally:
+            process.kill()
+    assert (tmp_path / "log.json").is_file(), process.stderr.read()[-2000:]
+    seen = json.loads((tmp_path / "log.json").read_text())
+    assert seen["error"] is None, seen
+    assert seen["category"] == "Limber"
+    assert seen["imported_points"] == len(beam.surface)
+    assert seen["progress_seen"] == 0.4
+    assert seen["cancelled"] == "cancelled"
+    assert seen["opened"] == ["beam"]
+    assert seen["playing"] is True
+    assert 1 < seen["frame_after_play"] <= len(beam.frames)
+    for name in ("tab", "job", "opened", "playing"):
+        assert _colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
+
+
+@contextmanager
+def virtual_screen() -> Iterator[str]:
+    """A screen of 1280 x 800 without a monitor; gives its DISPLAY."""
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"],
+        pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    os.close(write)
+    try:
+        with os.fdopen(read) as stream:
+            yield f":{stream.readline().strip()}"
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+def _take_pictures(folder: Path, display: str, process: subprocess.Popen) -> None:
+    """Take a picture of the screen whenever Blender asks for one; return when it has ended."""
+    end = time.monotonic() + 150
+    while process.poll() is None and time.monotonic() < end:
+        for request in folder.glob("*.request"):
+            picture = request.with_suffix(".png")
+            subprocess.run(["import", "-display", display, "-window", "root", str(picture)],
+                           check=True, timeout=30)
+            request.unlink()
+        time.sleep(0.05)
+
+
+def _colour_count(path: Path) -> int:
+    from PIL import Image
+
+    return len(Image.open(path).convert("RGB").getcolors(1 << 24))
