@@ -1,0 +1,28 @@
+"""``limber plan``: RRT* and D-RRT* to a goal, compared on the full model."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli import Run, settings_options, stage_command
+from limber.errors import InputError
+from limber.planning.compare import PlanSettings
+from limber.planning.plan import plan_branch_motion
+
+
+@stage_command("plan")
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+@click.option("--name", default="path", show_default=True, help="Name of the plan's files.")
+@click.option("--force", is_flag=True, help="Run again even if nothing has changed.")
+@settings_options(PlanSettings)
+def command(run: Run, branch_folder: Path, name: str, force: bool, settings: PlanSettings,
+            ) -> dict[str, Any]:
+    """Paths to a goal: RRT* and deformation-aware D-RRT*, compared on the full model."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith("-baseline"):
+        raise InputError(f"--name {name!r} cannot name a plan.",
+                         "It becomes part of file names, and -baseline is the other path's.",
+                         "Use letters, digits, dash, dot and underscore.")
+    return plan_branch_motion(branch_folder, settings, name=name, force=force,
+                              progress=run.progress, warn=run.warn)

@@ -1,0 +1,125 @@
+"""Figures of a plan: energy along both paths, and both paths over a slice of the energy field."""
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from limber.planning.field import EnergyField
+from limber.planning.objective import arc_lengths
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_COLOURS = {"baseline": "#c0504d", "plan": "#1f5fa8"}
+_LABELS = {"baseline": "RRT* (length alone)", "plan": "D-RRT* (deformation-aware)"}
+_GRID = 160  # points of the slice along its longer side
+
+
+def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
+    """Return the figures of plan ``name`` with their captions."""
+    plan = json.loads(branch.path(f"plans/{name}.json").read_text(encoding="utf-8"))
+    field = EnergyField.read(branch.path("energy.npz"))
+    return [
+        (along_paths(plan), "Strain energy, gripper force and largest strain along both paths, "
+                            "on the full model; the energy of the field that the planner saw is "
+                            "dashed."),
+        (paths_over_slice(field, plan), "Both paths over the energy field, in the plane that "
+                                        "fits them best; white where the branch was not sampled. "
+                                        "The cross is the rest pose."),
+        (convergence(plan), "Cost of the best path so far over the planner's iterations, relative "
+                            "to the last."),
+    ]
+
+
+def along_paths(plan: dict[str, Any]) -> "Figure":
+    """Draw energy, force and strain over the length of both paths."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 3)
+    for key in ("baseline", "plan"):
+        path = plan[key]
+        along = 1e3 * arc_lengths(np.array(path["poses"])[:, :3])
+        style = {"color": _COLOURS[key], "label": _LABELS[key]}
+        axes[0].plot(along, 1e3 * np.array(path["energies_j"]), **style)
+        if "field_energies_j" in path:
+            axes[0].plot(along, 1e3 * np.array(path["field_energies_j"]), "--", lw=1,
+                         color=_COLOURS[key])
+        axes[1].plot(along, path["forces_n"], **style)
+        axes[2].plot(along, 100 * np.array(path["strains"]), **style)
+    for axis, label in zip(axes, ("strain energy above rest [mJ]", "gripper force [N]",
+                                  "largest strain [%]"), strict=True):
+        axis.set(xlabel="along the path [mm]", ylabel=label)
+        axis.grid(alpha=0.25)
+    axes[0].legend(frameon=False, fontsize=8)
+    return figure
+
+
+def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
+    """Draw both paths over the energy field in their common plane."""
+    from matplotlib.figure import Figure
+
+    paths = {key: np.array(plan[key]["poses"])[:, :3] for key in ("baseline", "plan")}
+    origin, across, up = _plane(np.concatenate(list(paths.values())))
+    flat = {key: (path - origin) @ np.stack([across, up], axis=1) for key, path in paths.items()}
+    rest = (field.rest - origin) @ np.stack([across, up], axis=1)
+    x, y, energy = _slice(field, origin, across, up, np.concatenate([*flat.values(), rest[None]]))
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    axis = figure.subplots()
+    # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
+    top = max(1.5 * max(max(plan[key]["energies_j"]) for key in paths), 1e-9)
+    levels = np.linspace(0.0, 1e3 * top, 16)
+    filled = axis.contourf(1e3 * x, 1e3 * y, np.ma.masked_invalid(1e3 * energy), levels=levels,
+                           cmap="viridis", extend="max")
+    figure.colorbar(filled, ax=axis, label="strain energy above rest [mJ]", format="%.3g")
+    for key, points in flat.items():
+        axis.plot(*(1e3 * points.T), color="white", lw=4)
+        axis.plot(*(1e3 * points.T), color=_COLOURS[key], lw=2, label=_LABELS[key])
+        axis.plot(*(1e3 * points[-1]), "o", color=_COLOURS[key], mec="white")
+    axis.plot(*(1e3 * flat["plan"][0]), "s", color="black", mec="white", label="start")
+    axis.plot(*(1e3 * rest), "x", color="black", ms=9, mew=2, label="rest pose")
+    axis.set(xlabel="in the plane, along the straight line [mm]", ylabel="upwards [mm]",
+             aspect="equal")
+    axis.legend(loc="best", fontsize=8, framealpha=0.85)
+    return figure
+
+
+def convergence(plan: dict[str, Any]) -> "Figure":
+    """Draw the cost of the best path over iterations, both relative to their last."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    axis = figure.subplots()
+    for key, history in plan["convergence"].items():
+        if history:
+            cost = np.array([entry["cost"] for entry in history])
+            axis.plot([entry["iteration"] for entry in history], cost / cost[-1],
+                      color=_COLOURS[key], label=_LABELS[key])
+    axis.set(xlabel="iterations", ylabel="cost / final cost")
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False)
+    return figure
+
+
+def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return origin and two axes of the plane that fits points best, the second upwards."""
+    origin = points.mean(axis=0)
+    _, _, directions = np.linalg.svd(points - origin, full_matrices=False)
+    normal = directions[2]
+    # A plane of paths is seldom horizontal; where it is, any second axis does.
+    up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.2 else directions[1]
+    return origin, np.cross(up, normal), up
+
+
+def _slice(field: EnergyField, origin: np.ndarray, across: np.ndarray, up: np.ndarray,
+           shown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = 0.25 * (high - low).max()
+    x, y = (np.linspace(low[k] - margin, high[k] + margin, _GRID) for k in range(2))
+    points = (origin + x[None, :, None] * across + y[:, None, None] * up).reshape(-1, 3)
+    energy = field.energy(points)
+    energy[~field.region.contains(points)] = np.nan
+    return x, y, energy.reshape(_GRID, _GRID)

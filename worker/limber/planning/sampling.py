@@ -1,0 +1,230 @@
+"""Energy of the branch at sampled grasp positions, by the full model.
+
+Positions come from a Sobol sequence in the ball about the rest position that the deflection
+allows, cut by the paper's hemisphere. They are solved along a nearest-neighbour tree: next is the
+position nearest to any that has been solved, and it starts from that solution. So every step is
+short, also where a tour would have to jump, and the branch stays in the equilibrium that bends
+out of rest.
+"""
+
+import queue
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.errors import WorkError
+from limber.planning.field import GraspSamples, fit_field
+from limber.planning.grasp_model import GraspModel, Reach, acceptable, read_grasp_model
+from limber.progress import SILENT, Progress
+from limber.store import Branch
+
+
+class EnergySettings(BaseModel):
+    """How the energy field is sampled."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    samples: int = Field(150, ge=30, description="Grasp positions to solve.")
+    deflection: float = Field(0.4, gt=0, le=1.0, description=(
+        "Largest distance from rest, as a share of the branch's length up to the grasp."))
+    stretch: float = Field(0.2, ge=0, le=1.0, description=(
+        "How far out of its curve the branch may be pulled straight: 0 the distance between base "
+        "and grasp at rest, 1 the length of branch between them."))
+    gravity: bool = Field(True, description="Let the branch bear its own weight.")
+    workers: int = Field(2, ge=1, le=16, description="Processes that solve side by side.")
+    seed: int = Field(0, ge=0, description="Of the sampled positions.")
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What is kept of a solution."""
+
+    target: int
+    pose: np.ndarray
+    energy: float
+    work: float
+    force: np.ndarray
+    tip: np.ndarray
+    min_det_f: float
+    trouble: str
+
+
+def sample_positions(reach: Reach, rest: np.ndarray, count: int, *, deflection: float,
+                     stretch: float = 0.2, seed: int = 0) -> np.ndarray:
+    """Return ``count`` positions [m] to which the grasp may be taken, shape [count, 3].
+
+    They lie within ``deflection`` times the arc length of ``rest``, above the base, and no
+    farther from it than the branch reaches.
+    """
+    from scipy.stats import qmc
+
+    radius = deflection * reach.arc_length
+    taut = reach.chord + stretch * (reach.arc_length - reach.chord)
+    taut = max(taut, float(np.linalg.norm(rest - reach.base)))
+    sequence = qmc.Sobol(3, seed=seed)
+    found: list[np.ndarray] = []
+    for _ in range(64):
+        points = rest + radius * (2.0 * sequence.random(512) - 1.0)
+        inside = np.linalg.norm(points - rest, axis=1) <= radius
+        inside &= np.linalg.norm(points - reach.base, axis=1) <= taut
+        inside &= points[:, 2] >= reach.base[2]
+        found.append(points[inside])
+        if sum(map(len, found)) >= count:
+            return np.concatenate(found)[:count]
+    raise WorkError("The grasp has nearly no room to move.",
+                    f"Within {radius:.3f} m of rest the branch, {taut:.3f} m long, reaches little.",
+                    "Grasp the branch farther out, or allow more --deflection or --stretch.")
+
+
+def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int = 1,
+                  progress: Progress = SILENT) -> tuple[GraspSamples, dict[str, int]]:
+    """Solve the branch with its grasp at each of ``targets`` [n, 3].
+
+    Returns:
+        The accepted samples, the rest pose first; and how many were rejected for which reason.
+    """
+    if workers > 1:
+        solved = _solve_side_by_side(grasp_model, targets, workers, progress)
+    else:
+        def report(done: int) -> None:
+            progress(done / len(targets), "solving grasp poses", solved=done)
+        solved = _solve_tree(grasp_model, targets, np.arange(len(targets)), report)
+    rest = grasp_model.rest
+    at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, 0.0, np.zeros(3),
+                      grasp_model.tip(rest.displacement), rest.min_det_f, "")
+    good = [at_rest, *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
+    bad = sorted((s for s in solved if s.trouble), key=lambda s: s.target)
+    reasons = [s.trouble for s in bad]
+    rejected = np.zeros((len(bad), 6))
+    rejected[:, :3] = targets[[s.target for s in bad]] if bad else 0.0
+    samples = GraspSamples(
+        poses=np.array([s.pose for s in good]), energies=np.array([s.energy for s in good]),
+        works=np.array([s.work for s in good]), forces=np.array([s.force for s in good]),
+        tips=np.array([s.tip for s in good]), min_det_f=np.array([s.min_det_f for s in good]),
+        rejected_poses=rejected)
+    return samples, {reason: reasons.count(reason) for reason in sorted(set(reasons))}
+
+
+def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
+                report: Callable[[int], None]) -> list[_Solved]:
+    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their names."""
+    positions = [grasp_model.rest_position]
+    states = [grasp_model.rest.displacement]
+    waiting = list(range(len(targets)))
+    solved: list[_Solved] = []
+    while waiting:
+        gaps = np.linalg.norm(targets[waiting][:, None] - np.array(positions)[None], axis=2)
+        place, source = np.unravel_index(np.argmin(gaps), gaps.shape)
+        target = waiting.pop(int(place))
+        result = grasp_model.follow(targets[target][None], states[source])[0]
+        trouble = acceptable(result)
+        solved.append(_Solved(
+            int(numbers[target]), grasp_model.pose(result.displacement),
+            grasp_model.energy(result), grasp_model.work(result), result.reaction_force,
+            grasp_model.tip(result.displacement), float(result.min_det_f), trouble))
+        if not trouble:
+            positions.append(targets[target])
+            states.append(result.displacement)
+        report(len(solved))
+    return solved
+
+
+_channel: Any = None
+_stop: Any = None
+
+
+def _join_pool(channel: Any, stop: Any) -> None:
+    global _channel, _stop
+    _channel, _stop = channel, stop
+
+
+def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
+                 ) -> list[_Solved]:
+    def report(_done: int) -> None:
+        _channel.put(1)
+        if _stop.is_set():
+            raise WorkError("Stopped.", "Another part of the sampling was cancelled.")
+    return _solve_tree(grasp_model, targets, numbers, report)
+
+
+def _solve_side_by_side(grasp_model: GraspModel, targets: np.ndarray, workers: int,
+                        progress: Progress) -> list[_Solved]:
+    context = get_context("spawn")
+    channel, stop = context.Queue(), context.Event()
+    # Slabs of space: each process follows its own tree out of the rest state.
+    shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), workers)
+    done = 0
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_join_pool,
+                             initargs=(channel, stop)) as pool:
+        futures = [pool.submit(_solve_share, grasp_model, targets[share], share)
+                   for share in shares]
+        try:
+            while wait(futures, timeout=0.1).not_done:
+                while True:
+                    try:
+                        done += channel.get_nowait()
+                    except queue.Empty:
+                        break
+                progress(done / len(targets), "solving grasp poses", solved=done)
+        finally:
+            stop.set()
+        return [solved for future in futures for solved in future.result()]
+
+
+def sample_energy_field(folder: Path, settings: EnergySettings, *, force: bool = False,
+                        progress: Progress = SILENT,
+                        warn: Callable[[str], None] = lambda _message: None) -> dict[str, Any]:
+    """Stage ``energy``: sample grasp poses and fit the field; writes ``energy.npz``.
+
+    Raises:
+        BranchFolderError: no mesh yet.
+        WorkError: too few poses could be solved.
+    """
+    branch = Branch.open(folder)
+    grasp_model = read_grasp_model(branch, gravity=settings.gravity)
+    digests = energy_inputs(grasp_model)
+    if not force and branch.is_current("energy", settings, digests=digests):
+        return branch.manifest.stages["energy"].result
+    with branch.stage("energy", settings, digests=digests) as stage:
+        progress(0.0, "rest state")
+        targets = sample_positions(
+            grasp_model.reach, grasp_model.rest_position, settings.samples,
+            deflection=settings.deflection, stretch=settings.stretch, seed=settings.seed)
+        samples, reasons = sample_branch(grasp_model, targets, workers=settings.workers,
+                                         progress=progress.part(0.02, 0.9))
+        field = fit_field(samples, seed=settings.seed, progress=progress.part(0.9, 1.0))
+        rejected = len(samples.rejected_poses)
+        if rejected > 0.2 * settings.samples:
+            warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); paths keep "
+                 "away from them.")
+        field.write(stage.path("energy.npz"), {
+            "rest_pose": samples.poses[0], "base_m": grasp_model.reach.base,
+            "arc_length_m": np.array(grasp_model.reach.arc_length)})
+        stage.result.update(
+            sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
+            energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
+            errors=field.errors, kernel=field.work_fit.kernel, shape=field.work_fit.shape,
+            smoothing=field.work_fit.smoothing,
+            fitted_to_forces=len(field.work_fit.gradient_weights) > 0,
+            max_energy_j=float(samples.energies.max()),
+            max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
+            rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
+    progress(1.0, "energy field fitted")
+    return branch.manifest.stages["energy"].result
+
+
+def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
+    """Return digests of what the field depends on: geometry, grasp and material."""
+    import hashlib
+
+    mesh = grasp_model.mesh
+    material = hashlib.sha256()
+    for name in ("young", "poisson", "density"):
+        material.update(np.ascontiguousarray(mesh.cell_data[name], float).tobytes())
+    return {"mesh geometry": mesh.geometry_digest(), "material": material.hexdigest()}
