@@ -94,22 +94,29 @@ def inside_gap(times: np.ndarray, intervals: np.ndarray) -> np.ndarray:
 
 
 def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> np.ndarray:
-    """Find single samples far from their neighbours (Hampel's rule), shape [n] of bool.
+    """Find readings far from their neighbours, shape [n] of bool.
 
-    A sample is a spike where any column lies more than ``threshold`` robust standard deviations
-    from the median of its window. The scale is the median absolute deviation of the series'
-    local residual, so that a fast but smooth pull is not taken for spikes.
+    Each window's middle is compared with a robust line through the window (Theil and Sen), so
+    that a fast pull is not taken for a spike and up to three readings in a row are found. A spike
+    lies more than ``threshold`` robust standard deviations off.
     """
-    count = len(values)
-    if count < 2 * half_window + 1:
-        return np.zeros(count, bool)
+    width = 2 * half_window + 1
+    if len(values) < width:
+        return np.zeros(len(values), bool)
     padded = np.pad(values, ((half_window, half_window), (0, 0)), mode="reflect",
                     reflect_type="odd")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half_window + 1, axis=0)
-    residual = np.abs(values - np.median(windows, axis=2))
-    typical = MAD_TO_SIGMA * np.median(residual, axis=0)
-    span = np.ptp(np.nan_to_num(values), axis=0)
-    return np.any(residual > threshold * typical + 0.02 * span.max() + 1e-12, axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, width, axis=0)
+    place = np.arange(width) - half_window
+    first, second = np.triu_indices(width, 1)
+    slope = np.median((windows[..., second] - windows[..., first])
+                      / (place[second] - place[first]), axis=2)
+    expected = np.median(windows - slope[..., None] * place, axis=2)
+    residual = np.abs(values - expected)
+    # One scale for all axes: the noise of a sensor is alike in them, and an axis that hardly
+    # moves has none to show.
+    typical = MAD_TO_SIGMA * np.median(residual[np.any(residual > 0, axis=1)]
+                                       if np.any(residual) else residual)
+    return np.any(residual > threshold * typical + 1e-3 * np.abs(values).max(), axis=1)
 
 
 def saturated(values: np.ndarray, run_length: int = 4) -> np.ndarray:

@@ -1,0 +1,341 @@
+"""The stage ``estimate``: Young's modulus along a branch from its pulls."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import Cancelled
+from limber.estimation.checks import force_unit_suspicion
+from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.identifiability import (
+    Identifiability,
+    identifiability,
+    require_scale,
+    tie_unresolved,
+)
+from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
+from limber.estimation.optimise import Fit, gauss_newton, nelder_mead
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.preparation import (
+    Subject,
+    forwards_of,
+    pull_names,
+    pulls_digest,
+    read_pulls,
+    require_scale_in_principle,
+    subject_of,
+)
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.start import scaled_start
+from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
+from limber.progress import SILENT, Progress
+from limber.store import Branch, plain
+
+EVALUATIONS = ".estimate-evaluations.jsonl"
+"""Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
+MISFIT_FACTOR = 16.0
+"""Mean squared residual over the expected one from which model and pull do not belong together."""
+
+
+@dataclass
+class Estimate:
+    """What an estimate found.
+
+    Attributes:
+        fit: The optimiser's end.
+        objective: What it minimised; its parameter space tells what was tied.
+        uncertainty: Covariance and intervals.
+        identifiability: Judged before the fit.
+        warnings: What the user should know.
+        held_out: Per pull, RMS distance [m] and RMS force error [N] of a fit that did not see it.
+        stopped: Whether it was stopped before its end.
+    """
+
+    fit: Fit
+    objective: Objective
+    uncertainty: Uncertainty
+    identifiability: Identifiability
+    warnings: list[str] = field(default_factory=list)
+    held_out: dict[str, dict[str, float]] = field(default_factory=dict)
+    stopped: bool = False
+
+    @property
+    def values(self) -> Values:
+        return self.objective.space.unpack(self.fit.evaluation.free)
+
+
+def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
+             progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
+             ) -> dict[str, Any]:
+    """Estimate Young's modulus from the pulls of a branch folder.
+
+    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. Stopped by Ctrl-C it keeps the
+    best so far in ``estimate.json`` (``converged`` is then false); run again, it resumes.
+
+    Returns:
+        DESIGN's keys and ``warnings``.
+
+    Raises:
+        InputError: no pulls, or pulls that cannot tell Young's modulus.
+        WorkError: the simulation finds no equilibrium.
+        Cancelled: after the best so far was kept.
+    """
+    branch = Branch.open(branch_folder)
+    names = pull_names(branch, settings)
+    subject = subject_of(branch, settings)
+    digests = {"mesh geometry": subject.mesh.geometry_digest(),
+               "pulls": pulls_digest(branch, names)}
+    if not force and branch.is_current("estimate", settings, digests=digests):
+        stored = branch.manifest.stages["estimate"].result
+        if not stored.get("stopped"):
+            return stored
+    messages: list[str] = []
+
+    def tell(message: str) -> None:
+        messages.append(message)
+        warn(message)
+
+    pulls = read_pulls(branch, names, subject, settings, tell, progress.part(0.0, 0.2))
+    forwards = forwards_of(pulls, subject, settings, tell)
+    log_path = branch.folder / EVALUATIONS
+    if force:
+        log_path.unlink(missing_ok=True)
+    log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
+    if log.resumed_count:
+        tell(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
+    sigma = [pull.entry.sensor.force_sigma_n for pull in pulls]
+    objective = Objective(forwards, ParameterSpace.separate(subject.start, _extra(settings)),
+                          log=log, force_sigma=sigma, progress=progress.part(0.2, 0.95),
+                          expected_count=20 if settings.method == "gauss-newton" else 200)
+    found = fit_pulls(objective, subject.start, settings, tell)
+    found.warnings = messages
+    result = _summary(found, settings)
+    with branch.stage("estimate", settings, digests=digests) as stage:
+        full = result | _details(found, subject, pulls)
+        stage.path("estimate.json").write_text(
+            json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        if not found.stopped:
+            subject.mesh.with_data(cell_data={
+                "young": subject.weights @ found.values.young,
+                "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
+                "density": np.full(subject.mesh.tet_count, found.values.density),
+            }).write(stage.path("mesh.vtu"))
+        stage.result.update(result)
+    if found.stopped:
+        raise Cancelled("The estimate was stopped.",
+                        f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
+                        "estimate.json, not in the mesh.", "Run it again to resume.")
+    log.forget()
+    return stage.result
+
+
+def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
+              tell: Callable[[str], None]) -> Estimate:
+    """Judge what the data can tell, fit it, and say how sure the result is."""
+    require_scale_in_principle(objective.forwards)
+    if settings.young is None:
+        start = scaled_start(objective, start)
+        if any(forward.uses_force for forward in objective.forwards):
+            suspicion = force_unit_suspicion(float(np.mean(start.young)))
+            if suspicion:
+                tell(suspicion)
+    first = _evaluated(objective, start)
+    judged = identifiability(first, objective.space)
+    require_scale(judged)
+    space, ties = tie_unresolved(first, objective.space)
+    for message in ties:
+        tell(message)
+    objective = objective.with_space(space)
+    try:
+        fit = _fitted(objective, space.pack(start), settings, tell)
+        stopped = False
+    except Stopped:
+        fit, stopped = _best_so_far(objective), True
+    if settings.method == "gauss-newton" and not stopped:
+        fit, objective = _tied_at_the_end(fit, objective, settings, tell)
+    found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged,
+                     stopped=stopped)
+    _judge(found, tell)
+    if settings.hold_out and len(objective.forwards) > 1 and not stopped:
+        found.held_out = _held_out(found, settings)
+    return found
+
+
+def _extra(settings: EstimateSettings) -> tuple[str, ...]:
+    wanted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
+              "alpha": settings.fit_damping, "beta": settings.fit_damping}
+    return tuple(name for name, chosen in wanted.items() if chosen)
+
+
+def _evaluated(objective: Objective, values: Values) -> Evaluation:
+    """Evaluate with derivatives; softer or stiffer where there is no equilibrium."""
+    from dataclasses import replace
+
+    from limber.errors import WorkError
+
+    for factor in (1.0, 3.0, 0.3, 10.0, 0.1):
+        scaled = replace(values, young=values.young * factor)
+        found = objective.evaluate(objective.space.pack(scaled), jacobian=True)
+        if found is not None:
+            return found
+    raise WorkError("The simulation finds no equilibrium for any Young's modulus tried.",
+                    "The recorded poses or forces are out of this branch's reach.",
+                    "Check the grasp point, the frame of reference and the units.")
+
+
+def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
+            tell: Callable[[str], None]) -> Fit:
+    if settings.method == "nelder-mead":
+        fit = nelder_mead(objective, start, evaluation_limit=settings.evaluations,
+                          delta_m2=settings.delta_m2)
+    else:
+        fit = gauss_newton(objective, _resumed(objective, start), robust=settings.robust,
+                           evaluation_limit=settings.evaluations)
+    return _refined(fit, objective, settings, tell)
+
+
+def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
+    best = objective.log.best
+    if objective.log.resumed_count and best and len(best.parameters) == len(start):
+        return np.array(best.parameters)
+    return start
+
+
+def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
+             tell: Callable[[str], None]) -> Fit:
+    """Simulate more key frames where the spline between them is worse than the measurements."""
+    for _ in range(3):
+        coarse = []
+        values = objective.space.unpack(fit.evaluation.free)
+        for forward in objective.forwards:
+            error = getattr(forward, "thinning_error", lambda _values: 0.0)(values)
+            sigma = float(np.sqrt(np.median(np.einsum("fmii->fm", forward.frames.covariance)) / 3
+                                  )) if forward.frames.covariance.size else np.inf
+            if error > 0.3 * sigma:
+                coarse.append(forward)
+        if not coarse or settings.method == "nelder-mead":
+            if coarse:
+                tell("Frames between the simulated ones are off by more than a third of the "
+                     "noise; use more --key-frames.")
+            return fit
+        for forward in coarse:
+            forward.set_key_count(2 * forward.key_count)
+        fresh = objective.with_space(objective.space)
+        fit = gauss_newton(fresh, fit.evaluation.free, robust=settings.robust,
+                           evaluation_limit=settings.evaluations)
+        objective.forward_count = fresh.forward_count
+    return fit
+
+
+def _best_so_far(objective: Objective) -> Fit:
+    best = objective.log.best
+    if best is None or len(best.parameters) != objective.space.size:
+        raise Cancelled("The estimate was stopped before its first fit step.",
+                        "There is nothing to keep yet.", "Run it again.")
+    quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
+    evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
+    return Fit(evaluation, False, "stopped")
+
+
+def _tied_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
+                     tell: Callable[[str], None]) -> tuple[Fit, Objective]:
+    """Tie what turns out to be unresolved at the solution, and fit once more."""
+    if objective.space.group_count != len(objective.space.groups):
+        return fit, objective
+    space, ties = tie_unresolved(fit.evaluation, objective.space)
+    if not ties:
+        return fit, objective
+    for message in ties:
+        tell(message)
+    values = objective.space.unpack(fit.evaluation.free)
+    tied = objective.with_space(space)
+    return gauss_newton(tied, space.pack(values), robust=settings.robust,
+                        evaluation_limit=settings.evaluations), tied
+
+
+def _judge(found: Estimate, tell: Callable[[str], None]) -> None:
+    space, free = found.objective.space, found.fit.evaluation.free
+    for name in space.on_bound(free):
+        tell(f"{name} ran to its bound: the data ask for a value beyond it. Check units, grasp "
+             "point and frame of reference.")
+    if found.uncertainty.variance_factor > MISFIT_FACTOR:
+        tell(f"The fit is poor: residuals are {found.uncertainty.variance_factor**0.5:.1f} times "
+             "the stated noise. Is this a pull of this branch, in its frame of reference?")
+    named = outliers(found.fit.evaluation, found.objective)
+    if named:
+        worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "
+                          f"({entry['deviations']:.0f} deviations)" for entry in named[:4])
+        tell(f"Outliers: {worst}{' ...' if len(named) > 4 else ''}.")
+    if not found.fit.converged and not found.stopped:
+        tell(f"The optimiser did not converge: {found.fit.reason}")
+
+
+def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str, float]]:
+    scores = {}
+    for index, forward in enumerate(found.objective.forwards):
+        rest = without(found.objective, index)
+        fit = gauss_newton(rest, found.fit.evaluation.free, robust=settings.robust,
+                           evaluation_limit=15)
+        distance, force = held_out(found.objective, fit.evaluation.free, index)
+        scores[forward.name] = {"rms_m": distance, "rms_force_n": force}
+    return scores
+
+
+def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
+    values, sure = found.values, found.uncertainty
+    return {
+        "method": settings.method, "young_pa": values.young,
+        "young_interval_pa": sure.young_interval, "poisson": values.poisson,
+        "density": values.density, "loss_m2": found.fit.evaluation.loss,
+        "forward_count": found.objective.forward_count, "converged": found.fit.converged,
+        "stopped": found.stopped, "held_out": found.held_out,
+        "variance_factor": sure.variance_factor, "warnings": found.warnings}
+
+
+def _details(found: Estimate, subject: Subject, pulls: list[Any]) -> dict[str, Any]:
+    evaluation, objective = found.fit.evaluation, found.objective
+    details: dict[str, Any] = {
+        "control_points_m": subject.control_points,
+        "fractions": _fractions(subject), "parameters": objective.space.names,
+        "groups": objective.space.groups, "covariance": found.uncertainty.covariance,
+        "correlation": found.uncertainty.correlation,
+        "singular_values": found.identifiability.singular_values,
+        "deviations_before_fit": found.identifiability.deviations,
+        "reason": found.fit.reason,
+        "outliers": outliers(evaluation, objective),
+        "history": [{"evaluation": number + 1, "parameters": entry.parameters,
+                     "objective": entry.objective, "loss_m2": entry.loss,
+                     "seconds": entry.seconds}
+                    for number, entry in enumerate(objective.log.entries)],
+        "pulls": [_pull_details(number, objective, evaluation)
+                  for number in range(len(objective.forwards))]}
+    first = details["pulls"][0]
+    details |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
+                "simulated_m": first["simulated_m"]}
+    truth = next((pull.entry.truth for pull in pulls if pull.entry.truth), None)
+    if truth:
+        details["truth"] = truth
+    return details
+
+
+def _pull_details(number: int, objective: Objective, evaluation: Evaluation) -> dict[str, Any]:
+    forward, simulated = objective.forwards[number], evaluation.pulls[number]
+    frames = forward.frames
+    shown = np.unique(np.linspace(0, len(frames) - 1, 6).round().astype(int))
+    points, forces = objective.scored(evaluation)[number]
+    return {"name": forward.name, "times_s": frames.times[shown],
+            "observed_m": frames.positions[shown], "simulated_m": simulated.positions[shown],
+            "measured_force_n": frames.wrenches[:, :3], "simulated_force_n": simulated.forces,
+            "all_times_s": frames.times, "point_residual": points, "force_residual": forces}
+
+
+def _fractions(subject: Subject) -> list[float]:
+    path = subject.skeleton.main_path()
+    along = subject.skeleton.arc_length[path]
+    nearest = [np.argmin(np.linalg.norm(subject.skeleton.nodes[path] - point, axis=1))
+               for point in subject.control_points]
+    return [float(along[index] / along[-1]) for index in nearest]

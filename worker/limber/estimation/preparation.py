@@ -1,0 +1,196 @@
+"""From a branch folder and its pulls to what an optimiser needs."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.estimation.alignment import Frames, frames_of
+from limber.estimation.checks import clean
+from limber.estimation.objective import Forward
+from limber.estimation.parameters import Values
+from limber.estimation.quasi_static import QuasiStaticForward
+from limber.estimation.recording import Pull, PullEntry, read_pull
+from limber.estimation.settings import EstimateSettings
+from limber.geometry.control_points import control_points
+from limber.geometry.skeleton import Skeleton
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.young_field import young_weights
+from limber.progress import SILENT, Progress
+from limber.store import Branch
+
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The branch that is estimated.
+
+    Attributes:
+        mesh: Its tetrahedra.
+        skeleton: Its axes.
+        control_points: [m], shape [K, 3].
+        weights: Young's modulus of the tetrahedra from the control points', [tet_count, K].
+        model: With the values to start from.
+        start: These values.
+    """
+
+    mesh: TetMesh
+    skeleton: Skeleton
+    control_points: np.ndarray
+    weights: np.ndarray
+    model: BranchModel
+    start: Values
+
+
+def subject_of(branch: Branch, settings: EstimateSettings) -> Subject:
+    """Read mesh and skeleton; the start is uniform."""
+    mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
+    skeleton = Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
+    points = control_points(skeleton, settings.fractions)
+    young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
+    poisson = _given(settings.poisson, mesh.cell_data["poisson"])
+    density = _given(settings.density, mesh.cell_data["density"])
+    damping = RayleighDamping()
+    model = BranchModel(mesh, young=young, poisson=poisson, density=density, gravity=None)
+    start = Values(np.full(len(points), young), poisson, density,
+                   (damping.mass, damping.stiffness))
+    return Subject(mesh, skeleton, points, young_weights(mesh, points), model, start)
+
+
+def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
+    """Return the pulls to use, checked.
+
+    Raises:
+        InputError: there are none, or one that was asked for is missing.
+    """
+    known = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
+    missing = [name for name in settings.pull if name not in known]
+    if missing or not known:
+        raise InputError(
+            f"{branch.folder} has no pull {', '.join(missing)}." if missing
+            else f"{branch.folder} has no pulls.",
+            f"It has {', '.join(known)}." if known else "There is nothing to estimate from.",
+            "Bring one in with `limber import-pull`, or simulate one with `limber virtual-pull`.")
+    return list(settings.pull) or known
+
+
+def pulls_digest(branch: Branch, names: list[str]) -> str:
+    """Return a sha256 of all files of these pulls."""
+    joined = hashlib.sha256()
+    for file in sorted(branch.manifest.files):
+        if any(file.startswith(f"pulls/{name}/") for name in names):
+            joined.update(f"{file} {branch.digest(file)}\n".encode())
+    return joined.hexdigest()
+
+
+def read_pulls(branch: Branch, names: list[str], subject: Subject, settings: EstimateSettings,
+               warn: Warn, progress: Progress = SILENT) -> list[Pull]:
+    """Read and clean pulls; find control points in their images where there are no markers."""
+    pulls = []
+    for number, name in enumerate(names):
+        folder = branch.path(f"pulls/{name}")
+        pull = read_pull(folder)
+        if pull.entry.observation in ("clouds", "depth"):
+            pull = _observed(folder, pull, subject, settings,
+                             progress.part(number / len(names), (number + 1) / len(names)))
+        pull = clean(pull)
+        for message in pull.warnings:
+            warn(message)
+        pulls.append(pull)
+    return pulls
+
+
+def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings, warn: Warn,
+                ) -> list[Forward]:
+    """Make the forward simulation of each pull.
+
+    Raises:
+        InputError: a pull has nothing that could be compared, or watches other points.
+    """
+    forwards = []
+    for pull in pulls:
+        entry = _with_overrides(pull.entry, settings)
+        frames = frames_of(pull)
+        for message in frames.warnings:
+            warn(message)
+        rest = subject.control_points if entry.rest_points_m is None else np.array(
+            entry.rest_points_m)
+        if frames.positions.shape[1] not in (0, len(rest)):
+            raise InputError(
+                f"{pull.name} watches {frames.positions.shape[1]} points, {len(rest)} are known.",
+                "Each observed point needs its place at rest.",
+                "Give rest_points_m in pull.toml, or as many --fractions as markers.")
+        rest = rest if frames.positions.shape[1] else np.empty((0, 3))
+        _check_rest(pull, frames, rest, warn)
+        forwards.append(_forward(pull.name, entry, frames, rest, subject, settings))
+    return forwards
+
+
+def require_scale_in_principle(forwards: list[Forward]) -> None:
+    """Refuse pulls of which no amount of data would give the scale of Young's modulus.
+
+    Raises:
+        InputError: all are pose-driven, slow, without gravity and without measured force.
+    """
+    for forward in forwards:
+        entry = forward.entry
+        if forward.uses_force or entry.drive == "force" or entry.motion == "dynamic" or (
+                entry.gravity_m_s2 is not None):
+            return
+    raise InputError(
+        "No pull has a measured force, gravity or inertia.",
+        "A branch that is moved slowly to given poses takes the same shape whether it is soft or "
+        "stiff: only the ratios of Young's modulus along it show, and a fit would look perfect "
+        "with every modulus wrong.",
+        "Record the gripper's force, or let gravity or inertia act (gravity_m_s2 or motion in "
+        "pull.toml).")
+
+
+def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
+             settings: EstimateSettings) -> Forward:
+    if entry.motion == "dynamic":
+        from limber.estimation.dynamic import DynamicForward
+
+        return DynamicForward(name, subject.model, subject.weights, entry, frames, rest)
+    return QuasiStaticForward(name, subject.model, subject.weights, entry, frames, rest,
+                              key_count=settings.key_frames)
+
+
+def _observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSettings,
+              progress: Progress) -> Pull:
+    from limber.perception.observe import observe
+
+    observations, warnings = observe(folder, pull, subject.skeleton, settings.fractions,
+                                     progress=progress)
+    return replace(pull, observations=observations).warned(*warnings)
+
+
+def _with_overrides(entry: PullEntry, settings: EstimateSettings) -> PullEntry:
+    given = {"drive": settings.drive, "motion": settings.motion}
+    return entry.model_copy(update={k: v for k, v in given.items() if v is not None})
+
+
+def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, warn: Warn) -> None:
+    """Warn where the first frame, at rest, shows the points elsewhere than the branch has them."""
+    at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
+    if not len(rest) or not at_rest.any() or pull.entry.gravity_m_s2 is not None:
+        return
+    shown = frames.positions[at_rest]
+    if not np.isfinite(shown).any():
+        return
+    off = np.linalg.norm(np.nanmedian(shown, axis=0) - rest, axis=1)
+    limit = 5e-3 + 5 * pull.entry.sensor.position_sigma_m
+    if np.nanmax(off) > limit:
+        warn(f"{pull.name}: at rest the observed points lie up to {np.nanmax(off) * 1e3:.0f} mm "
+             "from where this branch has them: another branch, another frame of reference, or "
+             "markers in another order.")
+
+
+def _given(value: float | None, field: np.ndarray) -> float:
+    return float(np.mean(field)) if value is None else value
