@@ -82,23 +82,21 @@ def _size_note(branch: Branch, mesh: TetMesh) -> str:
 
 
 def _add_scalars(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
-    for name, title, unit, colours in (
-            ("young", "Young's modulus", "Pa", "viridis"),
-            ("strain_energy", "strain energy density", "J/m³", "inferno")):
-        if name in mesh.cell_data:
-            values = _at_nodes(mesh, mesh.cell_data[name])[used]
-        elif name in mesh.point_data:
-            values = np.asarray(mesh.point_data[name], float)[used]
-        else:
-            continue
-        scale = _colour_scale(values, title, unit, colours)
-        data.info["scalars"][name] = scale
-        data.arrays[f"scalar:{name}"] = values
-        data.arrays[f"color:{name}"] = _colours(values, scale)
+    if "young" in mesh.cell_data:
+        young = at_nodes(mesh, mesh.cell_data["young"])[used]
+        _add_scalar(data, "young", young, "Young's modulus", "Pa", "viridis")
 
 
-def _at_nodes(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
-    """Return cell values averaged over the tetrahedra at each node, by volume; shape [n]."""
+def _add_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
+                colours: str) -> None:
+    scale = _colour_scale(values, title, unit, colours)
+    data.info["scalars"][name] = scale
+    data.arrays[f"scalar:{name}"] = np.asarray(values, float)
+    data.arrays[f"color:{name}"] = _colours(values, scale)
+
+
+def at_nodes(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
+    """Return values of tetrahedra, shape [tet_count], averaged at each node by volume, [n]."""
     volume = np.abs(mesh.volumes)
     total, weight = np.zeros(mesh.node_count), np.zeros(mesh.node_count)
     for corner in mesh.tets.T:
@@ -233,14 +231,21 @@ def _add_frames(data: SceneData, branch: Branch, plan: str | None, vertex_count:
     data.info["frames"] = {"name": name, "file": f"frames/{name}.pc2", "count": len(positions)}
     data.arrays["frame_bounds"] = np.array(
         [bound(positions.reshape(-1, 3), axis=0) for bound in (np.min, np.max)], float)
-    energies = next((about[key] for key in ("energies_j", "energy_j") if key in about), None)
-    if energies is not None and len(energies) == len(positions):
-        data.arrays["frame_energy"] = np.asarray(energies, float)
-    poses = about.get("poses")
-    if poses is not None and len(poses) == len(positions):
-        data.arrays["grasp_motion"] = np.asarray(poses, float)[:, :3]
-    elif "path:plan" in data.arrays:
+    if len(about.get("energies_j") or ()) == len(positions):
+        data.arrays["frame_energy"] = np.asarray(about["energies_j"], float)
+    if branch.has(f"frames/{name}.npz"):
+        _add_strain_energy(data, branch.path(f"frames/{name}.npz"), vertex_count)
+    if "path:plan" in data.arrays:
         data.arrays["grasp_motion"] = _along(data.arrays["path:plan"], len(positions))
+
+
+def _add_strain_energy(data: SceneData, path: Path, vertex_count: int) -> None:
+    """Add where the branch is strained most along the path: the largest value of any frame."""
+    with np.load(path, allow_pickle=False) as content:
+        density = np.asarray(content["strain_energy_density_j_m3"], float)
+    if density.ndim == 2 and density.shape[1] == vertex_count and np.isfinite(density).all():
+        _add_scalar(data, "strain_energy", density.max(axis=0), "peak strain energy density",
+                    "J/m³", "inferno")
 
 
 def _read_pc2(path: Path, vertex_count: int) -> np.ndarray:
@@ -259,7 +264,9 @@ def _read_pc2(path: Path, vertex_count: int) -> np.ndarray:
 
 
 def _along(points: np.ndarray, count: int) -> np.ndarray:
-    """Return ``count`` points evenly spaced along a polyline, shape [count, 3]."""
+    """Return a path's own points if it has ``count``, else points evenly spaced along it."""
+    if len(points) == count:
+        return points
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     length = np.concatenate([[0.0], np.cumsum(steps)])
     places = np.linspace(0.0, length[-1], count)

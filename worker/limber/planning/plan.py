@@ -154,6 +154,7 @@ def _change(before: float, after: float, sign: int) -> float | None:
 def _write(stage: Stage, name: str, grasp_model: GraspModel, summary: dict[str, Any],
            field: EnergyField, baseline: ResolvedPath, plan: ResolvedPath) -> None:
     from limber.mechanics.frames import write_pc2
+    from limber.scene_data import at_nodes
 
     detailed = dict(summary)
     for key, path in (("baseline", baseline), ("plan", plan)):
@@ -172,6 +173,12 @@ def _write(stage: Stage, name: str, grasp_model: GraspModel, summary: dict[str, 
         "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
         "energies_j": plan.energies, "forces_n": plan.forces, "path": name})) + "\n",
         encoding="utf-8")
+    # What the scene can colour the surface by, at the vertices and in the order of the frames.
+    model, mesh = grasp_model.model, grasp_model.mesh
+    densities = [at_nodes(mesh, model.internal(u).tet_energy / mesh.volumes)[vertices]
+                 for u in plan.displacements]
+    np.savez_compressed(stage.path(f"frames/{name}.npz"),
+                        strain_energy_density_j_m3=np.array(densities, np.float32))
 
 
 def _table(path: ResolvedPath) -> str:
