@@ -122,6 +122,7 @@ def write_geometry(stage: Any, skeleton: Skeleton, settings: ReconstructSettings
     meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
     for text in meshed.warnings:
         warn(text)
+    masses += [twig_mass(kept, run, settings.density) for run in meshed.left_out]
     mesh = mark(meshed.mesh, kept, young=settings.young, poisson=settings.poisson,
                 density=settings.density, fractions=FRACTIONS,
                 grasp_fraction=settings.grasp_fraction)
@@ -170,18 +171,24 @@ def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
         if not (carried or thin or skeleton.order[own[0]] > settings.twig_order):
             continue
         keep[own] = False
-        base = members[0]
-        while not keep[base]:
-            base = skeleton.parent[base]
-        up = skeleton.parent[own]
-        length = np.linalg.norm(skeleton.nodes[own] - skeleton.nodes[up], axis=1)
-        volume = np.pi * skeleton.radius[own]**2 * length
-        centre = np.average((skeleton.nodes[own] + skeleton.nodes[up]) / 2, axis=0,
-                            weights=np.maximum(volume, 1e-300))
-        masses.append({"mass_kg": float(settings.density * volume.sum()),
-                       "centre_m": centre.tolist(), "attached_m": skeleton.nodes[base].tolist(),
-                       "branch": run})
+        masses.append(twig_mass(skeleton, run, settings.density, keep))
     return (skeleton, []) if keep.all() else (skeleton.subset(keep), masses)
+
+
+def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | None = None,
+              ) -> dict[str, Any]:
+    """Return mass [kg], centre and place of attachment [m] of a run that is not meshed."""
+    members = skeleton.runs()[run]
+    own, base = members[1:], members[0]
+    while keep is not None and not keep[base]:
+        base = skeleton.parent[base]
+    up = skeleton.parent[own]
+    length = np.linalg.norm(skeleton.nodes[own] - skeleton.nodes[up], axis=1)
+    volume = np.pi * skeleton.radius[own]**2 * length
+    centre = np.average((skeleton.nodes[own] + skeleton.nodes[up]) / 2, axis=0,
+                        weights=np.maximum(volume, 1e-300))
+    return {"mass_kg": float(density * volume.sum()), "centre_m": centre.tolist(),
+            "attached_m": skeleton.nodes[base].tolist(), "branch": run}
 
 
 def peak_memory_mb() -> float:

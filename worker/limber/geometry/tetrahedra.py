@@ -1,4 +1,4 @@
-"""Tetrahedra for a branch: fTetWild on its surface, or our own sweep along its axes."""
+"""Tetrahedra for a branch: our own sweep along its axes, or fTetWild on its surface."""
 
 import hashlib
 import os
@@ -25,9 +25,10 @@ class MeshSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     mesher: Literal["auto", "ftetwild", "sweep"] = Field(
-        "auto", description="auto: fTetWild, and the sweep along the axes where that fails.")
+        "auto", description="auto: sweep along the axes, and fTetWild where that cannot join a "
+        "twig; ftetwild falls back to the sweep.")
     mesh_sides: int = Field(
-        6, ge=4, le=24, description="Sides of a cross-section; more make a finer mesh.")
+        6, ge=4, le=24, description="Sides of fTetWild's cross-sections; the sweep has six.")
     mesh_spacing: float = Field(
         4.0, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
     mesh_time_limit: float = Field(20.0, gt=0, description="fTetWild's time limit [s].")
@@ -42,16 +43,22 @@ class MeshResult:
         mesh: Quadratic, positively oriented, without data on it.
         mesher: ``ftetwild``, ``ftetwild (cached)`` or ``sweep``.
         warnings: Why another mesher than the first took over.
+        left_out: Runs of the skeleton that are not in the mesh.
     """
 
     mesh: TetMesh
     mesher: str
     warnings: list[str] = field(default_factory=list)
+    left_out: list[int] = field(default_factory=list)
 
 
 def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
                 progress: Progress = SILENT) -> MeshResult:
     """Mesh the generalised cylinders of a skeleton with quadratic tetrahedra.
+
+    The sweep is tried first: on the scans we have it takes half a second where fTetWild takes 6 to
+    60, comes out the same each time, keeps the volume within a percent and has no flatter angles.
+    fTetWild takes over where the sweep cannot join a twig, and the sweep again where that fails.
 
     Args:
         skeleton: Axes and radii.
@@ -61,27 +68,48 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
     Raises:
         MeshingError: no mesher could do it.
     """
+    settings = settings or MeshSettings()
+    swept, warnings = None, []
+    if settings.mesher != "ftetwild":
+        try:
+            swept = _swept(skeleton, settings)
+        except MeshingError as error:
+            if settings.mesher == "sweep":
+                raise
+            warnings.append(f"{error.seen} fTetWild took over.")
+        if swept is not None and (settings.mesher == "sweep" or not swept.left_out):
+            return swept
+    try:
+        mesh, mesher = _wild(skeleton, settings, progress)
+        return MeshResult(mesh, mesher, warnings)
+    except (MeshingError, MissingDependencyError) as error:
+        if swept is None and settings.mesher == "auto":
+            raise
+        warnings.append(f"{error.seen} The sweep mesher took over.")
+    swept = swept or _swept(skeleton, settings)
+    return MeshResult(swept.mesh, "sweep", warnings + swept.warnings, swept.left_out)
+
+
+def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:
     from limber.geometry.tree_sweep import sweep_tree
+
+    swept = sweep_tree(skeleton, spacing=settings.mesh_spacing)
+    warnings = []
+    if swept.left_out:
+        warnings.append(f"{len(swept.left_out)} short twigs could not be joined to the mesh; "
+                        "their mass is kept.")
+    return MeshResult(swept.mesh.quadratic(), "sweep", warnings, swept.left_out)
+
+
+def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress) -> tuple[TetMesh, str]:
     from limber.geometry.tubes import branch_surface
 
-    settings = settings or MeshSettings()
-    warnings = []
-    if settings.mesher != "sweep":
-        try:
-            surface = branch_surface(skeleton, sides=settings.mesh_sides,
-                                     spacing=settings.mesh_spacing)
-            radii = np.sort(skeleton.radius)
-            mesh, cached = tetrahedralise(
-                surface, edge_length=8 * float(np.median(radii)),
-                epsilon=0.25 * float(radii[len(radii) // 10]), settings=settings,
-                progress=progress)
-            return MeshResult(mesh, "ftetwild (cached)" if cached else "ftetwild")
-        except (MeshingError, MissingDependencyError) as error:
-            if settings.mesher == "ftetwild":
-                raise
-            warnings.append(f"{error.seen} The sweep mesher took over.")
-    mesh = sweep_tree(skeleton, sides=settings.mesh_sides, spacing=settings.mesh_spacing)
-    return MeshResult(mesh.quadratic(), "sweep", warnings)
+    surface = branch_surface(skeleton, sides=settings.mesh_sides, spacing=settings.mesh_spacing)
+    radii = np.sort(skeleton.radius)
+    mesh, cached = tetrahedralise(
+        surface, edge_length=8 * float(np.median(radii)),
+        epsilon=0.25 * float(radii[len(radii) // 10]), settings=settings, progress=progress)
+    return mesh, "ftetwild (cached)" if cached else "ftetwild"
 
 
 def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
