@@ -21,6 +21,7 @@ MODULES = (
     "panels.reconstruct",
     "panels.result",
     "panels.play",
+    "relative_paths",
     "command",
 )
 

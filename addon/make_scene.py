@@ -1,10 +1,12 @@
 """Makes a scene file and its picture; `limber scene` runs this in a process that has bpy.
 
-    blender -b --factory-startup --python make_scene.py -- DATA.npz SCENE.blend [PICTURE.png WIDTH]
+    blender -b --factory-startup --python make_scene.py -- \
+        --data DATA.npz --scene SCENE.blend [--picture PICTURE.png]
 
 Standard output carries JSON lines as every stage's does; the last one has ``status``.
 """
 
+import argparse
 import importlib
 import importlib.util
 import json
@@ -30,8 +32,16 @@ def _say(**content) -> None:
 
 
 def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = None,
-               width: int = 1120) -> dict:
-    """Build the scene of ``data_path``, save it and render its last frame; returns a summary."""
+               width: int = 1120, color: str | None = None) -> dict:
+    """Build the scene of ``data_path``, save it and render its last frame; returns a summary.
+
+    Args:
+        data_path: What the worker wrote.
+        scene_path: The .blend to write.
+        picture_path: The PNG to render, if any.
+        width: Of the picture [pixels].
+        color: What the colours mean: a scalar of the data, the first by default.
+    """
     _load_addon()
     animation = importlib.import_module("limber_addon.bridge.animation")
     scenes = importlib.import_module("limber_addon.scene")
@@ -45,7 +55,7 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     scene = bpy.context.scene
     scene.name = data.info["name"]
     scene.unit_settings.system = "METRIC"
-    shown = scenes.show_branch(scene, data)
+    shown = scenes.show_branch(scene, data, color)
     camera = studio.set_up_studio(scene, data, studio.Picture(width))
     legend.add_legend(scene, camera, data, shown)
     _say(progress=0.2, message="scene built")
@@ -63,10 +73,15 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
 
 def main(arguments: list[str]) -> int:
     """Run with the arguments after ``--``; returns the exit code."""
-    data, scene, *picture = arguments
+    parser = argparse.ArgumentParser(prog="make_scene.py")
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--scene", type=Path, required=True)
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--width", type=int, default=1120)
+    parser.add_argument("--color")
+    given = parser.parse_args(arguments)
     try:
-        summary = make_scene(Path(data), Path(scene),
-                             *((Path(picture[0]), int(picture[1])) if picture else ()))
+        summary = make_scene(given.data, given.scene, given.picture, given.width, given.color)
     except (ValueError, RuntimeError, OSError) as error:
         _say(status="failed", error=str(error))
         return 3

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -10,6 +11,7 @@ from .bridge import animation, curves, materials, meshes
 from .scene_data import SceneData
 
 FOLDER_KEY = "limber_folder"
+NAME_KEY = "limber_name"
 INFO_KEY = "limber_info"
 ENERGY_KEY = "limber_energy_j"
 
@@ -87,16 +89,16 @@ def add_object(collection: bpy.types.Collection, name: str, data: bpy.types.ID,
     thing = bpy.data.objects.new(name, data)
     collection.objects.link(thing)
     if material is not None:
-        thing.data.materials.clear()
-        thing.data.materials.append(material)
+        data.materials.clear()
+        data.materials.append(material)
     return thing
 
 
 def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> ShownBranch:
     name = data.info["name"]
-    _remove_shown(scene, str(data.folder))
+    _remove_shown(scene, name, data.folder)
     collection = bpy.data.collections.new(name)
-    collection[FOLDER_KEY] = animation.shown_path(data.folder)
+    collection[FOLDER_KEY], collection[NAME_KEY] = str(data.folder), name
     scene.collection.children.link(collection)
     mesh = meshes.new_mesh(name, data.arrays["vertices"], data.arrays["faces"])
     surface = add_object(collection, name, mesh)
@@ -110,11 +112,13 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     return ShownBranch(collection, surface)
 
 
-def _remove_shown(scene: bpy.types.Scene, folder: str) -> None:
+def _remove_shown(scene: bpy.types.Scene, name: str, folder: Path) -> None:
+    """Remove what was shown of this branch before, also when its folder has moved since."""
     for collection in list(scene.collection.children):
         if FOLDER_KEY not in collection:
             continue
-        if bpy.path.abspath(collection[FOLDER_KEY]) == folder:
+        before = Path(collection[FOLDER_KEY])
+        if before == folder or (collection[NAME_KEY] == name and not before.is_dir()):
             for thing in list(collection.objects):
                 bpy.data.objects.remove(thing)
             bpy.data.collections.remove(collection)
@@ -139,6 +143,7 @@ def _add_points(shown: ShownBranch, data: SceneData) -> None:
         if len(points) == 0:
             continue
         ball = meshes.new_sphere(title, share * data.info["size_m"])
+        meshes.set_one_color(ball, COLORS[name])
         material = materials.plain_material(title, COLORS[name], roughness=0.35)
         shown.objects[name] = []
         for number, point in enumerate(points):
@@ -152,6 +157,7 @@ def _add_goal(shown: ShownBranch, data: SceneData) -> None:
     if not goal:
         return
     ball = meshes.new_sphere("Goal", goal["radius_m"] or 0.02 * data.info["size_m"])
+    meshes.set_one_color(ball, COLORS["goal"])
     material = materials.plain_material("Goal", COLORS["goal"], alpha=0.3)
     thing = add_object(shown.collection, "Goal", ball, material)
     thing.location = goal["centre_m"]
@@ -166,6 +172,7 @@ def _add_base(shown: ShownBranch, data: SceneData) -> None:
     bottom = min(data.info["ground_m"], base["centre_m"][2]) - 0.03 * size
     height = base["top_m"] - bottom
     block = meshes.new_cylinder("Fixed base", max(2.2 * base["radius_m"], 0.03 * size), height)
+    meshes.set_one_color(block, COLORS["base"])
     material = materials.plain_material("Fixed base", COLORS["base"], roughness=0.8)
     thing = add_object(shown.collection, "Fixed base", block, material)
     thing.location = (*base["centre_m"][:2], bottom + height / 2)
@@ -176,10 +183,12 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     frames = data.info.get("frames")
     if not frames:
         return
-    rest = shown.surface.data.copy()
-    rest.materials.clear()
+    rest = meshes.new_mesh("Rest shape", data.arrays["vertices"], data.arrays["faces"])
     material = materials.plain_material("Rest shape", COLORS["rest"], alpha=0.25)
-    shown.objects["rest"] = [add_object(shown.collection, "Rest shape", rest, material)]
+    ghost = add_object(shown.collection, "Rest shape", rest, material)
+    # In the viewport, lines: the moving branch stays in sight.
+    ghost.display_type = "WIRE"
+    shown.objects["rest"] = [ghost]
     header = animation.attach_cache(shown.surface, data.folder / frames["file"])
     shown.frame_count = header.frame_count
     scene.frame_start, scene.frame_end = 1, header.frame_count

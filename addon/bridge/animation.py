@@ -83,13 +83,19 @@ def cache_trouble(target: bpy.types.Object) -> str:
 def shown_path(path: Path) -> str:
     """Return ``path`` as Blender keeps it: relative to a saved .blend, absolute otherwise."""
     path = Path(path).resolve()
-    if not bpy.data.filepath:
-        return str(path)
+    return relative_path(str(path), Path(bpy.data.filepath).parent) if bpy.data.filepath else (
+        str(path))
+
+
+def relative_path(path: str, folder: Path) -> str:
+    """Return an absolute ``path`` as Blender's relative one from ``folder``; others as they are."""
+    if path.startswith("//"):
+        return path
     try:
-        return bpy.path.relpath(str(path))
+        return bpy.path.relpath(path, start=str(folder))
     except ValueError:
         # Another drive on Windows: there is no relative path.
-        return str(path)
+        return path
 
 
 def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 1) -> None:

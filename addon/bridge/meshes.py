@@ -87,6 +87,11 @@ def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
     mesh.update_tag()
 
 
+def set_one_color(mesh: bpy.types.Mesh, color: tuple[float, float, float]) -> None:
+    """Give all vertices one linear colour: Solid mode then shows it beside coloured surfaces."""
+    set_colors(mesh, "color", np.tile((*color, 1.0), (len(mesh.vertices), 1)))
+
+
 def new_sphere(name: str, radius: float) -> bpy.types.Mesh:
     """Make a smooth sphere of ``radius`` [m] about the origin."""
     return _primitive(name, lambda mesh: bmesh.ops.create_uvsphere(

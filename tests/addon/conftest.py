@@ -35,7 +35,7 @@ class BeamBranch:
     path: np.ndarray
 
 
-def write_pc2(path: Path, frames: np.ndarray) -> None:
+def _write_pc2(path: Path, frames: np.ndarray) -> None:
     """Write frames [f, v, 3] m as PC2, independently of the code under test."""
     head = struct.pack("<12siiffi", b"POINTCACHE2\0", 1, frames.shape[1], 0.0, 1.0, len(frames))
     path.write_bytes(head + np.ascontiguousarray(frames, "<f4").tobytes())
@@ -65,9 +65,12 @@ def make_beam_branch(folder: Path, frame_count: int = 6, *, plan: bool = True) -
     if plan:
         with branch.stage("plan:to-goal", reads=["mesh.vtu"]) as stage:
             _write_plan(stage, path)
-            write_pc2(stage.path("frames/to-goal.pc2"), frames)
+            _write_pc2(stage.path("frames/to-goal.pc2"), frames)
             stage.path("frames/to-goal.json").write_text(json.dumps(
                 {"frame_count": frame_count, "energies_j": list(0.01 * amounts)}))
+            # Not physics, but known: grows with the frame, and from the tip to the base.
+            density = 1000.0 * amounts[:, None] * (0.61 - surface[:, 2])
+            np.savez(stage.path("frames/to-goal.npz"), strain_energy_density_j_m3=density)
     return BeamBranch(folder, mesh, surface, frames, path)
 
 
@@ -82,6 +85,12 @@ def _write_plan(stage, path: np.ndarray) -> None:
         "plan": {"length_m": 0.13, "energy_sum_nmm": 4.5},
         "baseline": {"length_m": 0.11, "energy_sum_nmm": 6.5},
         "energy_saved_percent": 31.0, "length_added_percent": 18.0}))
+
+
+@pytest.fixture(scope="session")
+def write_pc2():
+    """A function that writes frames [f, v, 3] m as PC2, independently of the code under test."""
+    return _write_pc2
 
 
 @pytest.fixture()

@@ -81,7 +81,7 @@ def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
     scene = beam.folder.parent / "scene.blend"
     picture = scene.with_suffix(".png")
     code = call(["scene", str(beam.folder), "-o", str(scene), "--render", str(picture),
-                 "--width", "240", "--json"])
+                 "--width", "240", "--color", "strain_energy", "--json"])
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert code == 0, result
     assert picture.stat().st_size > 5000

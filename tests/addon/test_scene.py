@@ -97,6 +97,39 @@ def test_paths_are_relative(bpy, addon, beam, tmp_path):
         "//beam.branch/frames/to-goal.pc2")
 
 
+def test_path_becomes_relative_when_saved_later(bpy, registered, beam, positions, tmp_path):
+    """Opened before the first save, saved beside the folder, both moved: it still plays."""
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    modifier = bpy.data.objects["beam"].modifiers[0]
+    assert modifier.filepath == str(beam.folder / "frames" / "to-goal.pc2")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "mine.blend"))
+    assert modifier.filepath.replace("\\", "/") == "//beam.branch/frames/to-goal.pc2"
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in ("beam.branch", "mine.blend"):
+        shutil.move(tmp_path / name, moved / name)
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "mine.blend"))
+    np.testing.assert_allclose(positions("beam", 6), beam.frames[-1], atol=1e-6)
+    assert bpy.ops.limber.open_result(directory=str(moved / "beam.branch")) == {"FINISHED"}
+    assert len(bpy.context.scene.collection.children) == 1, "the moved branch replaces the old"
+
+
+def test_strain_energy_along_the_path(bpy, addon, beam, tmp_path):
+    """The surface carries the largest strain energy density of any frame, in J/m3."""
+    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    scenes = importlib.import_module("limber_addon.scene")
+    shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
+    mesh = shown.surface.data
+    np.testing.assert_allclose(meshes.scalars(mesh, "strain_energy"),
+                               1000.0 * (0.61 - beam.surface[:, 2]), rtol=1e-5)
+    assert mesh.color_attributes.active_color.name == "young_color"
+    scenes.color_by(shown.surface, "strain_energy")
+    assert mesh.color_attributes.active_color.name == "strain_energy_color"
+    attributes = [node.attribute_name for node in mesh.materials[0].node_tree.nodes
+                  if node.type == "ATTRIBUTE"]
+    assert attributes == ["strain_energy"]
+
+
 def test_a_branch_without_a_plan(bpy, addon, bare_beam, tmp_path):
     """Just reconstructed: the surface and its marks, no motion and no error."""
     shown = _scene_in_process(addon, bare_beam.folder, tmp_path / "scene.blend", bpy)
@@ -148,20 +181,15 @@ def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
     assert call(["scene", str(beam.folder)]) == 2
 
 
-def test_scene_script_reports_its_failure(bpy, beam, tmp_path):
+def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     """Frames of another mesh end the process with code 3 and a reason, not with a still branch."""
     from limber.scene_data import scene_data
     from limber.store import Branch
 
-    data = scene_data(Branch.open(beam.folder))
-    data.arrays["vertices"] = data.arrays["vertices"][:-1]
-    data.arrays["faces"] = data.arrays["faces"][:4]
-    for name in ("scalar:young", "color:young"):
-        data.arrays[name] = data.arrays[name][:-1]
-    data.arrays["faces"] = np.array([[0, 1, 2]])
-    data.write(tmp_path / "data.npz")
+    scene_data(Branch.open(beam.folder)).write(tmp_path / "data.npz")
+    write_pc2(beam.folder / "frames" / "to-goal.pc2", beam.frames[:, 1:])
     done = subprocess.run(
-        [sys.executable, ADDON / "make_scene.py", "--", tmp_path / "data.npz",
-         tmp_path / "scene.blend"], check=False, capture_output=True, text=True)
+        [sys.executable, ADDON / "make_scene.py", "--", "--data", tmp_path / "data.npz",
+         "--scene", tmp_path / "scene.blend"], check=False, capture_output=True, text=True)
     assert done.returncode == 3
     assert "another mesh" in json.loads(done.stdout.splitlines()[-1])["error"]

@@ -31,6 +31,7 @@ _COLOUR_MAPS = {
     "inferno": ("#1b0c41", "#4a0c6b", "#781c6d", "#a52c60", "#cf4446", "#ed6925", "#fb9b06",
                 "#f7d13d", "#fcffa4"),
 }
+_MOST_DECADES = 1e3  # a logarithmic scale spans at most this; what is below has its first colour
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 
 
@@ -111,6 +112,8 @@ def _colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> di
         # One value everywhere: put it in the middle, so that it has a colour and a label.
         low, high = (0.5 * low, 1.5 * low) if low > 0 else (low - 0.5, low + 0.5)
     log = low > 0 and high / low > 10.0
+    if log:
+        low = max(low, high / _MOST_DECADES)
     middle = float(np.sqrt(low * high)) if log else 0.5 * (low + high)
     prefix = next((p for p in _PREFIXES if abs(high) >= p[0]), (1.0, ""))
     ticks = [f"{value / prefix[0]:.3g} {prefix[1]}{unit}" for value in (low, middle, high)]
@@ -251,7 +254,9 @@ def _add_strain_energy(data: SceneData, path: Path, vertex_count: int) -> None:
 def _read_pc2(path: Path, vertex_count: int) -> np.ndarray:
     """Return the frames of a PC2 file, shape [frames, v, 3]; it must fit the mesh's surface."""
     content = path.read_bytes()
-    magic, _version, points, _start, _rate, frames = _PC2_HEADER.unpack_from(content)
+    # A file shorter than its header reads as one of other bytes, and is refused as such.
+    head = content[:_PC2_HEADER.size].ljust(_PC2_HEADER.size, b"?")
+    magic, _version, points, _start, _rate, frames = _PC2_HEADER.unpack(head)
     if magic != b"POINTCACHE2\0" or len(content) != _PC2_HEADER.size + 12 * points * frames:
         raise BranchFolderError(f"{path} is not a whole PC2 file.", "Its frames cannot be shown.",
                                 "Run the stage that makes it again.")

@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from limber.cli import Run, stage_command
-from limber.errors import InputError, MissingDependencyError
+from limber.errors import InputError, MissingDependencyError, WorkError
 from limber.progress import Progress
 from limber.store import Branch
 
@@ -29,11 +29,13 @@ _SCRIPT = Path(__file__).parents[3] / "addon" / "make_scene.py"
               help="Also render a picture (PNG) of the end of the path.")
 @click.option("--width", type=click.IntRange(160, 8192), default=1120, show_default=True,
               help="Of the picture [pixels]; its height is three quarters of it.")
+@click.option("--color", type=click.Choice(["young", "strain_energy"]), default="young",
+              show_default=True, help="What the branch's colours mean.")
 @click.option("--plan", help="Which path to show.  [default: the newest]")
 @click.option("--data", "data_path", type=click.Path(path_type=Path),
               help="Write only what a scene shows, as arrays (.npz): what the add-on opens.")
 def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | None,
-            width: int, plan: str | None, data_path: Path | None) -> dict[str, Any]:
+            width: int, color: str, plan: str | None, data_path: Path | None) -> dict[str, Any]:
     """A Blender scene with the branch, its motion and paths (needs bpy or Blender)."""
     from limber.scene_data import scene_data
 
@@ -42,14 +44,21 @@ def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | 
                          "One says what to make.", "Give -o scene.blend.")
     run.progress(0.0, "reading the branch folder")
     data = scene_data(Branch.open(branch_folder), plan)
+    if color not in data.info["scalars"]:
+        raise InputError(f"The branch has no {color} to show.", "", "Run `limber plan` first.")
     if data_path is not None:
         data.write(_writable(data_path))
         return {"data": data_path, "vertex_count": len(data.arrays["vertices"])}
     with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
         prepared = Path(temporary) / "scene.npz"
         data.write(prepared)
-        result = _make_scene(prepared, _writable(output), picture and _writable(picture),
-                             width, run.progress.part(0.1, 1.0))
+        arguments = ["--data", prepared, "--scene", _writable(output), "--color", color]
+        if picture is not None:
+            arguments += ["--picture", _writable(picture), "--width", width]
+        result = _make_scene(arguments, run.progress.part(0.1, 1.0))
+    if not output.is_file():
+        raise WorkError(f"Blender ended well but wrote no {output}.", "",
+                        "`limber doctor` says which Blender was used.")
     return result | {"scene": output, "picture": picture}
 
 
@@ -62,18 +71,12 @@ def _writable(path: Path) -> Path:
     return path.resolve()
 
 
-def _make_scene(data: Path, output: Path, picture: Path | None, width: int,
-                progress: Progress) -> dict[str, Any]:
+def _make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
     from limber.jobs.process import run_json_process
 
-    arguments = ["--", str(data), str(output), *([str(picture), str(width)] if picture else [])]
     progress(0.0, "starting Blender")
-    result = run_json_process("scene", [*blender_command(), *arguments], progress,
+    result = run_json_process("scene", [*blender_command(), "--", *map(str, arguments)], progress,
                               fix="`limber doctor` says which Blender was used.")
-    if not output.is_file():
-        raise MissingDependencyError(
-            f"Blender ended well but wrote no {output}.", "",
-            "`limber doctor` says which Blender was used.")
     return {key: result[key] for key in ("object_count", "frame_count", "blender")}
 
 
