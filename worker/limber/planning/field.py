@@ -19,17 +19,30 @@ import numpy as np
 from numba import njit
 
 from limber.errors import InputError, WorkError
+from limber.planning.chart import Chart, mapped, pulled_back_size
 from limber.planning.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.trust import TrustRegion, trusted_at
 from limber.progress import SILENT, Progress
 
-# (kernel, shape, smoothing, fitted to forces too): tried in turn, the least held-out error wins.
-CANDIDATES = tuple(
-    (kernel, shape, smoothing, with_forces)
+
+@dataclass(frozen=True)
+class FitChoice:
+    """How a field is fitted: kernel and shape, the chart's stretch, and whether to forces too."""
+
+    kernel: str
+    shape: float
+    stretch: float
+    with_forces: bool
+
+
+# Tried in turn; the least held-out error wins.
+CHOICES = tuple(
+    FitChoice(kernel, shape, stretch, with_forces)
     for kernel, shape in (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0),
-                          ("multiquadric", 2.0), ("gaussian", 2.0))
-    for smoothing in (1e-10, 1e-6)
+                          ("multiquadric", 2.0))
+    for stretch in (1.0, 2.0, 3.0)
     for with_forces in (True, False))
+_SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites round-off
 _CHOSEN_BY = ("energy_error", "force_error", "energy_error_median", "force_error_median")
 _FOLDS_TO_CHOOSE, _FOLDS_TO_REPORT = 4, 10
 
@@ -69,6 +82,7 @@ class GraspSamples:
 class FieldArrays(NamedTuple):
     """A field and its limits as the compiled loops take them; see :meth:`EnergyField.limited`."""
 
+    chart: tuple
     energy: tuple
     work: tuple
     planes: np.ndarray
@@ -84,6 +98,7 @@ class EnergyField:
 
     Attributes:
         samples: What it was fitted to.
+        chart: The coordinates of the fits.
         energy_fit, work_fit: Interpolants of the two scalars (clamped by the methods).
         shape_fit: Six channels: natural rotation vector and tip position.
         region: Where the field may be believed.
@@ -91,6 +106,7 @@ class EnergyField:
     """
 
     samples: GraspSamples
+    chart: Chart
     energy_fit: RadialInterpolant
     work_fit: RadialInterpolant
     shape_fit: RadialInterpolant
@@ -104,36 +120,45 @@ class EnergyField:
 
     def energy(self, points: np.ndarray) -> np.ndarray:
         """Return the deformation energy [J] at ``points`` [n, 3], never negative, shape [n]."""
-        return np.maximum(self.energy_fit.value(_rows(points))[:, 0], 0.0)
+        return np.maximum(self._value(self.energy_fit, points)[:, 0], 0.0)
 
     def energy_gradient(self, points: np.ndarray) -> np.ndarray:
         """Return its gradient [N], shape [n, 3]; zero where the energy is clamped."""
-        points = _rows(points)
-        clamped = self.energy_fit.value(points)[:, 0] <= 0.0
-        gradient = self.energy_fit.gradient(points)[:, :, 0]
-        return np.where(clamped[:, None], 0.0, gradient)
+        clamped = self._value(self.energy_fit, points)[:, 0] <= 0.0
+        return np.where(clamped[:, None], 0.0, self._gradient(self.energy_fit, points, 0))
 
     def work(self, points: np.ndarray) -> np.ndarray:
         """Return the gripper's slow work from rest [J] at ``points``, shape [n]."""
-        return np.maximum(self.work_fit.value(_rows(points))[:, 0], 0.0)
+        return np.maximum(self._value(self.work_fit, points)[:, 0], 0.0)
 
     def force(self, points: np.ndarray) -> np.ndarray:
         """Return the force that holds the grasp there [N], the gradient of work, [n, 3]."""
-        return self.work_fit.gradient(_rows(points))[:, :, 0]
+        return self._gradient(self.work_fit, points, 0)
 
     def poses(self, points: np.ndarray) -> np.ndarray:
         """Return positions with the rotation that the grasped piece takes there, [n, 6]."""
-        points = _rows(points)
-        return np.hstack([points, self.shape_fit.value(points)[:, :3]])
+        return np.hstack([_rows(points), self._value(self.shape_fit, points)[:, :3]])
 
     def tip(self, points: np.ndarray) -> np.ndarray:
         """Return where the branch's tip is with the grasp at ``points`` [m], [n, 3]."""
-        return self.shape_fit.value(_rows(points))[:, 3:]
+        return self._value(self.shape_fit, points)[:, 3:]
+
+    def tip_gradient(self, points: np.ndarray) -> np.ndarray:
+        """Return d tip_c / d x_k, shape [n, 3 (k), 3 (c)]."""
+        return np.stack([self._gradient(self.shape_fit, points, 3 + c) for c in range(3)], axis=2)
+
+    def _value(self, fit: RadialInterpolant, points: np.ndarray) -> np.ndarray:
+        return fit.value(self.chart.map(_rows(points)))
+
+    def _gradient(self, fit: RadialInterpolant, points: np.ndarray, channel: int) -> np.ndarray:
+        points = _rows(points)
+        gradient = fit.gradient(self.chart.map(points))[:, :, channel]
+        return self.chart.pull_back(points, gradient)
 
     def limited(self, max_energy: float = np.inf, max_force: float = np.inf) -> FieldArrays:
         """Return the arrays for compiled loops, with limits on energy [J] and force [N]."""
-        return FieldArrays(self.energy_fit.arrays, self.work_fit.arrays, self.region.planes,
-                           self.region.accepted, self.region.rejected,
+        return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.work_fit.arrays,
+                           self.region.planes, self.region.accepted, self.region.rejected,
                            float(max_energy), float(max_force))
 
     def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
@@ -143,6 +168,8 @@ class EnergyField:
             "poses": samples.poses, "energies_j": samples.energies, "works_j": samples.works,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
             "rejected_poses": samples.rejected_poses,
+            "chart_base_m": self.chart.base, "chart_radius_m": np.array(self.chart.radius),
+            "chart_stretch": np.array(self.chart.stretch),
             "error_names": np.array(list(self.errors)),
             "error_values": np.array(list(self.errors.values())),
             "energy_error": np.array(self.errors["energy_error"]),
@@ -165,6 +192,8 @@ class EnergyField:
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["works_j"], arrays["forces_n"],
                 arrays["tips_m"], arrays["min_det_f"], arrays["rejected_poses"])
+            chart = Chart(arrays["chart_base_m"], float(arrays["chart_radius_m"]),
+                          float(arrays["chart_stretch"]))
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
                     for name in ("energy_fit", "work_fit", "shape_fit")]
             errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
@@ -173,12 +202,18 @@ class EnergyField:
             raise InputError(f"{path} is not an energy field ({error}).",
                              "It was not written by `limber energy`, or is damaged.",
                              "Run `limber energy` again with --force.") from error
-        return cls(samples, *fits, TrustRegion.of(samples.positions,
+        return cls(samples, chart, *fits, TrustRegion.of(samples.positions,
                                                   samples.rejected_poses[:, :3]), errors)
 
 
-def fit_field(samples: GraspSamples, *, seed: int = 0, progress: Progress = SILENT) -> EnergyField:
-    """Fit the field; kernel, smoothing and the use of forces are those of least held-out error.
+def fit_field(samples: GraspSamples, base: np.ndarray | None = None, *, seed: int = 0,
+              progress: Progress = SILENT) -> EnergyField:
+    """Fit the field; of ``CHOICES`` the one with the least held-out error.
+
+    Args:
+        samples: What the branch model says.
+        base: Where the branch is rooted [m]; None: no chart is tried.
+        seed: Of the folds.
 
     Raises:
         WorkError: too few samples, or they span no volume.
@@ -188,20 +223,21 @@ def fit_field(samples: GraspSamples, *, seed: int = 0, progress: Progress = SILE
         raise WorkError(f"Only {len(samples.poses)} grasp poses were accepted.",
                         f"A field in three coordinates needs at least {needed}.",
                         "Sample more poses, or a smaller deflection.")
+    choices = [choice for choice in CHOICES if base is not None or choice.stretch == 1.0]
+    base = np.zeros(3) if base is None else np.asarray(base, float)
     scores = []
-    for number, candidate in enumerate(CANDIDATES):
-        progress(number / len(CANDIDATES), "choosing the interpolation")
-        errors = held_out_errors(samples, candidate, folds=_FOLDS_TO_CHOOSE, seed=seed)
+    for number, choice in enumerate(choices):
+        progress(number / len(choices), "choosing the interpolation")
+        errors = held_out_errors(samples, choice, base, folds=_FOLDS_TO_CHOOSE, seed=seed)
         # Their product: mean errors speak for the stiff poses, medians for the gentle ones.
         scores.append(np.prod([errors[name] for name in _CHOSEN_BY]))
-    candidate = CANDIDATES[int(np.argmin(scores))]
-    errors = held_out_errors(samples, candidate, seed=seed)
-    region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3])
-    return EnergyField(samples, *_fits(samples, candidate), region, errors)
+    choice = choices[int(np.argmin(scores))]
+    return replace(_fitted(samples, choice, base),
+                   errors=held_out_errors(samples, choice, base, seed=seed))
 
 
-def held_out_errors(samples: GraspSamples, candidate: tuple, *, folds: int = _FOLDS_TO_REPORT,
-                    seed: int = 0) -> dict[str, float]:
+def held_out_errors(samples: GraspSamples, choice: FitChoice, base: np.ndarray, *,
+                    folds: int = _FOLDS_TO_REPORT, seed: int = 0) -> dict[str, float]:
     """Return errors on samples that the fit has not seen (``folds`` fits, each without a part).
 
     Only held-out samples inside the hull of the others count: the planner never goes outside.
@@ -209,26 +245,24 @@ def held_out_errors(samples: GraspSamples, candidate: tuple, *, folds: int = _FO
     Returns:
         ``energy_error`` and ``force_error``: root mean square error over root mean square of the
         branch model's values; ``energy_error_median`` and ``force_error_median``: median of
-        the error of each sample over its own value; ``held_out_count``.
+        the error of each sample over its own value; ``gentle_energy_error``: as the first, over
+        the half of the samples with the least energy, where gentle paths run; ``held_out_count``.
     """
     order = np.random.default_rng(seed).permutation(len(samples.poses))
     tested, energy, force = [], [], []
     for fold in range(folds):
         out = order[fold::folds]
         kept = np.setdiff1d(order, out)
-        inside = out[TrustRegion.of(samples.positions[kept],
-                                    np.empty((0, 3))).contains(samples.positions[out])]
-        if len(inside) == 0:
-            continue
-        energy_fit, work_fit = _fits(samples.take(kept), candidate)[:2]
+        field = _fitted(samples.take(kept), choice, base)
+        inside = out[field.region.contains(samples.positions[out])]
         tested.append(inside)
-        energy.append(np.maximum(energy_fit.value(samples.positions[inside])[:, 0], 0.0))
-        force.append(work_fit.gradient(samples.positions[inside])[:, :, 0])
-    if not tested:
+        energy.append(field.energy(samples.positions[inside]))
+        force.append(field.force(samples.positions[inside]))
+    index = np.concatenate(tested)
+    if len(index) == 0:
         raise WorkError(f"{len(samples.poses)} grasp poses are too few to hold any out.",
                         "Then the error of the energy field cannot be told.",
                         "Sample more poses.")
-    index = np.concatenate(tested)
     return error_measures(samples.take(index), np.concatenate(energy), np.concatenate(force))
 
 
@@ -240,28 +274,32 @@ def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
     force_off = np.linalg.norm(force - truth.forces, axis=1)
     size = np.linalg.norm(truth.forces, axis=1)
     felt = (wanted > 1e-3 * wanted.max()) & (size > 1e-3 * size.max())
+    gentle = wanted <= np.median(wanted)
     return {
         "energy_error": _rms(energy_off) / _rms(wanted),
         "force_error": _rms(force_off) / _rms(size),
         "energy_error_median": float(np.median(energy_off[felt] / wanted[felt])),
         "force_error_median": float(np.median(force_off[felt] / size[felt])),
+        "gentle_energy_error": _rms(energy_off[gentle]) / _rms(wanted[gentle]),
         "held_out_count": float(len(energy)),
     }
 
 
-def _fits(samples: GraspSamples, candidate: tuple) -> list[RadialInterpolant]:
-    kernel, shape, smoothing, with_forces = candidate
-    options = {"kernel": kernel, "shape": shape, "smoothing": smoothing}
-    work = RadialInterpolant.fit(samples.positions, samples.works,
-                                 samples.forces if with_forces else None, **options)
+def _fitted(samples: GraspSamples, choice: FitChoice, base: np.ndarray) -> EnergyField:
+    chart = Chart(base, float(np.linalg.norm(samples.positions[0] - base)), choice.stretch)
+    places = chart.map(samples.positions)
+    forces = chart.push_forward(samples.positions, samples.forces) if choice.with_forces else None
+    options = {"kernel": choice.kernel, "shape": choice.shape, "smoothing": _SMOOTHING}
+    work = RadialInterpolant.fit(places, samples.works, forces, **options)
     # The force is the gradient of work, not of energy; what gravity adds is smooth and is fitted
     # to values alone. Same centres and kernel: the weights add up, one loop evaluates the sum.
-    lifted = RadialInterpolant.fit(samples.positions, samples.energies - samples.works, **options)
+    lifted = RadialInterpolant.fit(places, samples.energies - samples.works, **options)
     energy = replace(work, value_weights=work.value_weights + lifted.value_weights,
                      polynomial=work.polynomial + lifted.polynomial)
-    shape_fit = RadialInterpolant.fit(
-        samples.positions, np.hstack([samples.poses[:, 3:], samples.tips]), **options)
-    return [energy, work, shape_fit]
+    shape = RadialInterpolant.fit(places, np.hstack([samples.poses[:, 3:], samples.tips]),
+                                  **options)
+    region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3])
+    return EnergyField(samples, chart, energy, work, shape, region, {})
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
@@ -275,7 +313,7 @@ def _rms(values: np.ndarray) -> float:
 @njit(cache=True)
 def energy_at(point, field):
     """Return the clamped energy [J] at ``point`` [3]."""
-    return max(value_at(point, 0, *field.energy), 0.0)
+    return max(value_at(mapped(point, *field.chart), 0, *field.energy), 0.0)
 
 
 @njit(cache=True)
@@ -288,5 +326,5 @@ def allowed_at(point, energy, field):
     if field.max_force == np.inf:
         return True
     slope = np.empty(len(point))
-    gradient_at(point, 0, *field.work, slope)
-    return np.sqrt(np.sum(slope * slope)) <= field.max_force
+    gradient_at(mapped(point, *field.chart), 0, *field.work, slope)
+    return pulled_back_size(point, slope, *field.chart) <= field.max_force

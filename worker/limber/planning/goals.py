@@ -64,7 +64,7 @@ class TipGoal:
         points = points[np.argsort(self.distance(field, points))[:count]]
         target = self.position + _ball(count, generator) * (0.9 * self.tolerance)
         for _ in range(8):
-            points = points + _damped_steps(field.shape_fit.gradient(points)[:, :, 3:],
+            points = points + _damped_steps(field.tip_gradient(points),
                                             target - field.tip(points))
         return points
 

@@ -25,6 +25,7 @@ from limber.mechanics import (
     solve_static,
 )
 from limber.mechanics.strain import strain_state
+from limber.store import Branch
 
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
 _SETTINGS = StaticSettings(min_step=1 / 64)
@@ -147,8 +148,8 @@ def acceptable(result: StaticResult) -> str:
     return "" if result.min_det_f > 0.0 else "inverted"
 
 
-def read_grasp_model(branch: Any, *, gravity: bool) -> GraspModel:
-    """Read mesh and skeleton of a branch folder.
+def read_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
+    """Read mesh and skeleton of a branch folder; ``gravity``: whether it bears its weight.
 
     Raises:
         BranchFolderError: a file is missing.

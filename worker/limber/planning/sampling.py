@@ -24,6 +24,10 @@ from limber.planning.grasp_model import GraspModel, Reach, acceptable, read_gras
 from limber.progress import SILENT, Progress
 from limber.store import Branch
 
+_LAYER = 0.06  # share of the reach
+_TAUT = 2.0  # times the median force
+_SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
+
 
 class EnergySettings(BaseModel):
     """How the energy field is sampled."""
@@ -60,26 +64,42 @@ def sample_positions(reach: Reach, rest: np.ndarray, count: int, *, deflection: 
     """Return ``count`` positions [m] to which the grasp may be taken, shape [count, 3].
 
     They lie within ``deflection`` times the arc length of ``rest``, above the base, and no
-    farther from it than the branch reaches.
+    farther from it than the branch reaches. Half of them lie in a layer just inside that reach:
+    there the branch bends without being pushed together or pulled taut, the energy is least and
+    changes fastest, and gentle paths run.
+
+    Raises:
+        WorkError: the grasp has hardly any room.
     """
     from scipy.stats import qmc
 
     radius = deflection * reach.arc_length
     taut = reach.chord + stretch * (reach.arc_length - reach.chord)
     taut = max(taut, float(np.linalg.norm(rest - reach.base)))
-    sequence = qmc.Sobol(3, seed=seed)
+    sequence = qmc.Sobol(4, seed=seed)
     found: list[np.ndarray] = []
     for _ in range(64):
-        points = rest + radius * (2.0 * sequence.random(512) - 1.0)
+        draw = sequence.random(512)
+        points = rest + radius * (2.0 * draw[:, :3] - 1.0)
+        arm = points[1::2] - reach.base
+        depth = 1.0 - _LAYER * draw[1::2, 3:]
+        points[1::2] = reach.base + arm * (
+            taut * depth / np.linalg.norm(arm, axis=1, keepdims=True))
         inside = np.linalg.norm(points - rest, axis=1) <= radius
         inside &= np.linalg.norm(points - reach.base, axis=1) <= taut
         inside &= points[:, 2] >= reach.base[2]
-        found.append(points[inside])
+        bulk, layer = points[::2][inside[::2]], points[1::2][inside[1::2]]
+        found.append(_alternating(bulk, layer))
         if sum(map(len, found)) >= count:
             return np.concatenate(found)[:count]
     raise WorkError("The grasp has nearly no room to move.",
                     f"Within {radius:.3f} m of rest the branch, {taut:.3f} m long, reaches little.",
                     "Grasp the branch farther out, or allow more --deflection or --stretch.")
+
+
+def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    shared = min(len(first), len(second))
+    return np.stack([first[:shared], second[:shared]], axis=1).reshape(-1, 3)
 
 
 def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int = 1,
@@ -113,25 +133,43 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
                 report: Callable[[int], None]) -> list[_Solved]:
-    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their names."""
+    """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their names.
+
+    A pose that cannot be reached from there is tried again at the end, from other sides.
+    """
     positions = [grasp_model.rest_position]
     states = [grasp_model.rest.displacement]
-    waiting = list(range(len(targets)))
     solved: list[_Solved] = []
+
+    def attempt(target: int, source: int) -> _Solved:
+        result = grasp_model.follow(targets[target][None], states[source])[0]
+        found = _Solved(
+            int(numbers[target]), grasp_model.pose(result.displacement),
+            grasp_model.energy(result), grasp_model.work(result), result.reaction_force,
+            grasp_model.tip(result.displacement), float(result.min_det_f), acceptable(result))
+        if not found.trouble:
+            positions.append(targets[target])
+            states.append(result.displacement)
+        return found
+
+    waiting, failed = list(range(len(targets))), []
     while waiting:
         gaps = np.linalg.norm(targets[waiting][:, None] - np.array(positions)[None], axis=2)
         place, source = np.unravel_index(np.argmin(gaps), gaps.shape)
         target = waiting.pop(int(place))
-        result = grasp_model.follow(targets[target][None], states[source])[0]
-        trouble = acceptable(result)
-        solved.append(_Solved(
-            int(numbers[target]), grasp_model.pose(result.displacement),
-            grasp_model.energy(result), grasp_model.work(result), result.reaction_force,
-            grasp_model.tip(result.displacement), float(result.min_det_f), trouble))
-        if not trouble:
-            positions.append(targets[target])
-            states.append(result.displacement)
-        report(len(solved))
+        found = attempt(target, int(source))
+        if found.trouble:
+            failed.append((target, int(source)))
+        else:
+            solved.append(found)
+        report(len(solved) + len(failed))
+    for target, tried in failed:
+        gaps = np.linalg.norm(np.array(positions) - targets[target], axis=1)
+        for source in [s for s in np.argsort(gaps)[:_SECOND_TRIES + 1] if s != tried]:
+            found = attempt(target, int(source))
+            if not found.trouble:
+                break
+        solved.append(found)
     return solved
 
 
@@ -198,19 +236,21 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, force: bool =
             deflection=settings.deflection, stretch=settings.stretch, seed=settings.seed)
         samples, reasons = sample_branch(grasp_model, targets, workers=settings.workers,
                                          progress=progress.part(0.02, 0.9))
-        field = fit_field(samples, seed=settings.seed, progress=progress.part(0.9, 1.0))
+        samples, taut_count = without_taut(samples)
+        field = fit_field(samples, grasp_model.reach.base, seed=settings.seed,
+                          progress=progress.part(0.9, 1.0))
         rejected = len(samples.rejected_poses)
         if rejected > 0.2 * settings.samples:
             warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); paths keep "
                  "away from them.")
         field.write(stage.path("energy.npz"), {
-            "rest_pose": samples.poses[0], "base_m": grasp_model.reach.base,
-            "arc_length_m": np.array(grasp_model.reach.arc_length)})
+            "rest_pose": samples.poses[0], "arc_length_m": np.array(grasp_model.reach.arc_length)})
         stage.result.update(
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
+            taut_count=taut_count,
             energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
             errors=field.errors, kernel=field.work_fit.kernel, shape=field.work_fit.shape,
-            smoothing=field.work_fit.smoothing,
+            chart_stretch=field.chart.stretch,
             fitted_to_forces=len(field.work_fit.gradient_weights) > 0,
             max_energy_j=float(samples.energies.max()),
             max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
@@ -219,12 +259,26 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, force: bool =
     return branch.manifest.stages["energy"].result
 
 
+def without_taut(samples: GraspSamples) -> tuple[GraspSamples, int]:
+    """Return the samples without those that pull the branch taut, and how many those were.
+
+    Bending a branch, even double, takes about the same force anywhere; pulled taut it takes many
+    times that within millimetres. Such a wall spoils the field around it, and no gentle path
+    goes there: poses over twice the median force stay out, and so out of the trusted region.
+    """
+    size = np.linalg.norm(samples.forces, axis=1)
+    slack = size <= _TAUT * np.median(size)
+    slack[0] = True
+    return samples.take(np.flatnonzero(slack)), int((~slack).sum())
+
+
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
-    """Return digests of what the field depends on: geometry, grasp and material."""
+    """Return digests of what the field depends on: geometry, grasp, material and gravity."""
     import hashlib
 
     mesh = grasp_model.mesh
     material = hashlib.sha256()
     for name in ("young", "poisson", "density"):
         material.update(np.ascontiguousarray(mesh.cell_data[name], float).tobytes())
-    return {"mesh geometry": mesh.geometry_digest(), "material": material.hexdigest()}
+    return {"mesh geometry": mesh.geometry_digest(), "material": material.hexdigest(),
+            "gravity": str(grasp_model.gravity)}
