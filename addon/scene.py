@@ -137,8 +137,8 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
 
 
 def _add_points(shown: ShownBranch, data: SceneData) -> None:
-    for name, title, share in (("control_points", "Control point", 0.011),
-                               ("grasp", "Grasp", 0.013)):
+    for name, title, share in (("control_points", "Control point", 0.013),
+                               ("grasp", "Grasp", 0.015)):
         points = data.arrays.get(name, np.empty((0, 3)))
         if len(points) == 0:
             continue

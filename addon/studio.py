@@ -34,9 +34,9 @@ def set_up_studio(scene: bpy.types.Scene, data: SceneData,
     scene.collection.children.link(collection)
     _set_rendering(scene, picture)
     _set_world(scene)
-    _add_ground(collection, data)
+    rim = _add_ground(collection, data)
     _add_lights(collection, data)
-    return _add_camera(scene, collection, data)
+    return _add_camera(scene, collection, data, np.vstack([data.arrays["view_points"], rim]))
 
 
 def _set_rendering(scene: bpy.types.Scene, picture: Picture) -> None:
@@ -73,14 +73,20 @@ def _set_world(scene: bpy.types.Scene) -> None:
     background.inputs["Strength"].default_value = 0.95
 
 
-def _add_ground(collection: bpy.types.Collection, data: SceneData) -> None:
+def _add_ground(collection: bpy.types.Collection, data: SceneData) -> np.ndarray:
+    """Add a round plate below the branch; returns points of its rim [m], shape [4, 3].
+
+    It takes the shadow, and no horizon crosses the branch.
+    """
     size = data.info["size_m"]
-    # A round plate: it takes the shadow, and no horizon crosses the branch.
-    plate = meshes.new_cylinder("Ground", 0.24 * size, 0.01 * size)
+    radius = 0.2 * size
+    plate = meshes.new_cylinder("Ground", radius, 0.01 * size)
     material = materials.plain_material("Ground", (0.36, 0.37, 0.36), roughness=0.9)
     thing = add_object(collection, "Ground", plate, material)
     middle = (data.info.get("base") or {}).get("centre_m", data.arrays["view_points"].mean(axis=0))
     thing.location = (middle[0], middle[1], data.info["ground_m"] - 0.035 * size)
+    across = radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    return np.array(thing.location) + across
 
 
 def _add_lights(collection: bpy.types.Collection, data: SceneData) -> None:
@@ -98,7 +104,7 @@ def _add_lights(collection: bpy.types.Collection, data: SceneData) -> None:
 
 
 def _add_camera(scene: bpy.types.Scene, collection: bpy.types.Collection,
-                data: SceneData) -> bpy.types.Object:
+                data: SceneData, seen: np.ndarray) -> bpy.types.Object:
     lens = bpy.data.cameras.new("Camera")
     camera = bpy.data.objects.new("Camera", lens)
     collection.objects.link(camera)
@@ -108,7 +114,7 @@ def _add_camera(scene: bpy.types.Scene, collection: bpy.types.Collection,
     lens.clip_start, lens.clip_end = 0.01 * data.info["size_m"], 100 * data.info["size_m"]
     camera.rotation_mode = "QUATERNION"
     camera.rotation_quaternion = Vector(data.arrays["view_direction"]).to_track_quat("-Z", "Y")
-    _fit(scene, camera, data.arrays["view_points"])
+    _fit(scene, camera, seen)
     return camera
 
 
@@ -123,7 +129,7 @@ def _fit(scene: bpy.types.Scene, camera: bpy.types.Object, points: np.ndarray) -
     render.resolution_x = width
     towards = camera.rotation_quaternion @ Vector((0.0, 0.0, -1.0))
     distance = (Vector(points.mean(axis=0)) - place).dot(towards)
-    camera.location = place - 0.10 * distance * towards
+    camera.location = place - 0.06 * distance * towards
     # The shift is in sensor heights (sensor_fit is VERTICAL).
     camera.data.shift_x = -LEGEND_SHARE / 2 * width / render.resolution_y
     bpy.context.view_layer.update()
