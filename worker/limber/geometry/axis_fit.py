@@ -174,6 +174,24 @@ def clamped(skeleton: Skeleton, low: float, high: float) -> Skeleton:
     return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
 
 
+def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
+    """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
+
+    A run is no thicker than its carrier where it starts, nor ``growth`` times its own median so
+    far: a bunch of twigs that the scan did not resolve would otherwise become a fat cylinder.
+    """
+    radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
+    for run, members in enumerate(skeleton.runs()):
+        own = members if run == 0 else members[1:]
+        cap = np.inf if run == 0 else radius[members[0]]
+        for place, node in enumerate(own):
+            if place >= 3:
+                cap = min(cap, growth * float(np.median(radius[own[:place]])))
+            if radius[node] > cap:
+                radius[node], state[node] = cap, CLAMPED
+    return replace(skeleton, radius=radius, radius_state=state)
+
+
 def median_radii(skeleton: Skeleton, points: np.ndarray, neighbours: int = 24) -> np.ndarray:
     """The paper's radii: median distance of the k nearest points to each node [m], shape [n]."""
     distance, _ = cKDTree(points).query(skeleton.nodes, k=min(neighbours, len(points)))

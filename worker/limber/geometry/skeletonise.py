@@ -8,7 +8,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
-from limber.geometry.axis_fit import attached, clamped, fit_axes, nearest_cylinders, resampled
+from limber.geometry.axis_fit import (
+    attached,
+    clamped,
+    fit_axes,
+    nearest_cylinders,
+    resampled,
+    tapered,
+)
 from limber.geometry.contraction import Contraction, contract
 from limber.geometry.curve_graph import CurveGraph, curve_graph, prune_spurs, rooted
 from limber.geometry.skeleton import Skeleton
@@ -97,7 +104,9 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     graph = curve_graph(points[thin], contraction.points, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal)
     _check_branch_like(points[thin], contraction, graph, diagonal)
-    first, pruned = _first_skeleton(graph, settings, root, up)
+    start = _root_node(graph, points[thin], contraction.points, root,
+                       np.array([0.0, 0.0, 1.0]) if up is None else up)
+    first, pruned = _first_skeleton(graph, settings, start)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
@@ -143,9 +152,8 @@ def thinned(points: np.ndarray, limit: int) -> np.ndarray:
     return np.sort(first)
 
 
-def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, root: np.ndarray | None,
-                    up: np.ndarray | None) -> tuple[Skeleton, int]:
-    start = _root_node(graph, root, np.array([0.0, 0.0, 1.0]) if up is None else up)
+def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, start: int,
+                    ) -> tuple[Skeleton, int]:
     parent = rooted(graph.nodes, graph.edges, start)
     keep, pruned = prune_spurs(graph.nodes, parent, graph.thickness, settings.prune)
     new_index = np.cumsum(keep) - 1
@@ -154,18 +162,24 @@ def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, root: np.ndar
     return Skeleton.from_edges(graph.nodes[keep], moved, radius), pruned
 
 
-def _root_node(graph: CurveGraph, root: np.ndarray | None, up: np.ndarray) -> int:
-    """The tip nearest to ``root``, or the tip of the thickest end; of several the lowest."""
+def _root_node(graph: CurveGraph, points: np.ndarray, contracted: np.ndarray,
+               root: np.ndarray | None, up: np.ndarray) -> int:
+    """The tip nearest to ``root``, or the tip of the thickest end; of several the lowest.
+
+    How thick an end is, its smallest extent tells: a leaf is wide, but flat.
+    """
     degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
     tips = np.flatnonzero(degree == 1)
     if root is not None:
         return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))])
-    around = cKDTree(graph.nodes)
-    reach = 0.08 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
-    thick = np.array([np.median(graph.thickness[around.query_ball_point(graph.nodes[tip], reach)])
-                      for tip in tips])
-    # Among ends of nearly the same thickness the lowest is the root.
-    candidates = tips[thick >= 0.75 * thick.max()]
+    tree = cKDTree(contracted)
+    reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
+    thick = np.zeros(len(tips))
+    for place, tip in enumerate(tips):
+        near = points[tree.query_ball_point(graph.nodes[tip], reach)]
+        if len(near) >= 4:
+            thick[place] = np.sqrt(max(np.linalg.eigvalsh(np.cov(near.T))[0], 0.0))
+    candidates = tips[thick >= 0.7 * thick.max()]
     return int(candidates[np.argmin(graph.nodes[candidates] @ up)])
 
 
@@ -178,7 +192,7 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, skeleton.radius, settings.prune)
     skeleton = resampled(clamped(skeleton.subset(keep), low, high), 1.0)
     fit = fit_axes(skeleton, points, progress=progress.part(0.5, 1.0))
-    return replace(fit, skeleton=clamped(fit.skeleton, low, high)), pruned
+    return replace(fit, skeleton=tapered(clamped(fit.skeleton, low, high))), pruned
 
 
 def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleton:
@@ -245,11 +259,11 @@ def _warnings(result: SkeletonResult, count: int) -> list[str]:
                      "away: too far from the rest to be bridged.")
     for loop in result.loops:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
-    far = float(np.mean(np.abs(result.residual) > np.maximum(
-        4 * result.noise, result.skeleton.radius[result.node_of_point])))
-    if far > 0.2:
-        texts.append(f"{100 * far:.0f} % of the points lie on no cylinder: foliage, flying "
-                     "pixels or a second plant? Trust the skeleton less there.")
+    misfit = float(np.mean(np.abs(result.residual) > np.maximum(
+        3 * result.noise, 0.4 * result.skeleton.radius[result.node_of_point])))
+    if misfit > 0.15:
+        texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
+                     "pixels or a second plant? Radii there mean little.")
     return texts
 
 

@@ -17,6 +17,7 @@ from limber.geometry.tetwild_process import run_tetwild
 from limber.progress import SILENT, Progress
 
 _CACHE_VERSION = 1
+_LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTetWild's time
 
 
 class MeshSettings(BaseModel):
@@ -77,7 +78,8 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
             if settings.mesher == "sweep":
                 raise
             warnings.append(f"{error.seen} fTetWild took over.")
-        if swept is not None and (settings.mesher == "sweep" or not swept.left_out):
+        if swept is not None and (settings.mesher == "sweep"
+                                  or _share(skeleton, swept.left_out) < _LEFT_OUT_LIMIT):
             return swept
     try:
         mesh, mesher = _wild(skeleton, settings, progress)
@@ -88,6 +90,14 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
         warnings.append(f"{error.seen} The sweep mesher took over.")
     swept = swept or _swept(skeleton, settings)
     return MeshResult(swept.mesh, "sweep", warnings + swept.warnings, swept.left_out)
+
+
+def _share(skeleton: Skeleton, runs: list[int]) -> float:
+    """Share of the skeleton's volume that the runs have."""
+    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[skeleton.parent], axis=1)
+    step[0] = 0.0
+    volume = skeleton.radius**2 * step
+    return float(volume[np.isin(skeleton.branch, runs)].sum() / volume.sum())
 
 
 def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:

@@ -14,7 +14,6 @@ from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.cylinder_mesh import split_wedges
-from limber.geometry.mesh_quality import radius_ratios
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.sweep import any_normal, frames, rings, tangents
 from limber.geometry.tet_mesh import TetMesh
@@ -142,31 +141,59 @@ class _TreeSweep:
                first_tangent: np.ndarray | None = None) -> bool:
         axis = self._axes[run]
         windows = self._plan_windows(run, start)
-        where = self._ring_places(axis, start, windows)
-        centres = axis.at(where)
-        # The flat end stands for a round one of the same volume.
-        tangent = tangents(centres)
-        centres[-1] += 2 / 3 * axis.radius[-1] * tangent[-1]
-        if first_tangent is not None:
-            tangent[0] = first_tangent
-        normals, binormals = frames(centres, tangent, first_normal)
-        ring = rings(centres, axis.radius_at(where), normals, binormals, sides)
-        nodes = np.concatenate([centres[:, None], ring], axis=1).reshape(-1, 3)
         first = self._node_count
-        mesh = TetMesh(nodes, split_wedges(_wedges(len(where), sides)))
+        where, mesh, centres = self._unfolded(axis, start, windows, sides, first_normal,
+                                              first_tangent)
+        nodes = mesh.nodes
         if mesh.volumes.min() <= 0:
             if run == 0:
                 raise MeshingError("The main axis bends more sharply than it is thick.",
                                    "Prisms swept along it would overlap.",
                                    "Smooth the skeleton, or choose --mesher ftetwild.")
             return False
-        slices = {window.run: int(np.argmin(np.abs(where - window.low))) for window in windows}
+        slices = {w.run: int(np.argmin(np.abs(where - w.low))) for w in windows
+                  if np.abs(where - w.low).min() < 1e-9}
         self._nodes.append(nodes)
         self._node_count += len(nodes)
         self._tets.append(mesh.tets + first)
         self._swept[run] = _Swept(axis, where, first + np.arange(len(where)) * (sides + 1), sides,
                                   centres, slices)
         return True
+
+    def _unfolded(self, axis: _Axis, start: float, windows: list["_Window"], sides: int,
+                  first_normal: np.ndarray | None, first_tangent: np.ndarray | None,
+                  ) -> tuple[np.ndarray, TetMesh, np.ndarray]:
+        """Rings along an axis whose prisms are not folded over, if that can be had.
+
+        Cross-sections cross in a sharp bend; with one fewer they may not. A twig's slice there
+        moves on along the axis, and after three moves is given up (taken from ``windows``).
+        """
+        moves = {window.run: 0 for window in windows}
+        where = self._ring_places(axis, start, windows)
+        for _ in range(4 * len(where) + 20):
+            mesh, centres = _tube_mesh(axis, where, sides, first_normal, first_tangent)
+            wrong = np.unique(np.flatnonzero(mesh.volumes <= 0) // (3 * sides))
+            if not len(wrong):
+                break
+            low, high = where[wrong[0]], where[wrong[0] + 1]
+            touching = [w for w in windows if w.low < high + 1e-9 and w.high > low - 1e-9]
+            edges = [v for w in windows for v in (w.low, w.high)] + [start, axis.length]
+            loose = [r for r in (wrong[0], wrong[0] + 1)
+                     if min(abs(where[r] - v) for v in edges) > 1e-9]
+            if loose:
+                where = np.delete(where, loose[-1])
+            elif touching:
+                window = touching[0]
+                windows.remove(window)
+                moves[window.run] += 1
+                length = window.high - window.low
+                if moves[window.run] <= 3 and window.high + length < axis.length:
+                    windows.append(_Window(window.run, window.low + length,
+                                           window.high + length, window.outward))
+                where = self._ring_places(axis, start, windows)
+            else:
+                break
+        return where, mesh, centres
 
     def _plan_windows(self, run: int, start: float) -> list[_Window]:
         """Where along this run its twigs grow out, without overlap in one place."""
@@ -220,7 +247,8 @@ class _TreeSweep:
         places = [start]
         for low, high in itertools.pairwise(marks):
             size = self._spacing * float(axis.radius_at((low + high) / 2))
-            count = 1 if (low, high) in inside else max(round((high - low) / size), 1)
+            within = any(a <= low + 1e-9 and high <= b + 1e-9 for a, b in inside)
+            count = 1 if within else max(round((high - low) / size), 1)
             places += list(np.linspace(low, high, count + 1)[1:])
         if len(places) < 3:
             places = list(np.linspace(start, axis.length, 3))
@@ -318,6 +346,21 @@ class _Joint:
     quality: float
 
 
+def _tube_mesh(axis: _Axis, where: np.ndarray, sides: int, first_normal: np.ndarray | None,
+               first_tangent: np.ndarray | None) -> tuple[TetMesh, np.ndarray]:
+    """Tetrahedra of a tube with rings at places ``where``, and the rings' centres."""
+    centres = axis.at(where)
+    tangent = tangents(centres)
+    # The flat end stands for a round one of the same volume.
+    centres[-1] += 2 / 3 * axis.radius[-1] * tangent[-1]
+    if first_tangent is not None:
+        tangent[0] = first_tangent
+    normals, binormals = frames(centres, tangent, first_normal)
+    ring = rings(centres, axis.radius_at(where), normals, binormals, sides)
+    nodes = np.concatenate([centres[:, None], ring], axis=1).reshape(-1, 3)
+    return TetMesh(nodes, split_wedges(_wedges(len(where), sides))), centres
+
+
 def _wedges(ring_count: int, sides: int) -> np.ndarray:
     k = np.arange(sides)
     a, b = 1 + k, 1 + (k + 1) % sides
@@ -352,19 +395,29 @@ def _block(known: np.ndarray, loop: np.ndarray, triangles: np.ndarray, centre: n
     The ring's centre and corners are numbered -1, -2, ...; an inverted tetrahedron gives -1 as
     the quality.
     """
-    nodes = np.vstack([known, ring[::-1], centre[None]])  # so that -1 is the centre
+    nodes = np.vstack([known[loop], centre[None], ring])
     sides = len(ring)
-    tets = [[*triangle, -1] for triangle in triangles]
-    for k in range(sides):
-        after = (k + 1) % sides
-        a, b, top_a, top_b = loop[k], loop[after], -2 - k, -2 - after
-        cuts = ([[b, a, top_b, -1], [top_b, a, top_a, -1]],
-                [[b, a, top_a, -1], [top_b, b, top_a, -1]])
-        tets += max(cuts, key=lambda cut: _worst(nodes, np.array(cut)))
-    block = np.array(tets)
-    return block, _worst(nodes, block)
+    local = np.searchsorted(loop, triangles, sorter=np.argsort(loop))
+    local = np.argsort(loop)[local]
+    k = np.arange(sides)
+    after, top = (k + 1) % sides, sides
+    a, b, top_a, top_b = k, after, sides + 1 + k, sides + 1 + after
+    hub = np.full(sides, top)
+    # Each side quadrilateral lies on the surface, so either diagonal will do.
+    one = np.stack([[b, a, top_b, hub], [top_b, a, top_a, hub]], axis=0).transpose(2, 0, 1)
+    two = np.stack([[b, a, top_a, hub], [top_b, b, top_a, hub]], axis=0).transpose(2, 0, 1)
+    shape_one, shape_two = (_shapes(nodes, cut).min(axis=1) for cut in (one, two))
+    sidewise = np.where((shape_one >= shape_two)[:, None, None], one, two).reshape(-1, 4)
+    below = np.column_stack([local, np.full(len(local), top)])
+    block = np.vstack([below, sidewise])
+    numbers = np.concatenate([loop, -1 - np.arange(sides + 1)])
+    return numbers[block], float(_shapes(nodes, block).min())
 
 
-def _worst(nodes: np.ndarray, tets: np.ndarray) -> float:
-    mesh = TetMesh(nodes, tets)
-    return -1.0 if mesh.volumes.min() <= 0 else float(radius_ratios(mesh).min())
+def _shapes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    """Volume over the cube of the mean edge, 1 for a regular tetrahedron, negative if inverted."""
+    corner = nodes[tets]
+    edges = [corner[..., i, :] - corner[..., j, :] for i in range(4) for j in range(i)]
+    square = sum(np.einsum("...k,...k->...", e, e) for e in edges) / 6
+    volume = np.linalg.det(corner[..., 1:, :] - corner[..., :1, :]) / 6
+    return 6 * np.sqrt(2) * volume / np.maximum(square, 1e-300)**1.5

@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.surface import Surface
+from limber.geometry.surface_checks import crossings
 from limber.geometry.sweep import frames, polygon_factor, resample, rings, tangents
 
 
@@ -33,27 +35,66 @@ def branch_surface(skeleton: Skeleton, *, sides: int = 12, spacing: float = 1.5)
     Raises:
         MeshingError: the union is empty or in several pieces.
     """
+    tubes = {run: tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
+    in_pieces: set[int] = set()
+    for _ in range(4):
+        surface = _union(tubes, in_pieces, sides, 0.02 * float(skeleton.radius.min()))
+        places = crossings(surface)
+        more = _runs_near(tubes, places) - in_pieces
+        if not more:
+            return surface
+        # A tube that loops through itself is no solid, whatever the union makes of it: convex
+        # pieces from one cross-section to the next always are.
+        in_pieces |= more
+    return surface
+
+
+def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: int, tolerance: float,
+           ) -> Surface:
     import manifold3d
 
     solids = []
-    for run in range(skeleton.branch_count):
-        for tube in tubes_of_run(skeleton, run, spacing):
-            solids.append(_solid(*tube_triangles(tube, sides)))
+    for run, parts in tubes.items():
+        for tube in parts:
+            vertices, faces = tube_triangles(tube, sides)
+            solids += _pieces(tube, vertices, sides) if run in in_pieces else [
+                _solid(vertices, faces)]
     joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    smallest = float(skeleton.radius.min())
     # Where tubes cross, the union leaves slivers far below any size that matters.
-    joined = joined.simplify(0.02 * smallest)
+    joined = joined.simplify(tolerance)
     pieces = joined.decompose()
     if not pieces:
         raise MeshingError("The union of the cylinders is empty.", "Radii may be zero.",
                            "Look at the skeleton's radii.")
     if len(pieces) > 1:
         # A cavity between crossing twigs comes out as a piece of negative volume: it is filled.
-        outer = [piece for piece in pieces if piece.volume() > 0]
-        joined = max(outer, key=lambda piece: piece.volume())
+        joined = max(pieces, key=lambda piece: piece.volume())
     mesh = joined.to_mesh64()
-    vertices = np.asarray(mesh.vert_properties, float)[:, :3]
-    return Surface(vertices, np.asarray(mesh.tri_verts, np.int64))
+    vertices = np.array(mesh.vert_properties, float)[:, :3].copy()
+    return Surface(vertices, np.array(mesh.tri_verts, np.int64))
+
+
+def _pieces(tube: Tube, vertices: np.ndarray, sides: int) -> list:
+    import manifold3d
+
+    ring_count = (len(vertices) - 2) // sides
+    ring = vertices[:-2].reshape(ring_count, sides, 3)
+    ends = len(tube.centres) - 1
+    hulls = [np.vstack([ring[i], ring[i + 1]]) for i in range(ends - 1)]
+    hulls.append(np.vstack([ring[ends - 1:].reshape(-1, 3), vertices[-1:]]))
+    return [manifold3d.Manifold.hull_points(np.ascontiguousarray(hull)) for hull in hulls]
+
+
+def _runs_near(tubes: dict[int, list[Tube]], places: np.ndarray) -> set[int]:
+    if len(places) == 0:
+        return set()
+    near = set()
+    for run, parts in tubes.items():
+        for tube in parts:
+            distance, _ = cKDTree(places).query(tube.centres)
+            if (distance < 3 * tube.radius).any():
+                near.add(run)
+    return near
 
 
 def tubes_of_run(skeleton: Skeleton, run: int, spacing: float) -> list[Tube]:
