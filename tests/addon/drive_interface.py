@@ -2,7 +2,7 @@
 
     blender --enable-event-simulate --python drive_interface.py -- FOLDER
 
-FOLDER has scan.xyz, slow_worker and beam.branch; log.json is written there. A step is a function
+FOLDER has scan.ply, slow_worker and beam.branch; log.json is written there. A step is a function
 that returns True when it is done; a timer calls the current one. A picture is asked for by a file
 NAME.request, and has been taken when that file is gone.
 """
@@ -55,7 +55,7 @@ def open_tab():
     sidebar.active_panel_category = "Limber"
     area.tag_redraw()
     seen["category"] = sidebar.active_panel_category
-    bpy.context.scene.limber.cloud_path = str(FOLDER / "scan.xyz")
+    bpy.context.scene.limber.cloud_path = str(FOLDER / "scan.ply")
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
     return True
@@ -109,6 +109,14 @@ def imported():
     return True
 
 
+def reconstructed():
+    """The worker has made a branch folder of the scan, and its result was opened by itself."""
+    if "scan" not in bpy.data.collections:
+        return False
+    seen["reconstructed_faces"] = len(bpy.data.collections["scan"].objects["scan"].data.polygons)
+    return True
+
+
 def start_slow_job():
     bpy.context.preferences.addons[KEY].preferences.python_path = str(FOLDER / "slow_worker")
     with override():
@@ -136,10 +144,9 @@ def open_result():
 
 
 def opened():
-    names = [collection.name for collection in bpy.context.scene.collection.children
-             if "limber_folder" in collection]
-    seen["opened"] = names
-    return bool(names)
+    seen["opened"] = [collection.name for collection in bpy.context.scene.collection.children
+                      if "limber_folder" in collection]
+    return "beam" in seen["opened"]
 
 
 def play():
@@ -156,7 +163,7 @@ def played():
     return bpy.context.scene.frame_current > 1
 
 
-STEPS = [open_sidebar, open_tab, picture("tab"), click(100), imported,
+STEPS = [open_sidebar, open_tab, picture("tab"), click(100), imported, click(188), reconstructed,
          start_slow_job, slow_job_reports, picture("job"), click(124), job_cancelled,
          open_result, opened, picture("opened"), play, played, picture("playing")]
 

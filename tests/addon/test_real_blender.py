@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from limber.geometry.generated import generate_branch
+
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
 FOLDER = Path(__file__).parent
@@ -104,13 +106,14 @@ def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
 
 
 def test_interface(run, blender, environment, beam, tmp_path):
-    """In a window, by events: the tab opens, a scan is imported, a job cancelled, a result opened
-    by the worker beside the interface, and played."""
+    """In a window, by events: the tab opens, a scan is imported and reconstructed by clicks, a job
+    cancelled by a click, a result opened, all by the worker beside the interface, and played."""
     missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
     if missing:
         pytest.skip(f"NO {' AND '.join(missing)}: scripts/provision_blender --gui-test brings it")
-    scan, slow = tmp_path / "scan.xyz", tmp_path / "slow_worker"
-    scan.write_text("".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in beam.surface))
+    scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud
+    scan.write_ply(tmp_path / "scan.ply")
+    slow = tmp_path / "slow_worker"
     slow.write_text("#!/bin/sh\necho '{\"progress\": 0.4, \"message\": \"slowly\"}'\n"
                     "exec sleep 100\n")
     slow.chmod(0o755)
@@ -128,10 +131,12 @@ def test_interface(run, blender, environment, beam, tmp_path):
     seen = json.loads((tmp_path / "log.json").read_text())
     assert seen["error"] is None, seen
     assert seen["category"] == "Limber"
-    assert seen["imported_points"] == len(beam.surface)
+    assert seen["imported_points"] == len(scan.points)
+    assert seen["reconstructed_faces"] > 50
+    assert (tmp_path / "scan.branch" / "mesh.vtu").is_file()
     assert seen["progress_seen"] == 0.4
     assert seen["cancelled"] == "cancelled"
-    assert seen["opened"] == ["beam"]
+    assert seen["opened"] == ["scan", "beam"]
     assert seen["playing"] is True
     assert 1 < seen["frame_after_play"] <= len(beam.frames)
     for name in ("tab", "job", "opened", "playing"):
