@@ -6,11 +6,13 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from .bridge import animation, curves, materials, meshes
 from .scene_data import SceneData
 
 FOLDER_KEY = "limber_folder"
+SCAN_KEY = "limber_scan_sha256"
 NAME_KEY = "limber_name"
 INFO_KEY = "limber_info"
 ENERGY_KEY = "limber_energy_j"
@@ -64,6 +66,13 @@ def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
         if FOLDER_KEY in collection:
             return next((thing for thing in collection.objects if INFO_KEY in thing), None)
     return None
+
+
+def place_scans(scene: bpy.types.Scene, data: SceneData) -> None:
+    """Put imported scans to where the branch made of them is: it was set upright and to 0."""
+    for thing in scene.objects:
+        if thing.get(SCAN_KEY) == data.info["source"].get("sha256", ""):
+            thing.matrix_world = Matrix(data.info["alignment"])
 
 
 def color_by(surface: bpy.types.Object, name: str) -> None:

@@ -9,7 +9,7 @@ import pytest
 from limber.errors import BranchFolderError
 from limber.geometry.cylinder_mesh import straight_beam
 from limber.scene_data import at_nodes, scene_data
-from limber.store import Branch
+from limber.store import Alignment, Branch
 
 
 @pytest.fixture()
@@ -48,6 +48,19 @@ def test_vertices_are_in_the_order_of_the_frames(tmp_path, mesh):
     corner = vertices[faces]
     volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])).sum() / 6
     assert volume == pytest.approx(mesh.linear().volumes.sum(), rel=1e-9)
+
+
+def test_alignment_takes_the_scan_to_the_branch(tmp_path, mesh):
+    """The matrix does what the folder's alignment does."""
+    branch = Branch.create(tmp_path / "a.branch")
+    turn = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    with branch.stage("reconstruct") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+        stage.manifest.alignment = Alignment(scale=0.001, origin=(1.0, 2.0, 3.0), rotation=turn)
+    matrix = scene_data(branch).info["alignment"]
+    points = np.random.default_rng(2).random((5, 3)) * 4000
+    moved = np.column_stack([points, np.ones(5)]) @ matrix.T
+    np.testing.assert_allclose(moved[:, :3], branch.manifest.alignment.apply(points), atol=1e-9)
 
 
 def test_values_at_nodes_keep_constants_and_integrals(mesh):

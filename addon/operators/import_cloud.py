@@ -1,12 +1,13 @@
 """Import a scan, to look at it."""
 
+import hashlib
 from pathlib import Path
 
 import bpy
 
 from .. import clouds
 from ..bridge import meshes
-from ..scene import add_object
+from ..scene import SCAN_KEY, add_object
 from .viewing import look_at
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -38,6 +39,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         cloud = add_object(context.scene.collection, f"{path.stem} scan", mesh)
+        cloud[SCAN_KEY] = hashlib.sha256(path.read_bytes()).hexdigest()
         cloud.scale = [_METRES[settings.cloud_unit]] * 3
         settings.cloud_path = str(path)
         if not settings.branch_folder:

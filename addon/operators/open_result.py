@@ -35,6 +35,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         with self._temporary:
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
+        scene.place_scans(context.scene, data)
         look_at(context, shown.surface)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")
 

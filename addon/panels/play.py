@@ -1,6 +1,7 @@
 """Step 4: the motion along the path, with its energy."""
 
 import bpy
+from bpy.app.handlers import persistent
 
 from .. import scene
 from ..bridge import animation
@@ -29,9 +30,20 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
             self.layout.label(text=f"Energy {1000 * energies[number]:.3g} mJ")
 
 
+@persistent
+def _redraw_sidebars(*_) -> None:
+    """Keep frame and energy right while playing: Blender redraws the view alone."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                next(region for region in area.regions if region.type == "UI").tag_redraw()
+
+
 def register() -> None:
     bpy.utils.register_class(LIMBER_PT_play)
+    bpy.app.handlers.frame_change_post.append(_redraw_sidebars)
 
 
 def unregister() -> None:
+    bpy.app.handlers.frame_change_post.remove(_redraw_sidebars)
     bpy.utils.unregister_class(LIMBER_PT_play)

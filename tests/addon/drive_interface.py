@@ -113,6 +113,10 @@ def reconstructed():
     """The worker has made a branch folder of the scan, and its result was opened by itself."""
     if "scan" not in bpy.data.collections:
         return False
+    cloud, surface = bpy.data.objects["scan scan"], bpy.data.collections["scan"].objects["scan"]
+    seen["scan_beside_branch"] = max(
+        (surface.closest_point_on_mesh(at)[1] - at).length
+        for at in (cloud.matrix_world @ vertex.co for vertex in cloud.data.vertices))
     seen["reconstructed_faces"] = len(bpy.data.collections["scan"].objects["scan"].data.polygons)
     return True
 

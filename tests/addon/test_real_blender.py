@@ -134,6 +134,7 @@ def test_interface(run, blender, environment, beam, tmp_path):
     assert seen["imported_points"] == len(scan.points)
     assert seen["reconstructed_faces"] > 50
     assert (tmp_path / "scan.branch" / "mesh.vtu").is_file()
+    assert seen["scan_beside_branch"] < 0.01, "the scan lies on the branch made of it"
     assert seen["progress_seen"] == 0.4
     assert seen["cancelled"] == "cancelled"
     assert seen["opened"] == ["scan", "beam"]

@@ -66,6 +66,7 @@ def scene_data(branch: Branch, plan: str | None = None) -> SceneData:
     data = SceneData({"vertices": mesh.nodes[used], "faces": compact.reshape(-1, 3)})
     data.info = {"format": FORMAT, "name": branch.name, "folder": str(branch.folder.resolve()),
                  "unit": "m", "scalars": {}, "paths": {}, "notes": [_size_note(branch, mesh)]}
+    data.info |= {"source": branch.manifest.source, "alignment": _alignment(branch)}
     _add_scalars(data, mesh, used)
     _add_markers(data, mesh, used)
     plan = _add_plan(data, branch, plan)
@@ -80,6 +81,15 @@ def _size_note(branch: Branch, mesh: TetMesh) -> str:
     length = (entry.result if entry else {}).get("length_m")
     extent = f"{length:.2f} m of centreline" if length else f"{np.ptp(mesh.nodes[:, 2]):.2f} m high"
     return f"{extent}, {mesh.tet_count} tetrahedra"
+
+
+def _alignment(branch: Branch) -> np.ndarray:
+    """Return the 4x4 matrix that takes points of the scan's file to the branch's frame [m]."""
+    place = branch.manifest.alignment
+    matrix = np.eye(4)
+    matrix[:3, 3] = place.apply(np.zeros((1, 3)))[0]
+    matrix[:3, :3] = (place.apply(np.eye(3)) - matrix[:3, 3]).T
+    return matrix
 
 
 def _add_scalars(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
