@@ -141,6 +141,12 @@ def job_cancelled():
     return True
 
 
+def slow_job_left_running():
+    """Blender is closed while the worker works."""
+    seen["left_running"] = jobs().current().pid
+    return jobs().current().fraction > 0
+
+
 def open_result():
     with override():
         bpy.ops.limber.open_result("INVOKE_DEFAULT", directory=str(FOLDER / "beam.branch"))
@@ -169,7 +175,8 @@ def played():
 
 STEPS = [open_sidebar, open_tab, picture("tab"), click(100), imported, click(188), reconstructed,
          start_slow_job, slow_job_reports, picture("job"), click(124), job_cancelled,
-         open_result, opened, picture("opened"), play, played, picture("playing")]
+         open_result, opened, picture("opened"), play, played, picture("playing"),
+         start_slow_job, slow_job_left_running]
 
 
 def run():

@@ -140,6 +140,7 @@ def test_interface(run, blender, environment, beam, tmp_path):
     assert seen["opened"] == ["scan", "beam"]
     assert seen["playing"] is True
     assert 1 < seen["frame_after_play"] <= len(beam.frames)
+    assert not Path(f"/proc/{seen['left_running']}").exists(), "closing Blender ends the worker"
     for name in ("tab", "job", "opened", "playing"):
         assert _colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
 
