@@ -13,8 +13,9 @@ from limber.estimation.parameters import Values
 from limber.estimation.points import point_operator
 from limber.estimation.recording import PullEntry
 from limber.mechanics.factor import NotPositiveDefiniteError
-from limber.mechanics.materials import RayleighDamping, lame, lame_by_poisson
+from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
+from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics import StaticResult, StaticSettings, solve_static
 
 SETTINGS = StaticSettings(tolerance=1e-6)
@@ -110,11 +111,12 @@ class QuasiStaticForward:
             if result is None:
                 return None
             before = result.displacement
-            slope = None
+            # An old derivative still foretells most of a small change.
+            slope = None if self._memory[key] is None else self._memory[key].slope
             points[key] = self.rest_points + self._observed(before)
             forces[key] = result.reaction_force if self.drive == "pose" else drive
             if sensitivities:
-                slope, d_forces[key] = self._slopes(model, values, extra, before)
+                slope, d_forces[key] = self._slopes(model, values, extra, result)
                 for column in range(count):
                     d_points[key, ..., column] = self._observed(slope[..., column])
             states.append(_Memory(before, slope))
@@ -173,48 +175,12 @@ class QuasiStaticForward:
         return None
 
     def _slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
-                displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of displacement [n, 3, p] and reaction [3, p], by implicit differentiation.
-
-        The equilibrium f(u, p) = g(p) gives K du = dg/dp - df/dp; K is factorised once, each
-        parameter costs a solve.
-        """
-        held = (self.grasp,) if self.drive == "pose" else ()
-        equations = model.equations(held)
-        equations.assemble(model, displacement, displacement)
-        equations.factorise()
-        slopes, reactions = [], []
-        for unbalanced in self._unbalanced(model, values, extra, displacement):
-            slope = equations.solve(-unbalanced)
-            out = model.tangent_times(displacement, slope) + unbalanced
-            slopes.append(slope)
-            nodes, weights = self.grasp.nodes, self.grasp.weights
-            if self.drive == "force":
-                reactions.append(np.zeros(3))
-            elif self.grasp.mode == "pinned":
-                reactions.append(weights @ out[nodes] / (weights @ weights))
-            else:
-                reactions.append(out[nodes].sum(axis=0))
-        return np.stack(slopes, axis=-1), np.stack(reactions, axis=-1)
-
-    def _unbalanced(self, model: BranchModel, values: Values, extra: tuple[str, ...],
-                    displacement: np.ndarray) -> list[np.ndarray]:
-        """Derivative of internal force less load to each parameter at fixed displacement."""
-        found = []
-        for column, young in zip(self.weights.T, values.young, strict=True):
-            pair = lame(column * young, model.poisson)
-            found.append(model.internal(displacement, lame_pair=pair).force)
-        for name in extra:
-            if name == "poisson":
-                pair = lame_by_poisson(model.young, model.poisson)
-                found.append(model.internal(displacement, lame_pair=pair).force)
-            elif name == "density":
-                found.append(-model.weight_force)
-            else:
-                raise InputError(f"{name} was asked for from a quasi-static pull.",
-                                 "Damping does nothing in equilibrium.",
-                                 "Use --motion dynamic, or leave it fixed.")
-        return found
+                result: StaticResult) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of displacement [n, 3, p] and reaction [3, p]."""
+        found = static_sensitivities(
+            model, result, self.grasp, self.weights, mechanics_names(extra),
+            is_held=self.drive == "pose", control_young=values.young)
+        return found.displacement, found.reaction_force
 
     def _at_all_frames(self, points: np.ndarray, forces: np.ndarray, d_points: np.ndarray | None,
                        d_forces: np.ndarray | None) -> Simulated:
@@ -225,8 +191,9 @@ class QuasiStaticForward:
                          None if d_forces is None else spread(d_forces))
 
 
-def with_drive(entry: PullEntry, drive: str | None) -> PullEntry:
-    """Return the pull's settings with another drive, where one is given."""
-    return entry if drive is None else entry.model_copy(update={"drive": drive})
-
+def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what :mod:`limber.mechanics.sensitivities` calls the parameters."""
+    names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
+             "beta": "damping_stiffness"}
+    return ("log_young", *(names[name] for name in extra))
 

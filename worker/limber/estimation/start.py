@@ -30,9 +30,15 @@ def _force_ratio(forward: Forward, values: Values) -> float | None:
         return None
     measured = forward.frames.wrenches[:, :3]
     known = np.isfinite(measured).all(axis=1)
-    across = float(np.sum(measured[known] * simulated.forces[known]))
-    own = float(np.sum(simulated.forces[known]**2))
-    return across / own if own > 0 and across > 0 else None
+    # A uniform branch would not go where this one went: far out it is stretched, and its force
+    # says nothing. Near rest both only bend.
+    travel = np.linalg.norm(forward.frames.poses[:, :3] - forward.frames.poses[0, :3], axis=1)
+    near = known & (travel > 0.05 * travel.max()) & (travel < 0.4 * travel.max())
+    chosen = near if near.sum() >= 3 else known
+    # Along the measured force: what stretches points across it.
+    own = float(np.sum(measured[chosen]**2))
+    across = float(np.sum(measured[chosen] * simulated.forces[chosen]))
+    return own / across if own > 0 and across > 0 else None
 
 
 def _scanned(objective: Objective, values: Values) -> Values:

@@ -116,7 +116,11 @@ def spikes(values: np.ndarray, half_window: int = 3, threshold: float = 8.0) -> 
     # moves has none to show.
     typical = MAD_TO_SIGMA * np.median(residual[np.any(residual > 0, axis=1)]
                                        if np.any(residual) else residual)
-    return np.any(residual > threshold * typical + 1e-3 * np.abs(values).max(), axis=1)
+    far = residual > threshold * typical + 1e-3 * np.abs(values).max()
+    # A spike bends the line of its neighbours, which then look off as well, by less.
+    around = np.pad(residual, ((half_window, half_window), (0, 0)))
+    largest = np.lib.stride_tricks.sliding_window_view(around, width, axis=0).max(axis=2)
+    return np.any(far & (residual > 0.5 * largest), axis=1)
 
 
 def saturated(values: np.ndarray, run_length: int = 4) -> np.ndarray:

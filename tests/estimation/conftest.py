@@ -1,0 +1,52 @@
+"""A small branch, its true copy on a finer mesh, and an exact pull of it."""
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import Bench, PaperBranch, exact_pull
+from limber.estimation.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+)
+
+
+@pytest.fixture(scope="session")
+def small() -> PaperBranch:
+    """Short and thick: few tetrahedra; E falls by a factor of 4 along it."""
+    return PaperBranch("small", (40e6, 25e6, 16e6, 10e6), 0.36, 0.35, (0.012, 0.009), 0.4)
+
+
+@pytest.fixture(scope="session")
+def small_pull(small) -> Pull:
+    """16 frames, without noise."""
+    return exact_pull(small, 0, frames=16)
+
+
+@pytest.fixture(scope="session")
+def small_bench(small) -> Bench:
+    return Bench(small, slice_length=2.0)
+
+
+@pytest.fixture
+def plain_pull() -> Pull:
+    """A recording made by hand: a spring of 50 N/m pulled out 0.1 m, two markers that follow."""
+    times = np.linspace(0.0, 4.0, 201)
+    eased = np.clip((times - 0.4) / 3.0, 0.0, 1.0)
+    way = 0.1 * eased**2 * (3 - 2 * eased)
+    poses = np.zeros((201, 6))
+    poses[:, 0], poses[:, 2] = way, 0.5
+    rng = np.random.default_rng(0)
+    wrenches = np.zeros((201, 6))
+    wrenches[:, 0] = 50.0 * way
+    wrenches[:, :3] += 0.02 * rng.standard_normal((201, 3))
+    seen = np.linspace(0.2, 3.8, 60)
+    moved = np.interp(seen, times, way)
+    positions = np.zeros((60, 2, 3))
+    positions[:, 0, 0], positions[:, 0, 2] = 0.3 * moved, 0.2
+    positions[:, 1, 0], positions[:, 1, 2] = 0.7 * moved, 0.35
+    entry = PullEntry(grasp=GraspEntry(point_m=(0.0, 0.0, 0.5), radius_m=0.01),
+                      sensor=SensorEntry(force_sigma_n=0.02))
+    return Pull("spring", entry, times, poses, wrenches, Observations(seen, positions))
