@@ -50,6 +50,7 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     scene_data = importlib.import_module("limber_addon.scene_data")
     data = scene_data.read_scene_data(data_path)
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.preferences.filepaths.save_version = 0
     # Saved before it is filled: from then on paths are kept relative to it.
     bpy.ops.wm.save_as_mainfile(filepath=str(scene_path), compress=True)
     scene = bpy.context.scene

@@ -179,6 +179,8 @@ def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
     assert call(["scene", str(beam.folder), "-o", str(tmp_path / "scene.blend")]) == 3
     assert "LIMBER_BLENDER" in capsys.readouterr().err
     assert call(["scene", str(beam.folder)]) == 2
+    (tmp_path / "file").write_text("")
+    assert call(["scene", str(beam.folder), "-o", str(tmp_path / "file" / "x.blend")]) == 2
 
 
 def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):

@@ -36,7 +36,11 @@ _SCRIPT = Path(__file__).parents[3] / "addon" / "make_scene.py"
               help="Write only what a scene shows, as arrays (.npz): what the add-on opens.")
 def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | None,
             width: int, color: str, plan: str | None, data_path: Path | None) -> dict[str, Any]:
-    """A Blender scene with the branch, its motion and paths (needs bpy or Blender)."""
+    """A Blender scene with the branch, its motion and paths (needs bpy or Blender).
+
+    Files made by the bpy package (5.0) open in Blender 4.5 and newer. To have one made by another
+    Blender, 4.2 or newer, name that in LIMBER_SCENE_BLENDER.
+    """
     from limber.scene_data import scene_data
 
     if (output is None) == (data_path is None):
@@ -65,10 +69,11 @@ def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | 
 def _writable(path: Path) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            return path.resolve()
     except OSError as error:
-        raise InputError(f"{path.parent} cannot be made ({error.strerror}).",
+        raise InputError(f"{path.parent} cannot be written to ({error.strerror}).",
                          "The result goes there.", "Choose another place.") from error
-    return path.resolve()
 
 
 def _make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
