@@ -5,14 +5,15 @@ follows from the Green-Lagrange strain E = (H + H^T + H^T H) / 2, and the force 
 the integral of F S grad N_a.
 
 Shared arguments:
-    displacement, other: Node displacements [m], and a second nodal field, shape [node_count, 3]:
-        the last increment or the velocity, as the factors below say.
+    displacement: Node displacements [m], shape [node_count, 3].
     gradients, weights: From limber.mechanics.elements, [tet_count, q, 3, n] and [tet_count, q].
     lame_lambda, lame_mu: Lamé coefficients [Pa], shape [tet_count].
     tets: Node indices, shape [tet_count, n], int32.
     material: limber.mechanics.materials.Material as int.
-    viscosity: Factor [s] of the strain's rate in the stress (Kelvin-Voigt); ``other`` is then
-        the velocity [m/s]. 0 leaves ``other`` out.
+    growth, memory: In motion the stress is that of the strain ``growth * E + memory``: viscous
+        stress (Kelvin-Voigt) follows the strain's rate, and a difference formula gives that rate
+        from the strain now and the strains before, which are the memory, [tet_count, q, 6] (00
+        11 22 01 02 12). Growth 1 and a memory of no rows: no viscosity.
 
 Displacements are taken relative to the element's first node: gradients sum to zero, so this
 changes nothing but the round-off of a branch that has moved far.
@@ -28,17 +29,16 @@ _LINEAR = 2
 
 
 @compiled
-def internal_force(displacement, other, gradients, weights, lame_lambda, lame_mu, tets,
-                   material, viscosity, force, energies):
+def internal_force(displacement, gradients, weights, lame_lambda, lame_mu, tets, material,
+                   growth, memory, force, energies):
     """Write the internal force [N] and each element's strain energy [J]; return min det F."""
     tet_count, point_count = weights.shape
     node_count = tets.shape[1]
     local = np.empty((3, node_count))
-    rate = np.zeros((3, node_count))
     local_force = np.empty((3, node_count))
     F = np.empty((3, 3))
-    D = np.zeros((3, 3))
     P = np.empty((3, 3))
+    M = np.zeros(6)
     force[:] = 0.0
     min_det = np.inf
     for e in range(tet_count):
@@ -48,11 +48,6 @@ def internal_force(displacement, other, gradients, weights, lame_lambda, lame_mu
             for i in range(3):
                 local[i, a] = displacement[node, i] - displacement[first, i]
                 local_force[i, a] = 0.0
-        if viscosity != 0.0:
-            for a in range(node_count):
-                node = tets[e, a]
-                for i in range(3):
-                    rate[i, a] = other[node, i] - other[first, i]
         energy = 0.0
         for q in range(point_count):
             for i in range(3):
@@ -62,15 +57,10 @@ def internal_force(displacement, other, gradients, weights, lame_lambda, lame_mu
                         total += local[i, a] * gradients[e, q, j, a]
                     F[i, j] = total
                 F[i, i] += 1.0
-            if viscosity != 0.0:
-                for i in range(3):
-                    for j in range(3):
-                        total = 0.0
-                        for a in range(node_count):
-                            total += rate[i, a] * gradients[e, q, j, a]
-                        D[i, j] = total
-            density, det = first_stress(F, D, lame_lambda[e], lame_mu[e], material,
-                                        viscosity, P)
+            if memory.shape[0]:
+                for k in range(6):
+                    M[k] = memory[e, q, k]
+            density, det = first_stress(F, lame_lambda[e], lame_mu[e], material, growth, M, P)
             min_det = min(min_det, det)
             weight = weights[e, q]
             energy += weight * density
@@ -88,47 +78,67 @@ def internal_force(displacement, other, gradients, weights, lame_lambda, lame_mu
 
 
 @compiled
-def first_stress(F, D, lam, mu, material, viscosity, P):
-    """Write the first Piola-Kirchhoff stress [Pa]; return energy density [J/m^3] and det F.
+def strains(displacement, gradients, tets, material, out):
+    """Write the strain at each quadrature point, shape [tet_count, q, 6]."""
+    F = np.empty((3, 3))
+    for e in range(tets.shape[0]):
+        first = tets[e, 0]
+        for q in range(gradients.shape[1]):
+            for i in range(3):
+                for j in range(3):
+                    total = 0.0
+                    for a in range(tets.shape[1]):
+                        total += (displacement[tets[e, a], i] - displacement[first, i]
+                                  ) * gradients[e, q, j, a]
+                    F[i, j] = total
+                F[i, i] += 1.0
+            out[e, q] = _strain(F, material)
 
-    ``D`` is the rate of F [1/s], used where ``viscosity`` is not 0.
-    """
+
+@compiled
+def strain_changes(displacement, direction, gradients, tets, material, out):
+    """Write the directional derivative of the strain at each quadrature point."""
+    F = np.empty((3, 3))
+    H = np.empty((3, 3))
+    for e in range(tets.shape[0]):
+        first = tets[e, 0]
+        for q in range(gradients.shape[1]):
+            for i in range(3):
+                for j in range(3):
+                    f, h = 0.0, 0.0
+                    for a in range(tets.shape[1]):
+                        g = gradients[e, q, j, a]
+                        f += (displacement[tets[e, a], i] - displacement[first, i]) * g
+                        h += (direction[tets[e, a], i] - direction[first, i]) * g
+                    F[i, j], H[i, j] = f, h
+                F[i, i] += 1.0
+            if material == _LINEAR:
+                for i in range(3):
+                    for j in range(3):
+                        F[i, j] = 1.0 if i == j else 0.0
+            out[e, q] = _strain_rate(F, H)
+
+
+@compiled
+def first_stress(F, lam, mu, material, growth, M, P):
+    """Write the first Piola-Kirchhoff stress [Pa]; return energy density [J/m^3] and det F."""
     det = (F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
            - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
            + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0]))
+    e00, e11, e22, e01, e02, e12 = _strain(F, material)
     if material == _NEO_HOOKE:
         density = _neo_hookean_stress(F, det, lam, mu, P)
-        if viscosity != 0.0:
-            e00, e11, e22, e01, e02, e12 = _strain_rate(F, D)
-            _add_turned(F, lam * viscosity, mu * viscosity, e00, e11, e22, e01, e02, e12, P)
-        return density, det
-    if material == _LINEAR:
-        e00, e11, e22 = F[0, 0] - 1.0, F[1, 1] - 1.0, F[2, 2] - 1.0
-        e01 = 0.5 * (F[0, 1] + F[1, 0])
-        e02 = 0.5 * (F[0, 2] + F[2, 0])
-        e12 = 0.5 * (F[1, 2] + F[2, 1])
+        factor = growth - 1.0
     else:
-        e00, e11, e22, e01, e02, e12 = _green_strain(F)
-    trace = e00 + e11 + e22
-    density = (0.5 * lam * trace * trace + mu * (
-        e00 * e00 + e11 * e11 + e22 * e22 + 2.0 * (e01 * e01 + e02 * e02 + e12 * e12)))
-    if viscosity != 0.0:
-        if material == _LINEAR:
-            d00, d11, d22 = D[0, 0], D[1, 1], D[2, 2]
-            d01 = 0.5 * (D[0, 1] + D[1, 0])
-            d02 = 0.5 * (D[0, 2] + D[2, 0])
-            d12 = 0.5 * (D[1, 2] + D[2, 1])
-        else:
-            d00, d11, d22, d01, d02, d12 = _strain_rate(F, D)
-        e00 += viscosity * d00
-        e11 += viscosity * d11
-        e22 += viscosity * d22
-        e01 += viscosity * d01
-        e02 += viscosity * d02
-        e12 += viscosity * d12
-    for i in range(3):
-        for j in range(3):
-            P[i, j] = 0.0
+        trace = e00 + e11 + e22
+        density = (0.5 * lam * trace * trace + mu * (
+            e00 * e00 + e11 * e11 + e22 * e22 + 2.0 * (e01 * e01 + e02 * e02 + e12 * e12)))
+        factor = growth
+        for i in range(3):
+            for j in range(3):
+                P[i, j] = 0.0
+    e00, e11, e22 = factor * e00 + M[0], factor * e11 + M[1], factor * e22 + M[2]
+    e01, e02, e12 = factor * e01 + M[3], factor * e02 + M[4], factor * e12 + M[5]
     if material == _LINEAR:
         trace = lam * (e00 + e11 + e22)
         P[0, 0], P[1, 1], P[2, 2] = (trace + 2 * mu * e00, trace + 2 * mu * e11,
@@ -139,6 +149,14 @@ def first_stress(F, D, lam, mu, material, viscosity, P):
     else:
         _add_turned(F, lam, mu, e00, e11, e22, e01, e02, e12, P)
     return density, det
+
+
+@compiled
+def _strain(F, material):
+    if material == _LINEAR:
+        return (F[0, 0] - 1.0, F[1, 1] - 1.0, F[2, 2] - 1.0, 0.5 * (F[0, 1] + F[1, 0]),
+                0.5 * (F[0, 2] + F[2, 0]), 0.5 * (F[1, 2] + F[2, 1]))
+    return _green_strain(F)
 
 
 @compiled
@@ -153,6 +171,7 @@ def _green_strain(F):
 
 @compiled
 def _strain_rate(F, D):
+    """Symmetric part of F^T D: the change of the Green-Lagrange strain as F changes by D."""
     return (F[0, 0] * D[0, 0] + F[1, 0] * D[1, 0] + F[2, 0] * D[2, 0],
             F[0, 1] * D[0, 1] + F[1, 1] * D[1, 1] + F[2, 1] * D[2, 1],
             F[0, 2] * D[0, 2] + F[1, 2] * D[1, 2] + F[2, 2] * D[2, 2],
@@ -197,89 +216,88 @@ def _neo_hookean_stress(F, det, lam, mu, P):
 
 
 @compiled
-def _stress_derivative(F, D, H, V, lam, mu, material, viscosity, d_p):
-    """Write the change of P as F changes by H and its rate D by V (directional, exact)."""
+def stress_derivative(F, H, lam, mu, material, growth, M, d_p):
+    """Write the change of P as F changes by H (directional, exact)."""
     for i in range(3):
         for j in range(3):
             d_p[i, j] = 0.0
     if material == _LINEAR:
-        trace = lam * (H[0, 0] + H[1, 1] + H[2, 2]
-                       + viscosity * (V[0, 0] + V[1, 1] + V[2, 2]))
+        trace = lam * (H[0, 0] + H[1, 1] + H[2, 2])
         for i in range(3):
             for j in range(3):
-                d_p[i, j] = mu * (H[i, j] + H[j, i] + viscosity * (V[i, j] + V[j, i]))
-            d_p[i, i] += trace
+                d_p[i, j] = growth * mu * (H[i, j] + H[j, i])
+            d_p[i, i] += growth * trace
         return
+    factor = growth
     if material == _NEO_HOOKE:
-        det = 0.0
-        d_det = 0.0
-        for j in range(3):
-            det += F[0, j] * _cofactor(F, 0, j)
-        for i in range(3):
-            for j in range(3):
-                d_det += _cofactor(F, i, j) * H[i, j]
-        pressure = (lam + mu) * (det - 1.0) - mu
-        for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
-            for j in range(3):
-                c, d = (j + 1) % 3, (j + 2) % 3
-                d_cofactor = (H[a, c] * F[b, d] + F[a, c] * H[b, d]
-                              - H[a, d] * F[b, c] - F[a, d] * H[b, c])
-                d_p[i, j] = (mu * H[i, j] + pressure * d_cofactor
-                             + (lam + mu) * d_det * _cofactor(F, i, j))
-        if viscosity != 0.0:
-            e00, e11, e22, e01, e02, e12 = _strain_rate(F, D)
-            _add_turned(H, lam * viscosity, mu * viscosity, e00, e11, e22, e01, e02, e12, d_p)
-            a00, a11, a22, a01, a02, a12 = _strain_rate(H, D)
-            b00, b11, b22, b01, b02, b12 = _strain_rate(F, V)
-            _add_turned(F, lam * viscosity, mu * viscosity, a00 + b00, a11 + b11, a22 + b22,
-                        a01 + b01, a02 + b02, a12 + b12, d_p)
-        return
+        _neo_hookean_derivative(F, H, lam, mu, d_p)
+        factor = growth - 1.0
     e00, e11, e22, e01, e02, e12 = _green_strain(F)
+    _add_turned(H, lam, mu, factor * e00 + M[0], factor * e11 + M[1], factor * e22 + M[2],
+                factor * e01 + M[3], factor * e02 + M[4], factor * e12 + M[5], d_p)
     h00, h11, h22, h01, h02, h12 = _strain_rate(F, H)
-    if viscosity != 0.0:
-        v = viscosity
-        c00, c11, c22, c01, c02, c12 = _strain_rate(F, D)
-        a00, a11, a22, a01, a02, a12 = _strain_rate(H, D)
-        b00, b11, b22, b01, b02, b12 = _strain_rate(F, V)
-        e00, e11, e22 = e00 + v * c00, e11 + v * c11, e22 + v * c22
-        e01, e02, e12 = e01 + v * c01, e02 + v * c02, e12 + v * c12
-        h00, h11, h22 = h00 + v * (a00 + b00), h11 + v * (a11 + b11), h22 + v * (a22 + b22)
-        h01, h02, h12 = h01 + v * (a01 + b01), h02 + v * (a02 + b02), h12 + v * (a12 + b12)
-    _add_turned(H, lam, mu, e00, e11, e22, e01, e02, e12, d_p)
-    _add_turned(F, lam, mu, h00, h11, h22, h01, h02, h12, d_p)
+    _add_turned(F, factor * lam, factor * mu, h00, h11, h22, h01, h02, h12, d_p)
 
 
 @compiled
-def tangent_times(displacement, velocity, direction, rate_direction, gradients, weights,
-                  lame_lambda, lame_mu, tets, material, viscosity, product):
+def _neo_hookean_derivative(F, H, lam, mu, d_p):
+    det = 0.0
+    d_det = 0.0
+    for j in range(3):
+        det += F[0, j] * _cofactor(F, 0, j)
+    for i in range(3):
+        for j in range(3):
+            d_det += _cofactor(F, i, j) * H[i, j]
+    pressure = (lam + mu) * (det - 1.0) - mu
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            c, d = (j + 1) % 3, (j + 2) % 3
+            d_cofactor = (H[a, c] * F[b, d] + F[a, c] * H[b, d]
+                          - H[a, d] * F[b, c] - F[a, d] * H[b, c])
+            d_p[i, j] = (mu * H[i, j] + pressure * d_cofactor
+                         + (lam + mu) * d_det * _cofactor(F, i, j))
+
+
+@compiled
+def tangent_times(displacement, direction, gradients, weights, lame_lambda, lame_mu, tets,
+                  material, growth, memory, product):
     """Write the exact directional derivative of the internal force, shape [node_count, 3]."""
     tet_count, point_count = weights.shape
     node_count = tets.shape[1]
-    F, D, H, V, d_p = (np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.zeros((3, 3)),
-                       np.empty((3, 3)))
+    F, H, d_p = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    u, d = np.empty((3, node_count)), np.empty((3, node_count))
+    out = np.empty((3, node_count))
+    M = np.zeros(6)
     product[:] = 0.0
     for e in range(tet_count):
         first = tets[e, 0]
+        for a in range(node_count):
+            node = tets[e, a]
+            for i in range(3):
+                u[i, a] = displacement[node, i] - displacement[first, i]
+                d[i, a] = direction[node, i] - direction[first, i]
+                out[i, a] = 0.0
         for q in range(point_count):
             for i in range(3):
                 for j in range(3):
-                    f, d, h, v = 0.0, 0.0, 0.0, 0.0
+                    f, h = 0.0, 0.0
                     for a in range(node_count):
-                        node = tets[e, a]
-                        g = gradients[e, q, j, a]
-                        f += (displacement[node, i] - displacement[first, i]) * g
-                        h += (direction[node, i] - direction[first, i]) * g
-                        if viscosity != 0.0:
-                            d += (velocity[node, i] - velocity[first, i]) * g
-                            v += (rate_direction[node, i] - rate_direction[first, i]) * g
-                    F[i, j], D[i, j], H[i, j], V[i, j] = f, d, h, v
+                        f += u[i, a] * gradients[e, q, j, a]
+                        h += d[i, a] * gradients[e, q, j, a]
+                    F[i, j], H[i, j] = f, h
                 F[i, i] += 1.0
-            _stress_derivative(F, D, H, V, lame_lambda[e], lame_mu[e], material, viscosity, d_p)
+            if memory.shape[0]:
+                for k in range(6):
+                    M[k] = memory[e, q, k]
+            stress_derivative(F, H, lame_lambda[e], lame_mu[e], material, growth, M, d_p)
             weight = weights[e, q]
-            for a in range(node_count):
-                node = tets[e, a]
-                for i in range(3):
-                    product[node, i] += weight * (
-                        d_p[i, 0] * gradients[e, q, 0, a] + d_p[i, 1] * gradients[e, q, 1, a]
-                        + d_p[i, 2] * gradients[e, q, 2, a])
+            for i in range(3):
+                x, y, z = weight * d_p[i, 0], weight * d_p[i, 1], weight * d_p[i, 2]
+                for a in range(node_count):
+                    out[i, a] += (x * gradients[e, q, 0, a] + y * gradients[e, q, 1, a]
+                                  + z * gradients[e, q, 2, a])
+        for a in range(node_count):
+            node = tets[e, a]
+            for i in range(3):
+                product[node, i] += out[i, a]

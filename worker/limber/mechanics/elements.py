@@ -140,7 +140,8 @@ def volume_weights(mesh: TetMesh) -> np.ndarray:
 
 def _check_orientation(mesh: TetMesh, determinant: np.ndarray) -> None:
     scale = np.median(np.abs(determinant))
-    bad = np.flatnonzero((determinant <= 1e-12 * scale).any(axis=1))
+    volumes = 6 * mesh.volumes
+    bad = np.flatnonzero((determinant <= 1e-12 * scale).any(axis=1) | (volumes <= 1e-12 * scale))
     if len(bad):
         place = ", ".join(f"{x:.4g}" for x in mesh.centroids[bad[0]])
         raise InputError(

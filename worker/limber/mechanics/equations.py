@@ -1,6 +1,7 @@
 """The linear equations of the free nodes: assembled, factorised and solved again and again."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +15,23 @@ from limber.mechanics.stiffness import general_stiffness, strain_stiffness
 if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel
 
+_NO_INCREMENT = np.zeros((0, 3))
+_NO_MEMORY = np.zeros((0, 0, 6, 0))
 _FIRST_SHIFT = 1e-7
 _LAST_SHIFT = 1.0
+
+
+@dataclass(frozen=True)
+class Viscous:
+    """Viscous stress in motion: the stress is that of the strain ``growth * E + memory``.
+
+    Attributes:
+        growth: 1 plus the damping factor times the rate of the strain per strain.
+        memory: What the strains before contribute, shape [tet_count, q, 6].
+    """
+
+    growth: float
+    memory: np.ndarray
 
 
 class Equations:
@@ -53,12 +69,14 @@ class Equations:
                 self._pin_rows[rows + axis, 3 * number + axis] = grasp.weights
         self._pin_solutions = np.zeros_like(self._pin_rows)
 
-    def assemble(self, model: "BranchModel", displacement: np.ndarray, other: np.ndarray, *,
-                 viscosity: float = 0.0, rate_factor: float = 0.0, mixed: bool = False,
+    def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
+                 increment: np.ndarray | None = None, viscous: Viscous | None = None,
                  mass_factor: float = 0.0) -> None:
         """Assemble tangent stiffness plus ``mass_factor`` [1/s^2] times the mass.
 
-        For the other arguments see limber.mechanics.stiffness.
+        Args:
+            increment: The last increment [m], for mixed-point Newton (StVK only).
+            viscous: Viscous part in motion.
         """
         if mass_factor:
             np.multiply(self._mass_values(model), mass_factor, out=self._values)
@@ -66,14 +84,19 @@ class Equations:
             self._values[:] = 0.0
         layout = self.layout
         lam, mu = layout.per_element(model.lame_lambda), layout.per_element(model.lame_mu)
+        growth, memory = 1.0, _NO_MEMORY
+        if viscous is not None:
+            growth, memory = viscous.growth, layout.per_point(viscous.memory)
         if model.material == Material.stable_neo_hookean:
-            general_stiffness(displacement, other, layout.gradients, layout.weights, lam, mu,
-                              layout.nodes, int(model.material), viscosity, rate_factor,
+            general_stiffness(displacement, layout.gradients, layout.weights, lam, mu,
+                              layout.nodes, int(model.material), growth, memory,
                               layout.slots, layout.lengths, self._values)
         else:
-            strain_stiffness(displacement, other, layout.gradients, layout.weights, lam, mu,
-                             layout.nodes, int(model.material), viscosity, rate_factor,
-                             float(mixed), layout.slots, layout.lengths, self._values)
+            mixed = increment is not None and model.material == Material.st_venant_kirchhoff
+            strain_stiffness(displacement, increment if mixed else _NO_INCREMENT,
+                             layout.gradients, layout.weights, lam, mu, layout.nodes,
+                             int(model.material), growth, memory, layout.slots, layout.lengths,
+                             self._values)
         self._add_pins()
 
     def factorise(self) -> bool:

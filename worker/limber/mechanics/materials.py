@@ -60,7 +60,7 @@ class RayleighDamping:
 
 
 def lame(young: np.ndarray, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Lamé coefficients lambda and mu [Pa] of Young's modulus [Pa] and Poisson's ratio."""
+    """Return Lamé's lambda and mu [Pa] of Young's modulus [Pa] and Poisson's ratio."""
     return (young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson)))
 
 

@@ -11,8 +11,13 @@ from scipy.sparse.csgraph import connected_components
 from limber.errors import InputError
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import elements
-from limber.mechanics.assembly import internal_force, tangent_times
-from limber.mechanics.equations import Equations
+from limber.mechanics.assembly import (
+    internal_force,
+    strain_changes,
+    strains,
+    tangent_times,
+)
+from limber.mechanics.equations import Equations, Viscous
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import (
     Material,
@@ -26,6 +31,10 @@ from limber.store import Branch
 
 GRAVITY = (0.0, 0.0, -9.80665)
 """Standard gravity [m/s^2] along -z."""
+
+
+_NO_MEMORY = np.zeros((0, 0, 6))
+DEFAULT_DAMPING = RayleighDamping()
 
 
 @dataclass(frozen=True)
@@ -104,7 +113,7 @@ class BranchModel:
                  density: float | np.ndarray, fixed: np.ndarray | None = None,
                  gravity: Sequence[float] | None = GRAVITY,
                  material: str | Material = "st_venant_kirchhoff",
-                 damping: RayleighDamping = RayleighDamping(),  # noqa: B008 (frozen)
+                 damping: RayleighDamping = DEFAULT_DAMPING,
                  point_masses: Iterable[PointMass] = (), lumped_mass: bool = False):
         check_mesh(mesh)
         self._data = _MeshData(mesh, fixed_mask(mesh, fixed))
@@ -119,6 +128,8 @@ class BranchModel:
     def from_branch(cls, branch: Branch, **overrides: object) -> "BranchModel":
         """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for the class.
 
+        Gravity acts as it did on the scan, which the upright turn has turned with the branch.
+
         Raises:
             BranchFolderError: there is no mesh. InputError: it lacks material data.
         """
@@ -130,7 +141,7 @@ class BranchModel:
                 raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
                                  "The material is not known.", "Reconstruct again.")
             values[name] = mesh.cell_data[name] if value is None else value
-        return cls(mesh, **values, **overrides)
+        return cls(mesh, **values, **{"gravity": branch.gravity, **overrides})
 
     @property
     def mesh(self) -> TetMesh:
@@ -179,6 +190,14 @@ class BranchModel:
                    self.density if density is None else density)
         return other
 
+    def without_point_masses(self) -> "BranchModel":
+        """Return the model with nothing hanging on it."""
+        if not self.point_masses:
+            return self
+        other = copy.copy(self)
+        other.point_masses, other._mass = (), {}
+        return other
+
     def equations(self, grasps: Sequence[Grasp] = ()) -> Equations:
         """Return the equations with these grasps held; made once for each set of patches.
 
@@ -193,42 +212,51 @@ class BranchModel:
                                             grasps)
         return self._data.equations[key]
 
-    def internal(self, displacement: np.ndarray, velocity: np.ndarray | None = None, *,
-                 lame_pair: tuple[np.ndarray, np.ndarray] | None = None,
-                 viscosity: float = 0.0) -> InternalState:
+    def internal(self, displacement: np.ndarray, *, viscous: Viscous | None = None,
+                 lame_pair: tuple[np.ndarray, np.ndarray] | None = None) -> InternalState:
         """Return internal force and energy at a displacement [m], shape [node_count, 3].
 
         Args:
-            velocity: [m/s], shape [node_count, 3], where ``viscosity`` [s] is not 0.
+            viscous: Viscous part in motion.
             lame_pair: Lamé coefficients instead of the model's; the force is linear in them.
         """
         data = self._data
         lam, mu = lame_pair or (self.lame_lambda, self.lame_mu)
-        displacement = np.ascontiguousarray(displacement, float)
-        velocity = displacement if velocity is None else np.ascontiguousarray(velocity, float)
+        growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         force, energies = np.empty((self.mesh.node_count, 3)), np.empty(self.mesh.tet_count)
-        det = internal_force(displacement, velocity, data.gradients, data.weights, lam, mu,
-                             data.tets, int(self.material), float(viscosity), force, energies)
+        det = internal_force(np.ascontiguousarray(displacement, float), data.gradients,
+                             data.weights, lam, mu, data.tets, int(self.material), growth,
+                             memory, force, energies)
         return InternalState(force, energies, float(det))
 
     def tangent_times(self, displacement: np.ndarray, direction: np.ndarray,
-                      velocity: np.ndarray | None = None,
-                      rate_direction: np.ndarray | None = None,
-                      viscosity: float = 0.0) -> np.ndarray:
-        """Return the exact derivative of the internal force [N] along ``direction`` [m].
-
-        With ``viscosity`` [s], also along ``rate_direction`` [m/s] of the velocity.
-        """
+                      viscous: Viscous | None = None) -> np.ndarray:
+        """Return the exact derivative of the internal force [N] along ``direction`` [m]."""
         data = self._data
-        direction = np.ascontiguousarray(direction, float)
+        growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         product = np.empty((self.mesh.node_count, 3))
         tangent_times(np.ascontiguousarray(displacement, float),
-                      direction if velocity is None else np.ascontiguousarray(velocity, float),
-                      direction, direction if rate_direction is None
-                      else np.ascontiguousarray(rate_direction, float),
-                      data.gradients, data.weights, self.lame_lambda, self.lame_mu, data.tets,
-                      int(self.material), float(viscosity), product)
+                      np.ascontiguousarray(direction, float), data.gradients, data.weights,
+                      self.lame_lambda, self.lame_mu, data.tets, int(self.material), growth,
+                      memory, product)
         return product
+
+    def strains(self, displacement: np.ndarray) -> np.ndarray:
+        """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12)."""
+        data = self._data
+        out = np.empty((*data.weights.shape, 6))
+        strains(np.ascontiguousarray(displacement, float), data.gradients, data.tets,
+                int(self.material), out)
+        return out
+
+    def strain_changes(self, displacement: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the derivative of :meth:`strains` along ``direction`` [m]."""
+        data = self._data
+        out = np.empty((*data.weights.shape, 6))
+        strain_changes(np.ascontiguousarray(displacement, float),
+                       np.ascontiguousarray(direction, float), data.gradients, data.tets,
+                       int(self.material), out)
+        return out
 
     @property
     def weight_force(self) -> np.ndarray:
@@ -356,7 +384,7 @@ def check_mesh(mesh: TetMesh) -> None:
     links = sp.csr_matrix((np.ones(3 * len(corners)), (np.repeat(corners[:, 0], 3),
                                                        corners[:, 1:].ravel())),
                           (mesh.node_count, mesh.node_count))
-    count, label = connected_components(links, directed=False)
+    _, label = connected_components(links, directed=False)
     pieces = np.unique(label[np.unique(corners)], return_counts=True)[1]
     if len(pieces) > 1:
         raise InputError(

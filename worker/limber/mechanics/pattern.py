@@ -121,6 +121,10 @@ class LaneLayout:
         """Return one number a tetrahedron in this layout, shape [batch, LANES]."""
         return values[self._order].reshape(-1, LANES)
 
+    def per_point(self, values: np.ndarray) -> np.ndarray:
+        """Return values [tet_count, q, k] in this layout, shape [batch, q, k, LANES]."""
+        return _lanes(values[self._order])
+
 
 def _lanes(array: np.ndarray) -> np.ndarray:
     batched = array.reshape(-1, LANES, *array.shape[1:])

@@ -42,7 +42,7 @@ class StaticSettings:
 
     tolerance: float = 1e-7
     max_iterations: int = 20
-    max_step: float = 0.15
+    max_step: float = 0.4
     min_step: float = 1 / 512
     stretch_limit: float = 2.0
     mixed: bool = True
@@ -122,7 +122,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
                  pose: np.ndarray | None = None, grasp_force: np.ndarray | None = None,
                  nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
-                 settings: StaticSettings = StaticSettings(),  # noqa: B008 (frozen)
+                 settings: StaticSettings = StaticSettings(),
                  progress: Progress = SILENT) -> StaticResult:
     """Find the equilibrium of a branch; never raises for want of convergence.
 
@@ -149,7 +149,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
 def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.ndarray, *,
                  nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
-                 settings: StaticSettings = StaticSettings(),  # noqa: B008 (frozen)
+                 settings: StaticSettings = StaticSettings(),
                  progress: Progress = SILENT) -> list[StaticResult]:
     """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
 
@@ -173,7 +173,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
 
 def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
                      nodal_forces: np.ndarray | None = None,
-                     settings: StaticSettings = StaticSettings(),  # noqa: B008 (frozen)
+                     settings: StaticSettings = StaticSettings(),
                      ) -> StaticResult:
     """Find the equilibrium with the model's fixed nodes moved by ``displacement``.
 
@@ -323,9 +323,8 @@ class _Path:
     def _step(self, part: float) -> float | None:
         """Try a step to ``part`` of the way; return the length taken, None if it failed."""
         settings, equations, held = self.settings, self.equations, self.equations.held
-        load_left = 1.0
         try:
-            equations.assemble(self.model, self.displacement, self.displacement)
+            equations.assemble(self.model, self.displacement)
             equations.factorise()
         except NotPositiveDefiniteError:
             self.trouble = "the stiffness has no positive pivots"
@@ -335,7 +334,7 @@ class _Path:
         longest = np.linalg.norm(increment, axis=1).max()
         limit = settings.max_step * self.model.extent
         if longest > limit:
-            part = self.reached + (part - self.reached) * limit / longest * load_left
+            part = self.reached + (part - self.reached) * limit / longest
             target, pins = self.constraint_at(part)
             increment = self._predict(target, pins, part)
         trial = self.displacement + increment
@@ -378,7 +377,8 @@ class _Path:
                 return None
             self.iterations += 1
             try:
-                equations.assemble(self.model, trial, increment, mixed=self.problem.mixed)
+                equations.assemble(self.model, trial,
+                                   increment=increment if self.problem.mixed else None)
                 stable = equations.factorise()
             except NotPositiveDefiniteError:
                 self.trouble = "the stiffness has no positive pivots"
@@ -425,7 +425,7 @@ class _Path:
         return taken
 
     def _is_stable(self, trial: np.ndarray) -> bool:
-        self.equations.assemble(self.model, trial, trial)
+        self.equations.assemble(self.model, trial)
         return self.equations.factorise()
 
     def _result(self, converged: bool) -> StaticResult:

@@ -13,7 +13,7 @@ behind the end of the values.
 
 import numpy as np
 
-from limber.mechanics.assembly import _stress_derivative
+from limber.mechanics.assembly import stress_derivative
 from limber.mechanics.compiled import compiled
 
 LANES = 16
@@ -23,20 +23,20 @@ _LINEAR = 2
 
 
 @compiled
-def strain_stiffness(displacement, other, gradients, weights, lame_lambda, lame_mu, nodes,
-                     material, viscosity, rate_factor, mixed, slots, lengths, values):
+def strain_stiffness(displacement, increment, gradients, weights, lame_lambda, lame_mu, nodes,
+                     material, growth, memory, slots, lengths, values):
     """Add the tangent stiffness [N/m] of St. Venant-Kirchhoff or linear elements to ``values``.
 
     Args:
-        displacement, other: See limber.mechanics.assembly.
+        displacement: See limber.mechanics.assembly.
+        increment: The last increment of the displacement; the stress of the geometric part is
+            then taken at the strain less dH^T dH / 2, dH the increment's gradient: the stress
+            that the last linearisation predicted (mixed integration points, Magisano, Leonetti
+            and Garcea 2017). Without rows: Newton's.
         gradients, weights: Shapes [batch, q, 3, n, LANES] and [batch, q, LANES].
         lame_lambda, lame_mu: Shape [batch, LANES].
         nodes: Shape [batch, n, LANES].
-        viscosity, rate_factor: Kelvin-Voigt factor [s], and the derivative [1/s] of the velocity
-            to the displacement in the time step; ``other`` is the velocity.
-        mixed: 1 takes the stress of the geometric part at E - dH^T dH / 2, dH the gradient of
-            ``other``, now the last increment: the stress that the last linearisation predicted
-            (mixed integration points, Magisano, Leonetti and Garcea 2017). 0: Newton's.
+        growth, memory: See limber.mechanics.assembly; memory of shape [batch, q, 6, LANES].
         slots, lengths: Shape [batch, pairs, LANES]; pair (a, b <= a) has number a (a+1)/2 + b.
         values: Lower triangle by columns, with a few numbers of scratch behind its end.
     """
@@ -51,20 +51,19 @@ def strain_stiffness(displacement, other, gradients, weights, lame_lambda, lame_
     # Rows of c: 0-5 stress, 6-11 mu F F^T (00 11 22 01 02 12), 12-14 lambda, mu and their sum.
     c = np.zeros((point_count, 15, LANES))
     block = np.empty((9, LANES))
-    use_other = material != _LINEAR and (mixed != 0.0 or viscosity != 0.0)
-    growth = 1.0 + viscosity * rate_factor
+    mixed = material != _LINEAR and increment.shape[0] > 0
     for batch in range(batch_count):
         for a in range(node_count):
             for l in range(LANES):
                 node, first = nodes[batch, a, l], nodes[batch, 0, l]
                 for i in range(3):
                     local[i, a, l] = displacement[node, i] - displacement[first, i]
-        if use_other:
+        if mixed:
             for a in range(node_count):
                 for l in range(LANES):
                     node, first = nodes[batch, a, l], nodes[batch, 0, l]
                     for i in range(3):
-                        rate[i, a, l] = other[node, i] - other[first, i]
+                        rate[i, a, l] = increment[node, i] - increment[first, i]
         for q in range(point_count):
             _deformation(local, gradients[batch, q], material == _LINEAR, F)
             for l in range(LANES):
@@ -74,12 +73,13 @@ def strain_stiffness(displacement, other, gradients, weights, lame_lambda, lame_
                 E[3, l] = 0.5 * (F[0, l] * F[1, l] + F[3, l] * F[4, l] + F[6, l] * F[7, l])
                 E[4, l] = 0.5 * (F[0, l] * F[2, l] + F[3, l] * F[5, l] + F[6, l] * F[8, l])
                 E[5, l] = 0.5 * (F[1, l] * F[2, l] + F[4, l] * F[5, l] + F[7, l] * F[8, l])
-            if use_other:
+            if mixed:
                 _gradient(rate, gradients[batch, q], D)
-                if viscosity != 0.0:
-                    _add_strain_rate(F, D, viscosity, E)
-                else:
-                    _add_strain_rate(D, D, -0.5 * mixed, E)
+                _add_strain_rate(D, D, -0.5, E)
+            if memory.shape[0] and material != _LINEAR:
+                for k in range(6):
+                    for l in range(LANES):
+                        E[k, l] = growth * E[k, l] + memory[batch, q, k, l]
             for l in range(LANES):
                 weight = weights[batch, q, l]
                 lam, mu = weight * lame_lambda[batch, l], weight * lame_mu[batch, l]
@@ -211,17 +211,15 @@ def _scatter(block, slots, lengths, is_diagonal, values):
 
 
 @compiled
-def general_stiffness(displacement, other, gradients, weights, lame_lambda, lame_mu, nodes,
-                      material, viscosity, rate_factor, slots, lengths, values):
+def general_stiffness(displacement, gradients, weights, lame_lambda, lame_mu, nodes,
+                      material, growth, memory, slots, lengths, values):
     """Add the tangent stiffness of any material, from the derivative of its stress.
 
-    Arguments as in :func:`strain_stiffness`. The velocity's part is not symmetric; its symmetric
-    part is added.
+    Arguments as in :func:`strain_stiffness`.
     """
     batch_count, point_count = weights.shape[0], weights.shape[1]
     node_count = nodes.shape[1]
-    F, D, H, V, d_p = (np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)),
-                       np.empty((3, 3)))
+    F, H, d_p, M = np.empty((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.zeros(6)
     tensor = np.empty((point_count, 3, 3, 3, 3))
     block = np.empty((9, LANES))
     blocks = np.empty((9, node_count * (node_count + 1) // 2, LANES))
@@ -232,19 +230,22 @@ def general_stiffness(displacement, other, gradients, weights, lame_lambda, lame
             for q in range(point_count):
                 for i in range(3):
                     for j in range(3):
-                        f, d = 0.0, 0.0
+                        f = 0.0
                         for a in range(node_count):
-                            node, g = nodes[batch, a, l], gradients[batch, q, j, a, l]
-                            f += (displacement[node, i] - displacement[first, i]) * g
-                            d += (other[node, i] - other[first, i]) * g
-                        F[i, j], D[i, j] = f, d
+                            node = nodes[batch, a, l]
+                            f += (displacement[node, i] - displacement[first, i]
+                                  ) * gradients[batch, q, j, a, l]
+                        F[i, j] = f
                     F[i, i] += 1.0
+                if memory.shape[0]:
+                    for k in range(6):
+                        M[k] = memory[batch, q, k, l]
                 for k in range(3):
                     for m in range(3):
-                        H[k, m], V[k, m] = 1.0, rate_factor
-                        _stress_derivative(F, D, H, V, lame_lambda[batch, l], lame_mu[batch, l],
-                                           material, viscosity, d_p)
-                        H[k, m], V[k, m] = 0.0, 0.0
+                        H[k, m] = 1.0
+                        stress_derivative(F, H, lame_lambda[batch, l], lame_mu[batch, l],
+                                          material, growth, M, d_p)
+                        H[k, m] = 0.0
                         for i in range(3):
                             for j in range(3):
                                 tensor[q, k, i, m, j] = weights[batch, q, l] * d_p[i, j]
@@ -269,9 +270,8 @@ def _lane_blocks(gradients, tensor, l, blocks):
                     for m in range(3):
                         total = 0.0
                         for j in range(3):
-                            total += (tensor[q, k, i, m, j] + tensor[q, i, k, j, m]
-                                      ) * gradients[q, j, a, l]
-                        half[i, k, m] = 0.5 * total
+                            total += tensor[q, k, i, m, j] * gradients[q, j, a, l]
+                        half[i, k, m] = total
             for b in range(a + 1):
                 x, y, z = gradients[q, 0, b, l], gradients[q, 1, b, l], gradients[q, 2, b, l]
                 blocks[0, pair, l] += half[0, 0, 0] * x + half[0, 0, 1] * y + half[0, 0, 2] * z

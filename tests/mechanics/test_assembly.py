@@ -1,0 +1,154 @@
+"""Forces and stiffness against rigid motion, patch test and finite differences."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics import BranchModel, Grasp
+from limber.mechanics.equations import Viscous
+from limber.mechanics.grasp import rotation_matrix
+from limber.mechanics.statics import solve_prescribed
+from tests.mechanics.conftest import box_mesh
+
+MATERIALS = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")
+
+
+def make_model(mesh, material="st_venant_kirchhoff", **options):
+    values = {"young": 1e7, "poisson": 0.3, "density": 900, "gravity": None} | options
+    return BranchModel(mesh, material=material, **values)
+
+
+def curved_box():
+    mesh = box_mesh()
+    nodes = mesh.nodes.copy()
+    nodes[:, 0] += 10 * nodes[:, 2] ** 2
+    return TetMesh(nodes, mesh.tets, point_data=mesh.point_data)
+
+
+def full_stiffness(model, equations):
+    pattern = equations.pattern
+    lower = sp.csc_matrix((equations._values[:pattern.value_count],
+                           (pattern.rows, pattern.columns)), shape=(pattern.size,) * 2)
+    return lower + sp.tril(lower, -1).T
+
+
+@pytest.mark.parametrize("material", MATERIALS[:2])
+@pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
+                         ids=["quadratic", "linear", "curved"])
+def test_rigid_motion_costs_nothing(mesh, material):
+    """A large rotation with a shift gives no force and no energy, to round-off."""
+    model = make_model(mesh, material)
+    turn = rotation_matrix(np.array([0.9, -1.4, 0.7]))
+    moved = mesh.nodes @ turn.T + [0.4, -2.0, 1.0] - mesh.nodes
+    state = model.internal(moved)
+    reference = model.internal(mesh.nodes * 0.01)
+    scale = np.linalg.norm(reference.force)
+    assert np.linalg.norm(state.force) < 1e-10 * scale
+    assert abs(state.strain_energy) < 1e-10 * reference.strain_energy
+    assert state.min_det_f == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("quadratic", [True, False])
+def test_patch_test(material, quadratic):
+    """Boundary nodes moved by a linear map: all inner nodes follow it, to 1e-10."""
+    mesh = box_mesh((0.03, 0.02, 0.02), (3, 3, 3), quadratic=quadratic)
+    inside = np.abs(mesh.nodes - mesh.nodes.mean(axis=0)) < np.array([0.0149, 0.0099, 0.0099])
+    boundary = ~inside.all(axis=1)
+    shift = mesh.nodes @ np.array([[0.02, 0.01, 0], [0.03, -0.01, 0.02], [0, 0.01, 0.03]])
+    model = make_model(mesh, material, fixed=boundary)
+    result = solve_prescribed(model, shift).require()
+    assert (~boundary).sum() > 5
+    assert np.abs(result.displacement - shift).max() < 1e-10 * np.abs(shift).max()
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
+                         ids=["quadratic", "linear", "curved"])
+def test_force_and_stiffness_are_derivatives(mesh, material):
+    """Force is the energy's derivative, stiffness the force's, both kernels of it alike."""
+    rng = np.random.default_rng(3)
+    model = make_model(mesh, material, young=rng.uniform(1e6, 5e6, mesh.tet_count))
+    u = 4e-4 * rng.standard_normal(mesh.nodes.shape)
+    d = rng.standard_normal(mesh.nodes.shape)
+    d[model.fixed] = 0
+    h = 2e-8
+    ahead, behind = model.internal(u + h * d), model.internal(u - h * d)
+    by_energy = (ahead.strain_energy - behind.strain_energy) / (2 * h)
+    assert by_energy == pytest.approx((model.internal(u).force * d).sum(), rel=1e-6)
+    by_force = ((ahead.force - behind.force) / (2 * h))[~model.fixed]
+    product = model.tangent_times(u, d)[~model.fixed]
+    assert np.linalg.norm(product - by_force) < 1e-6 * np.linalg.norm(by_force)
+    equations = model.equations()
+    equations.assemble(model, u)
+    assembled = full_stiffness(model, equations) @ d[equations.pattern.order].ravel()
+    exact = model.tangent_times(u, d)[equations.pattern.order].ravel()
+    assert np.linalg.norm(assembled - exact) < 1e-12 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_viscous_stiffness_is_the_derivative(material):
+    """With a viscous memory the stiffness is still the force's derivative."""
+    rng = np.random.default_rng(4)
+    model = make_model(box_mesh(), material)
+    u = 4e-4 * rng.standard_normal(model.mesh.nodes.shape)
+    d = rng.standard_normal(u.shape)
+    d[model.fixed] = 0
+    viscous = Viscous(1.7, 0.02 * rng.standard_normal((*model.weights.shape, 6)))
+    h = 2e-8
+    change = (model.internal(u + h * d, viscous=viscous).force
+              - model.internal(u - h * d, viscous=viscous).force) / (2 * h)
+    equations = model.equations()
+    equations.assemble(model, u, viscous=viscous)
+    order = equations.pattern.order
+    assembled = full_stiffness(model, equations) @ d[order].ravel()
+    assert np.linalg.norm(assembled - change[order].ravel()) < 1e-6 * np.linalg.norm(change)
+
+
+def test_force_is_linear_in_young_and_superposes(short_box):
+    """Forces of two fields of Young's modulus add up to that of their sum."""
+    rng = np.random.default_rng(5)
+    first, second = rng.uniform(1e6, 1e7, (2, short_box.tet_count))
+    u = 1e-4 * rng.standard_normal(short_box.nodes.shape)
+    model = make_model(short_box, young=first)
+    together = model.with_young(first + second).internal(u).force
+    apart = model.internal(u).force + model.with_young(second).internal(u).force
+    assert together == pytest.approx(apart, rel=1e-12, abs=1e-12 * np.abs(apart).max())
+
+
+def test_pinned_solution_keeps_the_mean_and_balances(short_box):
+    """A pinned patch moves in the mean as told, and the factored equations are satisfied."""
+    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "pinned")
+    model = make_model(short_box)
+    equations = model.equations([grasp])
+    zero = np.zeros_like(short_box.nodes)
+    equations.assemble(model, zero)
+    assert equations.factorise()
+    move = np.array([[1e-4, 2e-4, -1e-4]])
+    solution = equations.solve(zero, move)
+    assert grasp.weights @ solution[grasp.nodes] == pytest.approx(move[0], rel=1e-9)
+    left = equations.free_part(model.tangent_times(zero, solution))
+    assert np.linalg.norm(left) < 1e-9 * np.linalg.norm(model.tangent_times(zero, solution))
+
+
+def test_superlu_gives_what_cholmod_gives(short_box, monkeypatch):
+    """The fallback without cvxopt solves the same equations and refuses an indefinite matrix."""
+    from limber.mechanics import factor
+
+    model = make_model(short_box)
+    force = np.zeros_like(short_box.nodes)
+    force[-1] = [1.0, 2.0, 3.0]
+    first = model.equations()
+    first.assemble(model, np.zeros_like(force))
+    first.factorise()
+    pattern = first.pattern
+    other = factor.SuperLuFactor(pattern.rows, pattern.columns, pattern.size)
+    values = first._values[:pattern.value_count].copy()
+    other.factorise(values)
+    right = force[pattern.order].ravel()
+    assert other.solve(right) == pytest.approx(first.solve(force)[pattern.order].ravel())
+    values[pattern.diagonal] -= 0.5 * values[pattern.diagonal].mean()
+    for candidate in (other, factor.CholmodFactor(pattern.rows, pattern.columns, pattern.size)):
+        with pytest.raises(factor.NotPositiveDefiniteError):
+            candidate.factorise(values)

@@ -1,0 +1,234 @@
+"""How displacements and reactions change with the parameters, exactly.
+
+The internal force is linear in both Lamé coefficients, so its explicit derivative to any material
+parameter is the same kernel with other coefficients. The displacement's derivative solves the
+tangent equations at the converged state; each solve is refined against the exact directional
+derivative of the force, so the result does not depend on what was factorised.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.mechanics.equations import Equations, Viscous
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.materials import lame_by_poisson
+from limber.mechanics.model import BranchModel
+
+PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")
+"""What can be differentiated for. ``log_young`` is one column for each column of the weights."""
+
+_REFINEMENTS = 12
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """Which derivatives are wanted.
+
+    Attributes:
+        names: Out of PARAMETERS.
+        weights: Young's modulus of the tetrahedra is ``weights @ young_at_control_points``,
+            shape [tet_count, K]; None: one factor on the whole field.
+        control_young: Young's modulus at the control points [Pa], shape [K]; default: solved
+            from the model's field by least squares.
+    """
+
+    names: tuple[str, ...] = ("log_young",)
+    weights: np.ndarray | None = None
+    control_young: np.ndarray | None = None
+
+    def labels(self) -> list[str]:
+        """Return one name for each column of the derivatives."""
+        count = 1 if self.weights is None else self.weights.shape[1]
+        return [label for name in self.names
+                for label in ([f"log_young_{k}" for k in range(count)]
+                              if name == "log_young" else [name])]
+
+
+@dataclass(frozen=True)
+class StaticSensitivities:
+    """Derivatives of a static state.
+
+    Attributes:
+        labels: Name of each of the p columns.
+        displacement: [m per parameter], shape [node_count, 3, p].
+        reaction_force: Of the gripper on the branch [N per parameter], shape [3, p], or
+            [grasps, 3, p] for several.
+        strain_energy: [J per parameter], shape [p].
+    """
+
+    labels: list[str]
+    displacement: np.ndarray
+    reaction_force: np.ndarray
+    strain_energy: np.ndarray
+
+
+def static_sensitivities(model: BranchModel, result: "StaticResult",  # noqa: F821
+                         grasp: Grasp | Sequence[Grasp] | None, weights: np.ndarray | None,
+                         parameters: Sequence[str] = ("log_young",), *, is_held: bool = True,
+                         control_young: np.ndarray | None = None) -> StaticSensitivities:
+    """Differentiate a converged static state.
+
+    Args:
+        grasp: As it was solved with.
+        weights: See :class:`ParameterSet`.
+        parameters: Out of PARAMETERS; the damping ones give 0.
+        is_held: Whether the grasp was held at a pose; False for a force.
+    """
+    wanted = ParameterSet(checked_names(parameters), weights, control_young)
+    grasps = [] if grasp is None else [grasp] if isinstance(grasp, Grasp) else list(grasp)
+    equations = model.equations(grasps if is_held else ())
+    u = result.displacement
+    equations.assemble(model, u)
+    equations.factorise()
+    explicit = explicit_forces(model, wanted, result, None)
+
+    def tangent(direction: np.ndarray) -> np.ndarray:
+        return model.tangent_times(u, direction)
+
+    columns, forces, energies = [], [], []
+    internal = model.internal(u)
+    for partial in explicit:
+        change = refined_solve(equations, tangent, -partial)
+        columns.append(change)
+        out = partial + tangent(change)
+        forces.append(reactions(grasps, out) if is_held else np.zeros((len(grasps), 3)))
+        energies.append(float((internal.force * change).sum()))
+    energies = np.array(energies) + explicit_energies(model, wanted, u)
+    force = np.stack(forces, axis=-1) if grasps else np.zeros((1, 3, len(columns)))
+    if isinstance(grasp, Grasp) or grasp is None:
+        force = force[0]
+    return StaticSensitivities(wanted.labels(), np.stack(columns, axis=-1), force, energies)
+
+
+def refined_solve(equations: Equations, tangent: Callable[[np.ndarray], np.ndarray],
+                  right: np.ndarray, guess: np.ndarray | None = None) -> np.ndarray:
+    """Return x with tangent(x) = right on the free nodes, from a nearby factor."""
+    solution = equations.solve(right) if guess is None else guess
+    scale = np.linalg.norm(equations.free_part(right))
+    last = np.inf
+    for _ in range(_REFINEMENTS):
+        left = equations.free_part(right - tangent(solution))
+        norm = float(np.linalg.norm(left))
+        if norm <= 1e-10 * scale or norm >= 0.5 * last:
+            # Round-off is reached, or the factor is too far away to get nearer.
+            break
+        last = norm
+        solution = solution + equations.solve(left)
+    return solution
+
+
+def lame_changes(model: BranchModel, wanted: ParameterSet,
+                 ) -> list[tuple[np.ndarray, np.ndarray] | None]:
+    """Return for each column the derivative of the Lamé coefficients, None where they stay."""
+    changes: list[tuple[np.ndarray, np.ndarray] | None] = []
+    for name in wanted.names:
+        if name == "log_young":
+            changes += [(model.lame_lambda * part, model.lame_mu * part)
+                        for part in young_shares(model, wanted)]
+        elif name == "poisson":
+            changes.append(lame_by_poisson(model.young, model.poisson))
+        else:
+            changes.append(None)
+    return changes
+
+
+def young_shares(model: BranchModel, wanted: ParameterSet) -> np.ndarray:
+    """Return d log E_tet / d log E_k, shape [K, tet_count]."""
+    if wanted.weights is None:
+        return np.ones((1, model.mesh.tet_count))
+    control = wanted.control_young
+    if control is None:
+        control = np.linalg.lstsq(wanted.weights, model.young, rcond=None)[0]
+    mapped = wanted.weights @ control
+    if np.abs(mapped / model.young - 1).max() > 1e-6:
+        raise InputError("Young's modulus is not what the weights give.",
+                         "The model's field must be weights @ control_young.",
+                         "Make the model by with_young(weights @ control_young).")
+    return (wanted.weights * control).T / mapped
+
+
+def explicit_forces(model: BranchModel, wanted: ParameterSet,
+                    state: "StaticResult | MotionState",  # noqa: F821
+                    viscous: Viscous | None) -> list[np.ndarray]:
+    """Return the derivative of internal and inertial force less load, the motion held.
+
+    Each of shape [node_count, 3] [N per parameter].
+
+    Args:
+        state: A static result, or an instant of a motion.
+        viscous: The viscous part of that instant.
+    """
+    changes, partials = lame_changes(model, wanted), []
+    plain = [name.rsplit("_", 1)[0] if name.startswith("log_young") else name
+             for name in wanted.labels()]
+    for name, change in zip(plain, changes, strict=True):
+        if change is not None:
+            partials.append(model.internal(state.displacement, lame_pair=change,
+                                           viscous=viscous).force)
+        elif name == "log_density":
+            partials.append(_density_force(model, state))
+        else:
+            partials.append(_damping_force(model, name, state, viscous))
+    return partials
+
+
+def viscous_force(model: BranchModel, displacement: np.ndarray,
+                  strain: np.ndarray) -> np.ndarray:
+    """Return the nodal forces [N] of the stress that belongs to ``strain`` [tet_count, q, 6]."""
+    return (model.internal(displacement, viscous=Viscous(1.0, strain)).force
+            - model.internal(displacement).force)
+
+
+def _density_force(model: BranchModel, state: object) -> np.ndarray:
+    bare = model.without_point_masses()
+    force = -bare.weight_force
+    velocity = getattr(state, "velocity", None)
+    if velocity is not None:
+        force = force + bare.mass_matrix @ (state.acceleration + model.damping.mass * velocity)
+    return force
+
+
+def _damping_force(model: BranchModel, name: str, state: object,
+                   viscous: Viscous | None) -> np.ndarray:
+    velocity = getattr(state, "velocity", None)
+    if velocity is None:
+        return np.zeros_like(state.displacement)
+    if name == "damping_mass":
+        return model.mass_matrix @ velocity
+    if viscous is None:
+        return np.zeros_like(state.displacement)
+    # The viscous force is linear in the factor.
+    return (model.internal(state.displacement, viscous=viscous).force
+            - model.internal(state.displacement).force) / model.damping.stiffness
+
+
+def explicit_energies(model: BranchModel, wanted: ParameterSet,
+                      displacement: np.ndarray) -> np.ndarray:
+    """Return the derivative of the strain energy [J per parameter] at a held displacement."""
+    return np.array([0.0 if change is None
+                     else model.internal(displacement, lame_pair=change).strain_energy
+                     for change in lame_changes(model, wanted)])
+
+
+def reactions(grasps: Sequence[Grasp], out: np.ndarray) -> np.ndarray:
+    """Return the force on each grasp [N], shape [grasps, 3], of forces ``out`` on all nodes."""
+    return np.array([
+        grasp.weights @ out[grasp.nodes] / (grasp.weights @ grasp.weights)
+        if grasp.mode == "pinned" else out[grasp.nodes].sum(axis=0)
+        for grasp in grasps]).reshape(-1, 3)
+
+
+def checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names as a tuple.
+
+    Raises:
+        InputError: one is not in PARAMETERS.
+    """
+    for name in names:
+        if name not in PARAMETERS:
+            raise InputError(f"There is no parameter {name!r}.",
+                             f"Known are {', '.join(PARAMETERS)}.", "Choose of those.")
+    return tuple(names)
