@@ -183,9 +183,11 @@ def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
     for run, members in enumerate(skeleton.runs()):
         own = members if run == 0 else members[1:]
-        cap = np.inf if run == 0 else radius[members[0]]
+        carrier = members[0]
+        cap = np.inf if run == 0 else 1.1 * max(radius[carrier], radius[skeleton.parent[carrier]])
         for place, node in enumerate(own):
-            if place >= 3:
+            # The first few are too few to speak for the run: a cut stem starts with a ragged end.
+            if place >= max(6, len(own) // 8):
                 cap = min(cap, growth * float(np.median(radius[own[:place]])))
             if radius[node] > cap:
                 radius[node], state[node] = cap, CLAMPED

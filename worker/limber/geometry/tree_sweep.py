@@ -18,6 +18,8 @@ from limber.geometry.skeleton import Skeleton
 from limber.geometry.sweep import any_normal, frames, rings, tangents
 from limber.geometry.tet_mesh import TetMesh
 
+_FLAT = 0.02  # a tetrahedron's shape under that (1 is regular) is avoided
+_SHIFTS = (1, -1, 2, -2, 3, -3)  # where else a twig's slice may go, in its own lengths
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
 
@@ -145,7 +147,7 @@ class _TreeSweep:
         where, mesh, centres = self._unfolded(axis, start, windows, sides, first_normal,
                                               first_tangent)
         nodes = mesh.nodes
-        if mesh.volumes.min() <= 0:
+        if _shapes(nodes, mesh.tets).min() < 0.1 * _FLAT:
             if run == 0:
                 raise MeshingError("The main axis bends more sharply than it is thick.",
                                    "Prisms swept along it would overlap.",
@@ -166,13 +168,15 @@ class _TreeSweep:
         """Rings along an axis whose prisms are not folded over, if that can be had.
 
         Cross-sections cross in a sharp bend; with one fewer they may not. A twig's slice there
-        moves on along the axis, and after three moves is given up (taken from ``windows``).
+        moves along the axis, and is given up (taken from ``windows``) when no place is left.
         """
         moves = {window.run: 0 for window in windows}
+        first_low = {window.run: window.low for window in windows}
         where = self._ring_places(axis, start, windows)
         for _ in range(4 * len(where) + 20):
             mesh, centres = _tube_mesh(axis, where, sides, first_normal, first_tangent)
-            wrong = np.unique(np.flatnonzero(mesh.volumes <= 0) // (3 * sides))
+            flat = _shapes(mesh.nodes, mesh.tets) < _FLAT
+            wrong = np.unique(np.flatnonzero(flat) // (3 * sides))
             if not len(wrong):
                 break
             low, high = where[wrong[0]], where[wrong[0] + 1]
@@ -187,9 +191,12 @@ class _TreeSweep:
                 windows.remove(window)
                 moves[window.run] += 1
                 length = window.high - window.low
-                if moves[window.run] <= 3 and window.high + length < axis.length:
-                    windows.append(_Window(window.run, window.low + length,
-                                           window.high + length, window.outward))
+                for shift in _SHIFTS[moves[window.run] - 1:]:
+                    low = first_low[window.run] + shift * length
+                    if start + 0.2 * length < low and low + length < axis.length:
+                        windows.append(_Window(window.run, low, low + length, window.outward))
+                        break
+                    moves[window.run] += 1
                 where = self._ring_places(axis, start, windows)
             else:
                 break
@@ -219,7 +226,7 @@ class _TreeSweep:
                 if near and apart:
                     placed.append(_Window(window.run, last.low, last.high, window.outward))
                     continue
-            low = max(low, free)
+            low = max(min(low, axis.length - length), free)
             if low + 0.5 * length > end:
                 continue
             high = min(low + length, end)
@@ -319,7 +326,7 @@ class _TreeSweep:
         ring = rings(centre[None], np.array([radius]), turn[None],
                      np.cross(tangent, turn)[None], sides)[0]
         tets, quality = _block(known, patch.loop[order], triangles, centre, ring)
-        return None if quality < 0.02 else _Joint(start, tangent, turn, tets, quality)
+        return None if quality < _FLAT else _Joint(start, tangent, turn, tets, quality)
 
     def _patch_triangles(self, patch: "_Patch") -> np.ndarray:
         """The carrier's boundary triangles on the patch, outward, shape [2 or 4, 3]."""
