@@ -1,7 +1,7 @@
 """The energy field: deformation energy of the branch over the position of its grasp.
 
-Two scalars are kept apart. Both are zero in the rest state, which is the branch hanging under
-its own weight with the gripper open:
+Two scalars are kept apart. Both are zero in the rest state, the branch with the gripper open,
+which hangs under its own weight where it is given any:
 
 - ``energy``: strain energy above that of the rest state, the paper's measure of deformation.
   Lifting a sagging branch can take it below zero; the field is clamped there.

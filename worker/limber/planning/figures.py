@@ -60,6 +60,7 @@ def along_paths(plan: dict[str, Any]) -> "Figure":
 def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
     """Draw both paths over the energy field in their common plane."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     paths = {key: np.array(plan[key]["poses"])[:, :3] for key in ("baseline", "plan")}
     origin, across, up = _plane(np.concatenate(list(paths.values())))
@@ -70,10 +71,10 @@ def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
     axis = figure.subplots()
     # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
     top = max(1.5 * max(max(plan[key]["energies_j"]) for key in paths), 1e-9)
-    levels = np.linspace(0.0, 1e3 * top, 16)
+    levels = MaxNLocator(14).tick_values(0.0, 1e3 * top)
     filled = axis.contourf(1e3 * x, 1e3 * y, np.ma.masked_invalid(1e3 * energy), levels=levels,
                            cmap="viridis", extend="max")
-    figure.colorbar(filled, ax=axis, label="strain energy above rest [mJ]", format="%.3g")
+    figure.colorbar(filled, ax=axis, label="strain energy above rest [mJ]")
     for key, points in flat.items():
         axis.plot(*(1e3 * points.T), color="white", lw=4)
         axis.plot(*(1e3 * points.T), color=_COLOURS[key], lw=2, label=_LABELS[key])

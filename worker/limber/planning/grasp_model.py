@@ -7,7 +7,8 @@ by turning as the branch would, so each pose carries that natural rotation for t
 gripper that turns otherwise bends the branch more than planned here.
 """
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +20,7 @@ from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import (
     BranchModel,
     Grasp,
+    PointMass,
     StaticResult,
     StaticSettings,
     follow_poses,
@@ -27,6 +29,7 @@ from limber.mechanics import (
 from limber.mechanics.strain import strain_state
 from limber.store import Branch
 
+_PARTS = ("mesh", "reach", "gravity", "point_masses")
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
 _SETTINGS = StaticSettings(min_step=1 / 64)
 
@@ -63,20 +66,23 @@ class GraspModel:
     """A branch, its grasp and its own weight; picklable, so that processes can each have one.
 
     Attributes:
-        mesh: Tetrahedra with material and grasp.
+        mesh: Tetrahedra with material and grasp, free of stress as they are.
         reach: Where the grasp may go.
         gravity: Acceleration [m/s^2], or None for a branch without weight.
+        point_masses: Masses that hang on the branch.
     """
 
     mesh: TetMesh
     reach: Reach
     gravity: tuple[float, float, float] | None
+    point_masses: tuple[PointMass, ...] = ()
 
     @cached_property
     def model(self) -> BranchModel:
         data = self.mesh.cell_data
         return BranchModel(self.mesh, young=data["young"], poisson=data["poisson"],
-                           density=data["density"], gravity=self.gravity)
+                           density=data["density"], gravity=self.gravity,
+                           point_masses=self.point_masses)
 
     @cached_property
     def grasp(self) -> Grasp:
@@ -84,7 +90,7 @@ class GraspModel:
 
     @cached_property
     def rest(self) -> StaticResult:
-        """The rest state: the branch under its own weight, the gripper open.
+        """The rest state: the branch with the gripper open, under its weight if it has any.
 
         Raises:
             ConvergenceError: there is none, as when the branch cannot bear its weight.
@@ -134,7 +140,7 @@ class GraspModel:
 
     def __getstate__(self) -> dict[str, Any]:
         # Only what it is made of goes to another process; models hold compiled factors.
-        return {name: getattr(self, name) for name in ("mesh", "reach", "gravity")}
+        return {name: getattr(self, name) for name in _PARTS}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():
@@ -149,11 +155,15 @@ def acceptable(result: StaticResult) -> str:
 
 
 def read_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
-    """Read mesh and skeleton of a branch folder; ``gravity``: whether it bears its weight.
+    """Read the branch model of a branch folder.
+
+    Without ``gravity`` the scanned shape is the rest state and free of stress. With it the
+    scanned shape is the one that the branch hangs in under its own weight: the shape that it
+    would have without weight is computed first, so that the rest state is the scan again.
 
     Raises:
         BranchFolderError: a file is missing.
-        WorkError: the mesh marks no material.
+        WorkError: the mesh marks no material, or the branch cannot bear its weight.
     """
     mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
     skeleton = Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
@@ -161,5 +171,17 @@ def read_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
     if missing:
         raise WorkError(f"The mesh has no {', '.join(sorted(missing))}.",
                         "Its energy cannot be computed.", "Reconstruct the branch again.")
-    centre = Grasp.from_mesh(mesh).centre
-    return GraspModel(mesh, Reach.of(skeleton, centre), branch.gravity if gravity else None)
+    reach = Reach.of(skeleton, Grasp.from_mesh(mesh).centre)
+    if not gravity:
+        return GraspModel(mesh, reach, None)
+    from limber.mechanics.rest_shape import unloaded_rest_shape
+
+    hanging = GraspModel(mesh, reach, branch.gravity, _point_masses(branch))
+    return replace(hanging, mesh=unloaded_rest_shape(hanging.model))
+
+
+def _point_masses(branch: Branch) -> tuple[PointMass, ...]:
+    if not branch.has("point_masses.json"):
+        return ()
+    masses = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
+    return tuple(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses)

@@ -18,7 +18,7 @@ from numba import njit
 from limber.errors import NoPathError
 from limber.planning.field import EnergyField, FieldArrays
 from limber.planning.objective import EdgeWeights, edge_cost, path_cost
-from limber.planning.smoothing import polish, shortcut
+from limber.planning.smoothing import polish, shortcut, slide_end
 from limber.progress import SILENT, Progress
 
 _CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
@@ -123,6 +123,7 @@ def plan_path(problem: Problem, search: Search, *, engine: str = "own",
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
     points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,
                       seed=search.seed)
+    points = slide_end(points, problem.goals, problem.limits, problem.weights)
     points = polish(points, problem.energy_field, problem.limits, problem.weights)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
                      history, node_count, engine)

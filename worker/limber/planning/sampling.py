@@ -40,7 +40,9 @@ class EnergySettings(BaseModel):
     stretch: float = Field(0.2, ge=0, le=1.0, description=(
         "How far out of its curve the branch may be pulled straight: 0 the distance between base "
         "and grasp at rest, 1 the length of branch between them."))
-    gravity: bool = Field(True, description="Let the branch bear its own weight.")
+    gravity: bool = Field(False, description=(
+        "Let the branch bear its own weight; the scanned shape is then the one it hangs in. "
+        "Otherwise it has no weight, and the scanned shape is free of stress."))
     workers: int = Field(2, ge=1, le=16, description="Processes that solve side by side.")
     seed: int = Field(0, ge=0, description="Of the sampled positions.")
 
@@ -281,4 +283,4 @@ def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
     for name in ("young", "poisson", "density"):
         material.update(np.ascontiguousarray(mesh.cell_data[name], float).tobytes())
     return {"mesh geometry": mesh.geometry_digest(), "material": material.hexdigest(),
-            "gravity": str(grasp_model.gravity)}
+            "weight": str((grasp_model.gravity, grasp_model.point_masses))}

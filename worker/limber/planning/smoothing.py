@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from limber.planning.field import EnergyField, FieldArrays
-from limber.planning.objective import EdgeWeights, edge_cost, path_cost, resample
+from limber.planning.objective import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
 
 _POLISH_POINTS = 40  # corners of the path while it is polished
 _MIN_GAP = 1e-9  # [m] keeps the length's gradient finite where two corners meet
@@ -31,6 +31,22 @@ def shortcut(path: np.ndarray, field: FieldArrays, weights: EdgeWeights, *, atte
             straight = np.linspace(path[first], path[last], last - first + 1)
             path = np.concatenate([path[:first], straight, path[last + 1:]])
     return resample(path, weights.step)
+
+
+def slide_end(path: np.ndarray, goals: np.ndarray, limits: FieldArrays, weights: EdgeWeights,
+              ) -> np.ndarray:
+    """Return the path bent to end in that one of ``goals`` [g, 3] which makes it cheapest.
+
+    A tree ends in the goal region where its samples happened to fall; the region is as good
+    everywhere, the path to it is not.
+    """
+    part = (arc_lengths(path) / max(arc_lengths(path)[-1], _MIN_GAP))[:, None]
+    best, least = path, path_cost(path, limits, weights)
+    for goal in goals:
+        bent = path + part * (goal - path[-1])
+        if (cost := path_cost(bent, limits, weights)) < least:
+            best, least = bent, cost
+    return best
 
 
 def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
