@@ -146,18 +146,18 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
 
 
 def _add_points(shown: ShownBranch, data: SceneData) -> None:
-    for name, title, share in (("control_points", "Control point", 0.013),
-                               ("grasp", "Grasp", 0.015)):
+    for name, title in (("control_points", "Control point"), ("grasp", "Grasp")):
         points = data.arrays.get(name, np.empty((0, 3)))
         if len(points) == 0:
             continue
-        ball = meshes.new_sphere(title, share * data.info["size_m"])
+        ball = meshes.new_sphere(title, 1.0)
         meshes.set_one_color(ball, COLORS[name])
         material = materials.plain_material(title, COLORS[name], roughness=0.35)
         shown.objects[name] = []
         for number, point in enumerate(points):
             thing = add_object(shown.collection, f"{title} {number + 1}", ball, material)
             thing.location = point
+            thing.scale = [data.arrays[f"{name}_radius"][number]] * 3
             shown.objects[name].append(thing)
 
 

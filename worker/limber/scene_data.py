@@ -53,9 +53,10 @@ def scene_data(branch: Branch, plan: str | None = None) -> SceneData:
 
     Arrays: ``vertices`` [v, 3] m, ``faces`` [f, 3]; for each name in ``info["scalars"]`` the
     values ``scalar:NAME`` [v] and linear colours ``color:NAME`` [v, 4]; ``control_points``
-    [k, 3] m; ``grasp`` [1, 3] m; for each of ``info["paths"]`` the points ``path:NAME``
-    [p, 3] m; ``grasp_motion`` [frames, 3] m; ``frame_energy`` [frames] J; ``view_points``
-    [n, 3] m and ``view_direction`` [3].
+    [k, 3] m and ``grasp`` [1, 3] m, with the radii of the balls that mark them,
+    ``control_points_radius`` [k] m and ``grasp_radius`` [1] m; for each of ``info["paths"]`` the
+    points ``path:NAME`` [p, 3] m; ``grasp_motion`` [frames, 3] m; ``frame_energy`` [frames] J;
+    ``view_points`` [n, 3] m and ``view_direction`` [3].
 
     Raises:
         BranchFolderError: no mesh yet, no such plan, or frames of another mesh.
@@ -165,6 +166,10 @@ def _add_markers(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
         at = np.flatnonzero(np.asarray(points["grasp"]) > 0)
         if len(at):
             data.arrays["grasp"] = mesh.nodes[at].mean(axis=0).reshape(1, 3)
+    for name, share in (("control_points", 0.013), ("grasp", 0.015)):
+        if len(data.arrays.get(name, ())):
+            data.arrays[f"{name}_radius"] = _marker_radii(
+                data.arrays[name], data.arrays["vertices"], share)
     if "fixed" in points:
         fixed = data.arrays["vertices"][np.asarray(points["fixed"])[used] > 0]
         if len(fixed):
@@ -172,6 +177,13 @@ def _add_markers(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
             radius = np.linalg.norm((fixed - middle)[:, :2], axis=1).max()
             data.info["base"] = {"centre_m": middle, "top_m": fixed[:, 2].max(),
                                  "radius_m": radius}
+
+
+def _marker_radii(points: np.ndarray, vertices: np.ndarray, share: float) -> np.ndarray:
+    """Return radii [m] of balls at ``points`` that are seen: as a share of all, and not inside."""
+    distance = np.linalg.norm(points[:, None] - vertices, axis=2)
+    around = np.sort(distance, axis=1)[:, :6].mean(axis=1)
+    return np.maximum(share * np.ptp(vertices, axis=0).max(), 1.4 * around)
 
 
 def _add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
