@@ -1,11 +1,20 @@
-"""Analytic energy fields, as if a branch model had been asked: no finite elements here."""
+"""Analytic energy fields, as if a branch model had been asked, and one small real branch."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
+from limber.geometry.cylinder_mesh import curved_beam
+from limber.geometry.marks import mark
+from limber.geometry.skeleton import Skeleton
+from limber.mechanics import Grasp
+from limber.planning.compare import PlanSettings
 from limber.planning.field import GraspSamples, fit_field
+from limber.planning.grasp_model import GraspModel, Reach
+from limber.planning.plan import plan_branch_motion
+from limber.planning.sampling import EnergySettings, sample_energy_field
+from limber.store import Branch
 
 STIFFNESS = np.array([8.0, 8.0, 30.0])  # [N/m] soft to the sides, stiff along the branch
 SIDE = np.array([0.02, 0.02, 0.0])  # [m] where the ridge stands
@@ -63,3 +72,41 @@ def well_field(well):
 @pytest.fixture(scope="session")
 def ridge_field(ridge):
     return fit_field(ridge.samples())
+
+
+@pytest.fixture(scope="session")
+def small_skeleton():
+    """An arc half a metre long that bends by 0.4 rad."""
+    s = np.linspace(0.0, 1.0, 41)
+    tangent = np.column_stack([np.sin(0.4 * s), 0 * s, np.cos(0.4 * s)])
+    steps = (tangent[1:] + tangent[:-1]) / 2 * 0.5 / 40
+    nodes = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    return Skeleton(nodes, np.arange(-1, 40), np.interp(s, [0, 1], [0.008, 0.006]))
+
+
+@pytest.fixture(scope="session")
+def small_mesh(small_skeleton):
+    """A coarse mesh of it, with base, grasp and a stiffness that falls towards the tip."""
+    mesh = curved_beam(small_skeleton.nodes, small_skeleton.radius, slice_length=5.0, sides=5)
+    mesh = mark(mesh, small_skeleton, young=1e8, poisson=0.35, density=900.0)
+    young = np.interp(mesh.centroids[:, 2], [0.0, 0.5], [1.5e8, 0.5e8])
+    return mesh.with_data(cell_data={"young": young})
+
+
+@pytest.fixture(scope="session")
+def small_model(small_mesh, small_skeleton):
+    return GraspModel(small_mesh, Reach.of(small_skeleton, Grasp.from_mesh(small_mesh).centre),
+                      None)
+
+
+@pytest.fixture(scope="session")
+def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
+    """A branch folder with an energy field and a plan, as the commands make them."""
+    folder = tmp_path_factory.mktemp("planning") / "small.branch"
+    branch = Branch.create(folder)
+    with branch.stage("mesh") as stage:
+        small_mesh.write(stage.path("mesh.vtu"))
+        small_skeleton.write_swc(stage.path("skeleton.swc"))
+    sample_energy_field(folder, EnergySettings(samples=60, workers=1))
+    plan_branch_motion(folder, PlanSettings(iterations=800, start_seed=3), name="there", workers=1)
+    return folder

@@ -1,0 +1,132 @@
+"""Sampled grasp poses: where they lie, and that their energies and forces belong together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.errors import Cancelled, WorkError
+from limber.mechanics import Grasp, solve_static
+from limber.planning.chart import Chart
+from limber.planning.grasp_model import Reach
+from limber.planning.sampling import sample_branch, sample_positions, without_taut
+from limber.progress import Progress
+
+REACH = Reach(np.zeros(3), 0.4, 0.38, np.array([0.0, 0.0, 0.6]))
+REST = np.array([0.0, 0.0, 0.38])
+
+
+def test_positions_stay_in_reach():
+    """Within the deflection of rest, above the base, no farther than the branch is long."""
+    points = sample_positions(REACH, REST, 200, deflection=0.4, stretch=0.5, seed=3)
+    assert points.shape == (200, 3)
+    assert np.linalg.norm(points - REST, axis=1).max() <= 0.4 * 0.4
+    assert np.linalg.norm(points, axis=1).max() <= 0.38 + 0.5 * 0.02 + 1e-12
+    assert points[:, 2].min() >= 0.0
+    near_reach = np.linalg.norm(points, axis=1) > 0.94 * 0.39
+    assert 0.4 < near_reach.mean() < 0.95, "half of them lie where gentle paths run"
+
+
+def test_positions_follow_the_seed():
+    """The same seed gives the same positions, another seed others; a longer run only adds."""
+    first = sample_positions(REACH, REST, 50, deflection=0.4, seed=1)
+    assert np.array_equal(first, sample_positions(REACH, REST, 80, deflection=0.4, seed=1)[:50])
+    assert not np.allclose(first, sample_positions(REACH, REST, 50, deflection=0.4, seed=2))
+
+
+def test_no_room_is_an_error():
+    """A grasp at the base has nowhere to go, and the message says what to change."""
+    with pytest.raises(WorkError, match="farther out"):
+        sample_positions(Reach(np.zeros(3), 0.4, 0.38, REST), np.array([0, 0, -0.5]), 50,
+                         deflection=0.4)
+
+
+@pytest.fixture(scope="module")
+def some(small_model):
+    targets = sample_positions(small_model.reach, small_model.rest_position, 14, deflection=0.3)
+    return targets, *sample_branch(small_model, targets)
+
+
+def test_samples_hold_what_was_asked(small_model, some):
+    """Rest first with nothing stored; the others where they were sent, bent and not inverted."""
+    targets, samples, reasons = some
+    assert not reasons and len(samples.poses) == 15
+    assert samples.energies[0] == 0.0 and not samples.forces[0].any()
+    assert np.allclose(samples.positions[0], small_model.grasp.centre, atol=1e-9)
+    assert np.allclose(samples.positions[1:], targets, atol=1e-7)
+    assert (samples.energies[1:] > 0).all() and (samples.min_det_f > 0.5).all()
+
+
+def test_force_is_the_gradient_of_work(small_model, some):
+    """Central differences of the solved energy give the gripper's force, with and without weight.
+
+    Under weight it is the work, strain energy and lifted weight, whose gradient it is.
+    """
+    target = some[0][2]
+    heavy = replace(small_model, gravity=(0.0, 0.0, -9.80665))
+    for model in (small_model, heavy):
+        here = model.follow(target[None], model.rest.displacement)[0]
+        step, slope = 1e-4, np.zeros(3)
+        for axis in range(3):
+            moved = np.eye(3)[axis] * step
+            there, back = (model.follow((target + s * moved)[None], here.displacement)[0]
+                           for s in (1, -1))
+            slope[axis] = (model.work(there) - model.work(back)) / (2 * step)
+        assert np.allclose(slope, here.reaction_force, rtol=0,
+                           atol=2e-3 * np.linalg.norm(here.reaction_force))
+    assert abs(heavy.work(here) - heavy.energy(here)) > 1e-3, "the weight must matter here"
+
+
+def test_firm_grasp_at_the_natural_rotation_costs_no_more(small_model, some):
+    """A clamped gripper that turns as the sample says needs the pinned one's energy (2 %)."""
+    firm = Grasp.from_mesh(small_model.mesh, mode="clamped")
+    for target in some[0][:3]:
+        loose = small_model.follow(target[None], small_model.rest.displacement)[0]
+        held = solve_static(small_model.model, grasp=firm,
+                            pose=small_model.pose(loose.displacement), start=loose.displacement)
+        assert held.converged
+        assert small_model.energy(held) == pytest.approx(small_model.energy(loose), rel=0.02)
+
+
+def test_two_processes_give_the_same_samples(small_model, some):
+    """Side by side, each with its own tree, the same equilibria come out."""
+    targets, alone, _ = some
+    together, reasons = sample_branch(small_model, targets, workers=2)
+    assert not reasons
+    assert np.allclose(together.energies, alone.energies, rtol=1e-4, atol=1e-6)
+    assert np.allclose(together.forces, alone.forces, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_cancel_ends_sampling(small_model, some, workers):
+    """A cancel is obeyed between poses, in this process and across processes."""
+    progress = Progress(lambda fraction, _message, _numbers:
+                        progress.cancel() if fraction > 0 else None)
+    with pytest.raises(Cancelled):
+        sample_branch(small_model, some[0], workers=workers, progress=progress)
+
+
+def test_taut_poses_are_left_out(ridge):
+    """Poses that take over twice the usual force go; the rest pose stays whatever it takes."""
+    samples = ridge.samples()
+    forces = samples.forces.copy()
+    forces[[0, 5, 9]] *= 1e3
+    kept, count = without_taut(replace(samples, forces=forces))
+    assert count >= 2 and len(kept.poses) == len(samples.poses) - count
+    assert np.array_equal(kept.poses[0], samples.poses[0])
+    assert np.linalg.norm(kept.forces[1:], axis=1).max() < 1e2
+
+
+def test_chart_gradients_are_those_of_the_map():
+    """Pulled back through the chart, a gradient is that of the composed function."""
+    chart = Chart(np.array([0.0, 0.01, -0.02]), 0.4, 2.5)
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) + [0, 0, 0.35]
+    normal = np.array([0.3, -1.0, 0.6])
+    gradient = np.tile(normal, (20, 1))
+    step = 1e-6
+    differences = np.stack(
+        [(chart.map(points + step * axis) - chart.map(points - step * axis)) @ normal / (2 * step)
+         for axis in np.eye(3)], axis=1)
+    pulled = chart.pull_back(points, gradient)
+    assert np.allclose(pulled, differences, atol=1e-7)
+    assert np.allclose(chart.push_forward(points, pulled), gradient, atol=1e-9)
