@@ -188,11 +188,59 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
     skeleton = resampled(skeleton, 1.5)
     fit = fit_axes(skeleton, points, progress=progress.part(0.0, 0.5))
-    skeleton = _with_full_tips(attached(fit.skeleton), points, fit)
-    keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, skeleton.radius, settings.prune)
-    skeleton = resampled(clamped(skeleton.subset(keep), low, high), 1.0)
+    skeleton = _with_full_tips(_without_bare_ends(attached(fit.skeleton), points), points, fit)
+    # Noise makes a carrier look thicker, and its outliers look like twigs.
+    reach = skeleton.radius + 2 * fit.noise
+    keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
+    skeleton = skeleton.subset(keep)
+    while (inside := _embedded_run(skeleton)) is not None:
+        skeleton, pruned = skeleton.subset(skeleton.branch != inside), pruned + 1
+    skeleton = resampled(clamped(skeleton, low, high), 1.0)
     fit = fit_axes(skeleton, points, progress=progress.part(0.5, 1.0))
     return replace(fit, skeleton=tapered(clamped(fit.skeleton, low, high))), pruned
+
+
+def _embedded_run(skeleton: Skeleton) -> int | None:
+    """A side run without twigs of its own that lies mostly inside the others, if there is one.
+
+    Where a scan has holes, the contraction may leave two strands in one branch.
+    """
+    carriers = set(skeleton.branch[skeleton.parent[1:]][
+        skeleton.branch[1:] != skeleton.branch[skeleton.parent[1:]]].tolist())
+    for run in range(skeleton.branch_count - 1, 0, -1):
+        own = skeleton.branch == run
+        if run in carriers:
+            continue
+        distance, near = cKDTree(skeleton.nodes[~own]).query(skeleton.nodes[own])
+        if float(np.median(distance / skeleton.radius[~own][near])) < 1.3:
+            return run
+    return None
+
+
+def _without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Drop end nodes that no point belongs to: the contraction can overshoot an end."""
+    segment, _ = nearest_cylinders(skeleton, points)
+    count = np.bincount(segment, minlength=skeleton.node_count)
+    keep = np.ones(skeleton.node_count, bool)
+    for members in skeleton.runs():
+        if (skeleton.parent == members[-1]).any():
+            continue
+        own = list(members[1:])
+        while len(own) > 2 and count[own[-1]] == 0:
+            keep[own.pop()] = False
+    # The root end: a bare first segment belongs to its upper node.
+    children = skeleton.child_counts()
+    root, nodes, parent = 0, skeleton.nodes, skeleton.parent.copy()
+    while children[root] == 1:
+        following = int(np.flatnonzero(parent == root)[0])
+        if count[following] > 0 or children[following] != 1:
+            break
+        keep[root], parent[following], root = False, -1, following
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
+    return Skeleton.from_edges(nodes[keep], moved, skeleton.radius[keep],
+                               radius_sigma=skeleton.radius_sigma[keep],
+                               radius_state=skeleton.radius_state[keep])
 
 
 def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleton:
