@@ -1,0 +1,187 @@
+"""The stages end to end on a small branch by finite elements: files, honesty, refusals."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from limber.cli import call
+from limber.errors import BranchFolderError, Cancelled, ConvergenceError, InputError, NoPathError
+from limber.geometry.tet_mesh import TetMesh
+from limber.planning.compare import PlanSettings
+from limber.planning.field import EnergyField
+from limber.planning.figures import report_figures
+from limber.planning.goals import default_goal
+from limber.planning.plan import plan_branch_motion
+from limber.planning.resolve import resolve_path
+from limber.planning.sampling import EnergySettings, sample_energy_field
+from limber.progress import Progress
+from limber.store import Branch
+
+ENERGY = EnergySettings(samples=60, workers=1)
+QUICK = {"iterations": 500, "start_seed": 3}
+
+
+@pytest.fixture
+def copied(planned_branch, tmp_path):
+    """A copy of the planned branch that a test may spoil."""
+    return shutil.copytree(planned_branch, tmp_path / "copy.branch")
+
+
+def read_plan(folder, name="there"):
+    return json.loads((folder / "plans" / f"{name}.json").read_text())
+
+
+def test_deformation_aware_path_is_gentler_on_the_full_model(planned_branch):
+    """By finite elements, D-RRT* stores less along its way than RRT*, for some more length."""
+    plan = read_plan(planned_branch)
+    assert plan["energy_saved_percent"] > 10.0
+    assert 0.0 <= plan["length_added_percent"] < 40.0
+    assert plan["plan"]["peak_energy_j"] <= 1.01 * plan["baseline"]["peak_energy_j"]
+
+
+def test_reported_energies_are_the_full_models(planned_branch, small_model):
+    """Energy, force and pose of a path's point are those that the branch model gives there."""
+    plan = read_plan(planned_branch)["plan"]
+    poses = np.array(plan["poses"])
+    middle = len(poses) // 2
+    result = small_model.follow(poses[middle:middle + 1, :3],
+                                resolve_path(small_model, poses[:middle, :3],
+                                             np.stack([small_model.rest_position, poses[0, :3]])
+                                             ).displacements[-1])[0]
+    assert small_model.energy(result) == pytest.approx(plan["energies_j"][middle], rel=1e-4)
+    assert np.linalg.norm(result.reaction_force) == pytest.approx(plan["forces_n"][middle],
+                                                                  rel=1e-3)
+    assert np.allclose(small_model.pose(result.displacement), poses[middle], atol=1e-4)
+
+
+def test_field_agrees_with_the_full_model_along_the_paths(planned_branch):
+    """Along both paths the field was within 15 % (root mean square) and it is reported."""
+    plan = read_plan(planned_branch)
+    for key in ("baseline", "plan"):
+        path = plan[key]
+        off = np.array(path["field_energies_j"]) - np.array(path["energies_j"])
+        error = np.sqrt(np.mean(off**2) / np.mean(np.square(path["energies_j"])))
+        assert path["field_energy_error"] == pytest.approx(error, rel=1e-3)
+        assert error < 0.15
+
+
+def test_files_tell_the_same(planned_branch, small_mesh):
+    """Table, plan and frames have the same points; columns and keys are the contract's."""
+    plan = read_plan(planned_branch)
+    for name, key in (("there", "plan"), ("there-baseline", "baseline")):
+        with open(planned_branch / "plans" / f"{name}.csv", newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        assert list(rows[0]) == ["s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
+                                 "energy_j", "force_n", "strain"]
+        assert len(rows) == len(plan[key]["poses"])
+        assert float(rows[-1]["s_m"]) == pytest.approx(plan[key]["length_m"], rel=1e-6)
+        assert {"length_m", "energy_integral_jm", "energy_sum_nmm", "peak_energy_j",
+                "peak_force_n"} <= set(plan[key])
+    frames = json.loads((planned_branch / "frames/there.json").read_text())
+    data = (planned_branch / "frames/there.pc2").read_bytes()
+    vertex_count = len(np.unique(small_mesh.surface_faces()))
+    assert frames["frame_count"] == len(plan["plan"]["poses"])
+    assert len(data) == 32 + 12 * frames["frame_count"] * vertex_count
+
+
+def test_folder_can_be_read_again_and_is_not_done_twice(copied):
+    """A moved folder opens, its field gives numbers, and the same stage returns at once."""
+    branch = Branch.open(copied)
+    before = branch.manifest.stages["plan:there"].finished, branch.digest("plans/there.json")
+    field = EnergyField.read(branch.path("energy.npz"))
+    assert field.energy(field.rest)[0] < 1e-3 * field.samples.energies.max()
+    sample_energy_field(copied, ENERGY)
+    plan_branch_motion(copied, PlanSettings(iterations=800, start_seed=3), name="there")
+    again = Branch.open(copied)
+    assert (again.manifest.stages["plan:there"].finished,
+            again.digest("plans/there.json")) == before
+
+
+def test_same_seed_same_plan(copied):
+    """Run again by force, the planner's path is the same to the bit."""
+    before = read_plan(copied)
+    plan_branch_motion(copied, PlanSettings(iterations=800, start_seed=3), name="there",
+                       workers=1, force=True)
+    after = read_plan(copied)
+    for key in ("baseline", "plan"):
+        assert np.array_equal(before[key]["field_energies_j"], after[key]["field_energies_j"])
+    assert before["convergence"] == after["convergence"]
+
+
+def test_other_modulus_makes_the_field_stale(copied):
+    """After an estimate changed Young's modulus, planning asks for the energy stage again."""
+    branch = Branch.open(copied)
+    mesh = TetMesh.read(branch.path("mesh.vtu"))
+    with branch.stage("estimate") as stage:
+        mesh.with_data(cell_data={"young": 2 * mesh.cell_data["young"]}).write(
+            stage.path("mesh.vtu"))
+    with pytest.raises(BranchFolderError, match="limber energy"):
+        plan_branch_motion(copied, PlanSettings(**QUICK), name="other")
+
+
+def test_refusals_leave_the_folder_as_it_was(copied):
+    """Goals out of reach, over a limit, doubled, or a cancel: an error each, no file changed."""
+    before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
+    with pytest.raises(NoPathError, match="misses it by"):
+        plan_branch_motion(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
+    with pytest.raises(NoPathError, match="max-force"):
+        plan_branch_motion(copied, PlanSettings(max_force=0.01), name="bad")
+    with pytest.raises(InputError, match="tip-goal"):
+        plan_branch_motion(copied, PlanSettings(goal=(0, 0, 1), tip_goal=(0, 0, 1)), name="bad")
+    with pytest.raises(InputError, match="outside the sampled region"):
+        plan_branch_motion(copied, PlanSettings(start=(1.0, 1.0, 1.0)), name="bad")
+    progress = Progress(lambda fraction, _message, _numbers:
+                        progress.cancel() if fraction > 0.05 else None)
+    with pytest.raises(Cancelled):
+        plan_branch_motion(copied, PlanSettings(**QUICK), name="bad", progress=progress)
+    assert sorted(p.name for p in copied.rglob("*") if p.name != ".lock") == before
+
+
+def test_limit_holds_on_the_full_model(copied):
+    """With a cap on energy below the shortest path's peak, both paths stay under it (10 %)."""
+    plan = read_plan(copied)
+    energies = plan["baseline"]["energies_j"]
+    ends = max(energies[0], energies[-1])
+    cap = max(0.5 * (ends + plan["baseline"]["peak_energy_j"]), 1.02 * ends)
+    capped = plan_branch_motion(copied, PlanSettings(max_energy=cap, **QUICK), name="capped",
+                                workers=1)
+    assert capped["baseline"]["peak_energy_j"] < 1.1 * cap
+    assert capped["plan"]["peak_energy_j"] < 1.1 * cap
+
+
+def test_tip_goal_puts_the_real_tip_there(copied):
+    """With a goal for the tip, the full model's tip ends within twice the tolerance."""
+    field = EnergyField.read(copied / "energy.npz")
+    wanted = field.tip(np.array(default_goal(field, 0.01).position))[0]
+    done = plan_branch_motion(copied, PlanSettings(tip_goal=tuple(wanted), iterations=500),
+                              name="tip", workers=1)
+    assert np.linalg.norm(np.array(done["plan"]["tip_end_m"]) - wanted) < 0.02
+
+
+def test_path_that_the_branch_cannot_follow_is_an_error(small_model):
+    """A path that tears the branch ends in ConvergenceError and not in numbers."""
+    away = small_model.rest_position + np.linspace(0, 1, 8)[:, None] * np.array([0, 0, 2.0])
+    with pytest.raises(ConvergenceError, match="no acceptable solution"):
+        resolve_path(small_model, away, small_model.rest_position[None])
+
+
+def test_command_prints_its_result(copied, capsys):
+    """`limber plan --json` ends with one object that has the contract's keys."""
+    code = call(["plan", str(copied), "--name", "there", "--iterations", "800", "--start-seed",
+                 "3", "--json"])
+    last = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert code == 0 and last["status"] == "done"
+    assert {"baseline", "plan", "energy_saved_percent", "length_added_percent", "goal", "seed",
+            "convergence"} <= set(last)
+    assert call(["plan", str(copied), "--name", "../evil"]) == 2
+
+
+def test_figures_draw(planned_branch, tmp_path):
+    """The report's figures can be drawn, each with a caption."""
+    for number, (figure, caption) in enumerate(report_figures(Branch.open(planned_branch),
+                                                              "there")):
+        figure.savefig(tmp_path / f"{number}.png")
+        assert caption and (tmp_path / f"{number}.png").stat().st_size > 5000
