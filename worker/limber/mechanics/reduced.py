@@ -55,7 +55,7 @@ class ReducedSettings:
 
     size: int = 66
     vibration_count: int = 6
-    field_count: int | None = 110
+    field_count: int | None = 120
     training: TrainingSettings = TrainingSettings()  # noqa: RUF009 (frozen)
 
 

@@ -23,8 +23,9 @@ MOVE_STEP = 0.05
 """Step of a tangent to the position, as part of the extent."""
 TURN_STEP = 0.15
 """Step of a tangent to the rotation [rad]."""
-VIBRATION_STEP = 0.005
-"""Amplitude of a vibration among the strain fields, as part of the extent."""
+VIBRATION_STEP = 0.2
+"""Amplitude of a vibration among the strain fields, as part of the extent: large, since free ends
+have next to no strain in the states, and would flutter if their own strains were left out."""
 
 
 @dataclass(frozen=True)

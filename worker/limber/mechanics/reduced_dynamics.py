@@ -19,6 +19,7 @@ from limber.mechanics.reduced import ReducedModel, ReducedState, solved_raised
 from limber.progress import SILENT, Progress
 
 _HALVINGS = 6
+_NEAR = 1e-5
 _NEWMARK = NewmarkSettings()
 
 
@@ -110,6 +111,7 @@ class ReducedStepper:
         q[:count] = held
         viscous, massive = model.damping.stiffness, model.damping.mass
         mass_part = (by_mass + massive * by_rate) * model.mass[free, free]
+        last = np.inf
         for _ in range(settings.max_iterations):
             moved = q - old.coordinates
             velocity = by_rate * moved + (1 - settings.gamma / settings.beta) * old.velocity \
@@ -130,12 +132,16 @@ class ReducedStepper:
             gain = 0.5 * abs(float(right @ change))
             if not np.isfinite(gain):
                 return False
-            if gain <= settings.tolerance**2 * max(energy, self.kinetic_energy, 1e-9):
+            scale = max(energy, self.kinetic_energy, 1e-9)
+            # Near the end Newton's next gain falls at least as this one did against the last.
+            expected = gain * min(1.0, gain / last) if gain < _NEAR * scale else gain
+            if expected <= settings.tolerance**2 * scale:
                 velocity[free] += by_rate * change
                 acceleration[free] += by_mass * change
                 self.strain_energy = energy
                 self.state = ReducedMotionState(old.time + step, q, velocity, acceleration)
                 return True
+            last = gain
         return False
 
     def _add_viscous(self, force: np.ndarray, tangent: np.ndarray, velocity: np.ndarray,

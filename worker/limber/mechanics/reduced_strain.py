@@ -216,12 +216,22 @@ def _green(H: np.ndarray) -> np.ndarray:
         for (i, j), scale in zip(_PAIRS, _SHEAR, strict=True)], axis=1)
 
 
-def _green_change(H: np.ndarray, D: np.ndarray) -> np.ndarray:
-    """Change of the strain at H by D, both [p, 3, 3, f]."""
-    return np.stack([
-        scale * 0.5 * (D[:, i, j] + D[:, j, i] + (H[:, :, i] * D[:, :, j]).sum(axis=1)
-                       + (D[:, :, i] * H[:, :, j]).sum(axis=1))
-        for (i, j), scale in zip(_PAIRS, _SHEAR, strict=True)], axis=1)
+@compiled
+def _green_change(H, D, owners, scales, strain):
+    """Write the change of the strain (shear scaled) at states H [p, 3, 3, s] by D [p, 3, 3, f].
+
+    Field f belongs to state owners[f] and is scaled by scales[f].
+    """
+    root = np.sqrt(0.5)
+    for p in range(D.shape[0]):
+        for f in range(D.shape[3]):
+            s, scale = owners[f], scales[f]
+            for k in range(6):
+                i, j = _PAIRS[k, 0], _PAIRS[k, 1]
+                total = D[p, i, j, f] + D[p, j, i, f]
+                for c in range(3):
+                    total += H[p, c, i, s] * D[p, c, j, f] + D[p, c, i, f] * H[p, c, j, s]
+                strain[p, k, f] = scale * total * (0.5 if k < 3 else root)
 
 
 @dataclass(frozen=True)
@@ -234,10 +244,10 @@ class _Sources:
     def strains(self, points: _Points, chunk: slice) -> np.ndarray:
         H = points.gradient(self.states, chunk)
         parts = [_green(H)]
-        for fields, owners, scale in self.changes:
-            if len(fields):
-                parts.append(_green_change(H[..., owners], points.gradient(fields, chunk))
-                             * scale)
+        for fields, owners, scales in self.changes:
+            strain = np.empty((len(H), 6, len(fields)))
+            _green_change(H, points.gradient(fields, chunk), owners, scales, strain)
+            parts.append(strain)
         return np.concatenate(parts, axis=2)
 
 

@@ -232,11 +232,29 @@ class Trainer:
             raise ConvergenceError(
                 f"None of {len(poses)} training grasps has an equilibrium.",
                 "They may lie out of reach.", "Use a smaller reach, or another grasp point.")
+        return self._snapshots(rows, vibrations, owners, len(poses) - len(rows))
+
+    def differentiate(self, poses: np.ndarray, young: np.ndarray,
+                      displacements: np.ndarray) -> Snapshots:
+        """Return full solutions that are there already, with their tangents.
+
+        Args:
+            displacements: Converged [m], shape [s, node_count, 3].
+        """
+        rows = []
+        for pose, modulus, displacement in zip(poses, young, displacements, strict=True):
+            model = self.model.with_young(self.weights @ modulus)
+            result = solve_static(model, grasp=self.grasp, pose=pose, start=displacement,
+                                  settings=self.solver)
+            rows.append(self._differentiated(result, pose, modulus))
+        return self._snapshots(rows, [], [], 0)
+
+    def _snapshots(self, rows: list[dict[str, np.ndarray]], vibrations: list[np.ndarray],
+                   owners: list[int], failed: int) -> Snapshots:
         columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         shape = (-1, self.model.mesh.node_count, 3)
         return Snapshots(**columns, vibrations=np.array(vibrations, np.float32).reshape(shape),
-                         vibration_states=np.array(owners, np.int64),
-                         failed=len(poses) - len(rows))
+                         vibration_states=np.array(owners, np.int64), failed=failed)
 
     def _nearest(self, pose: np.ndarray, young: np.ndarray,
                  starts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
