@@ -192,12 +192,21 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     # Noise makes a carrier look thicker, and its outliers look like twigs.
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
-    skeleton = skeleton.subset(keep)
-    while (inside := _embedded_run(skeleton)) is not None:
-        skeleton, pruned = skeleton.subset(skeleton.branch != inside), pruned + 1
+    skeleton, strands = _without_strands(skeleton.subset(keep))
     skeleton = resampled(clamped(skeleton, low, high), 1.0)
-    fit = fit_axes(skeleton, points, progress=progress.part(0.5, 1.0))
+    fit = fit_axes(skeleton, points, progress=progress.part(0.5, 0.8))
+    skeleton, late = _without_strands(fit.skeleton)
+    if late:
+        fit = fit_axes(skeleton, points, rounds=6, progress=progress.part(0.8, 1.0))
+    pruned += strands + late
     return replace(fit, skeleton=tapered(clamped(fit.skeleton, low, high))), pruned
+
+
+def _without_strands(skeleton: Skeleton) -> tuple[Skeleton, int]:
+    count = 0
+    while (inside := _embedded_run(skeleton)) is not None:
+        skeleton, count = skeleton.subset(skeleton.branch != inside), count + 1
+    return skeleton, count
 
 
 def _embedded_run(skeleton: Skeleton) -> int | None:
