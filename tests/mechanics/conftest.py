@@ -51,4 +51,4 @@ def short_box() -> TetMesh:
 @pytest.fixture(scope="session")
 def slender_beam() -> TetMesh:
     """A square beam 0.6 m long and 8 mm thick, 1,488 quadratic tetrahedra."""
-    return box_mesh((0.008, 0.008, 0.6), (2, 2, 62))
+    return box_mesh((0.008, 0.008, 0.6), (1, 1, 248))

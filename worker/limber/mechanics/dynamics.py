@@ -426,8 +426,8 @@ class _Motion:
                                                      self._floor()):
                 return self._accepted(new, min_det_f)
             first = increment is None
-            keep = (self.factor_step == dt and self.factor_error <= 10 * settings.keep_factor
-                    and settings.keep_factor > 0 if first else norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
+            keep = self._may_keep(dt) if first else (
+                norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
             if not keep:
                 if not self._factorise(new, increment, viscous, dt):
                     return None
@@ -446,6 +446,11 @@ class _Motion:
         self.trouble = f"no convergence in {settings.max_iterations} iterations"
         self.status = "stalled"
         return None
+
+    def _may_keep(self, dt: float) -> bool:
+        """Whether the last factor was made near enough to the state before this step."""
+        limit = self.settings.keep_factor
+        return limit > 0 and self.factor_step == dt and self.factor_error <= 10 * limit
 
     def _constraint_moves(self, new: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
         """Return how held nodes and pinned means move in the step; None: they do not."""

@@ -1,5 +1,6 @@
 """The linear equations of the free nodes: assembled, factorised and solved again and again."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -68,6 +69,13 @@ class Equations:
             for axis in range(3):
                 self._pin_rows[rows + axis, 3 * number + axis] = grasp.weights
         self._pin_solutions = np.zeros_like(self._pin_rows)
+
+    def placed(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray) -> "Equations":
+        """Return the equations of the same tetrahedra elsewhere; pattern and factor are shared."""
+        other = copy.copy(self)
+        other.layout = LaneLayout(self.pattern, tets, gradients, weights)
+        other._mass = None
+        return other
 
     def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
                  increment: np.ndarray | None = None, viscous: Viscous | None = None,

@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -73,15 +73,27 @@ class _MeshData:
     """What depends on the mesh alone; shared by all models of it."""
 
     def __init__(self, mesh: TetMesh, fixed: np.ndarray):
-        self.mesh, self.fixed = mesh, fixed
+        self.fixed = fixed
+        self.equations: dict[tuple, Equations] = {}
+        self._place(mesh)
+
+    def _place(self, mesh: TetMesh) -> None:
+        self.mesh = mesh
         self.tets = np.ascontiguousarray(mesh.tets, np.int32)
         self.rule = elements.stiffness_quadrature(mesh)
         self.gradients, self.weights = elements.element_gradients(mesh, self.rule)
         self.volume_weights = elements.volume_weights(mesh)
-        self.equations: dict[tuple, Equations] = {}
         edge = mesh.nodes[mesh.tets[:, 1]] - mesh.nodes[mesh.tets[:, 0]]
         self.edge = float(np.linalg.norm(edge, axis=1).mean())
         self.extent = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
+
+    def moved(self, nodes: np.ndarray) -> "_MeshData":
+        """Return the data of the mesh with other node positions; patterns are shared."""
+        other = copy.copy(self)
+        other._place(replace(self.mesh, nodes=nodes))
+        other.equations = {key: equations.placed(other.tets, other.gradients, other.weights)
+                           for key, equations in self.equations.items()}
+        return other
 
 
 class BranchModel:
@@ -188,6 +200,17 @@ class BranchModel:
         other._set(self.young if young is None else young,
                    self.poisson if poisson is None else poisson,
                    self.density if density is None else density)
+        return other
+
+    def with_rest_nodes(self, nodes: np.ndarray) -> "BranchModel":
+        """Return the model with other rest positions [m] of the same tetrahedra."""
+        other = copy.copy(self)
+        other._data = self._data.moved(nodes)
+        other._mass = {}
+        # Added masses stay with their node, not with the place in space.
+        other.point_masses = tuple(
+            replace(point, position=tuple(nodes[node]))
+            for point, (node, _) in zip(self.point_masses, self._added, strict=True))
         return other
 
     def without_point_masses(self) -> "BranchModel":

@@ -67,6 +67,7 @@ class ReducedStaticSettings:
         tolerance: Energy that a Newton step would still gain, relative to the strain energy.
         max_iterations: Newton iterations a step.
         max_halvings: How often the way to the pose is halved before another start is tried.
+        start_count: How many starts are tried, the given state included.
         novelty_limit: Largest coordinate relative to the training's beyond which the state is
             taken for false and sought again from other starts.
     """
@@ -74,6 +75,7 @@ class ReducedStaticSettings:
     tolerance: float = 1e-10
     max_iterations: int = 25
     max_halvings: int = 4
+    start_count: int = 4
     novelty_limit: float = 1.5
 
 
@@ -260,7 +262,7 @@ class ReducedModel:
         pose = check_pose(pose)
         load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
         best, iterations = None, 0
-        for at_pose, q in self._starts(pose, start):
+        for at_pose, q in self._starts(pose, start)[:settings.start_count]:
             found = self._follow(at_pose, q, pose, load, settings)
             iterations += found.iterations
             if best is None or (found.ranking(settings) < best.ranking(settings)):

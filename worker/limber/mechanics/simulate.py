@@ -1,8 +1,6 @@
-"""The stage ``simulate``: a pull or a force on a branch over time, as frames and numbers."""
+"""The stage `simulate`: pull a branch by a pose or a force, in balance or in time."""
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,207 +8,217 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import ConvergenceError, InputError
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics.dynamics import DynamicResult, simulate_dynamics
-from limber.mechanics.frames import surface_vertices, write_pc2, write_pvd_series
+from limber.mechanics.dynamics import NewmarkSettings, simulate_dynamics
+from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import BranchModel
+from limber.mechanics.model import GRAVITY, BranchModel
+from limber.mechanics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics import StaticResult, follow_poses, solve_static
 from limber.mechanics.strain import strain_state
 from limber.progress import SILENT, Progress
-from limber.store import Branch, Stage, plain
+from limber.store import Branch, write_atomically
 
-# Of the way from base to grasp: a pull that any branch takes when none is asked for.
-_DEFAULT_PULL = 0.15
+STAGE = "simulate"
 
 
 class SimulateSettings(BaseModel):
-    """How a branch is moved. Without ``pull`` and ``load`` it is pulled a little sideways."""
+    """Options of `limber simulate`."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
-    name: str = Field("pull", pattern=r"^[\w.-]+$", description="Name of the frames' files.")
-    motion: Literal["dynamic", "static"] = Field(
-        "dynamic", description="dynamic: Newmark in time; static: equilibria along the way.")
-    pull: tuple[float, float, float] | None = Field(
-        None, description="Move the grasp by X Y Z [m] from where it rests.")
-    turn: tuple[float, float, float] = Field(
-        (0.0, 0.0, 0.0), description="Turn the clamped grasp by a rotation vector [rad] as well.")
-    load: tuple[float, float, float] | None = Field(
-        None, description="Force X Y Z [N] on the grasp patch, instead of a pull.")
-    grasp: Literal["clamped", "pinned"] = Field(
-        "pinned", description="clamped: the gripper turns the branch; pinned: it may turn freely.")
-    duration: float = Field(2.0, gt=0, description="Time of the pull or of the load's rise [s].")
-    hold: float = Field(0.5, ge=0, description="Time after that [s]; dynamic motion only.")
-    frame_rate: float = Field(24.0, gt=0, le=1000, description="Frames a second.")
-    gravity: bool = Field(True, description="Let the branch bear its own weight.")
-    damping_mass: float = Field(0.5, ge=0, description="Rayleigh damping of the mass [1/s].")
-    damping_stiffness: float = Field(
-        0.002, ge=0, description="Rayleigh damping of the stiffness [s].")
-    series: bool = Field(False, description="Also write a VTU series that ParaView opens.")
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What both kinds of motion give; arrays by frame.
-
-    Attributes:
-        times: [s].
-        displacement: [m], shape [frames, node_count, 3].
-        strain_energy: [J].
-        grasp_force: [N], shape [frames, 3].
-        min_det_f: Smallest determinant of the deformation gradient.
-        warnings: What a user should know.
-    """
-
-    times: np.ndarray
-    displacement: np.ndarray
-    strain_energy: np.ndarray
-    grasp_force: np.ndarray
-    min_det_f: np.ndarray
-    warnings: list[str]
+    name: str = Field("simulate", pattern=r"^[\w-]+$",
+                      description="Name of the result: frames/NAME.pc2 and frames/NAME.json.")
+    kind: Literal["static", "dynamic"] = Field(
+        "dynamic", description="dynamic: motion in time; static: a path of equilibria.")
+    move: tuple[float, float, float] | None = Field(
+        None, description="Move the grasp by X Y Z [m].")
+    turn: tuple[float, float, float] | None = Field(
+        None, description="Turn the grasp by a rotation vector X Y Z [rad].")
+    force: tuple[float, float, float] | None = Field(
+        None, description="Pull the grasp with a force X Y Z [N] instead of moving it.")
+    grasp_point: tuple[float, float, float] | None = Field(
+        None, description="Grasp at X Y Z [m] instead of where the mesh marks it.")
+    grasp_radius: float = Field(0.01, gt=0, description="Radius of that grasp [m].")
+    grasp_mode: Literal["clamped", "pinned"] = Field(
+        "clamped", description="clamped: position and rotation held; pinned: position alone.")
+    duration: float = Field(1.0, gt=0, description="Time of the pull [s].")
+    hold: float = Field(0.5, ge=0, description="Time at the end of the pull [s] (dynamic).")
+    frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames a second.")
+    step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
+    gravity: bool = Field(True, description="Gravity along -z.")
+    rest_shape: bool = Field(
+        True, description="Take the scan as already sagging under gravity.")
+    material: Literal["st_venant_kirchhoff", "stable_neo_hookean", "linear"] = Field(
+        "st_venant_kirchhoff", description="Material law.")
+    damping_mass: float = Field(0.5, ge=0, description="Damping on velocity [1/s].")
+    damping_stiffness: float = Field(0.002, ge=0, description="Damping on strain rate [s].")
+    vtu: bool = Field(False, description="Also write a VTU series that ParaView opens.")
 
 
-def simulate_branch(folder: Path, settings: SimulateSettings, *, force: bool = False,
-                    progress: Progress = SILENT, warn: Callable[[str], None] = lambda _: None,
-                    ) -> dict[str, Any]:
-    """Move the branch of a folder and write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+def simulate(branch_folder: str | Path, settings: SimulateSettings = SimulateSettings(), *,
+             force: bool = False, progress: Progress = SILENT,
+             warn: Any = lambda _message: None) -> dict[str, Any]:
+    """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+
+    Returns:
+        The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
+        ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
 
     Raises:
-        ConvergenceError: the branch cannot follow; the message has how far it came, the place and
-            the reason. Nothing is written then.
+        InputError: options that do not fit. ConvergenceError: the branch could not follow; the
+            frames up to there are written.
     """
-    branch = Branch.open(folder)
-    mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
-    key, reads = f"simulate:{settings.name}", ["mesh.vtu"]
-    if not force and branch.is_current(key, settings, reads=reads):
-        return branch.manifest.stages[key].result
-    with branch.stage(key, settings, reads=reads) as stage:
-        model = _model(branch, settings)
-        motion = _move(model, settings, _reach(mesh), progress)
-        for warning in motion.warnings:
-            warn(warning)
-        _write(stage, settings, model, motion)
-        tip = _tip(branch, mesh)
-        stage.result.update(
-            converged=True, frame_count=len(motion.times), energy_j=motion.strain_energy[-1],
-            energy_max_j=motion.strain_energy.max(), grasp_force_n=motion.grasp_force[-1],
-            tip_displacement_m=motion.displacement[-1, tip], min_det_f=motion.min_det_f.min())
-    return branch.manifest.stages[key].result
+    branch = Branch.open(branch_folder)
+    branch.require("mesh.vtu", "reconstruct")
+    if settings.force is not None and (settings.move or settings.turn):
+        raise InputError("Both a motion and a force were given.",
+                         "A grasp follows a pose or takes a force.",
+                         "Give --move and --turn, or --force.")
+    stored = branch.manifest.stages.get(STAGE)
+    if not force and stored and stored.result.get("converged") and branch.is_current(
+            STAGE, settings, reads=["mesh.vtu"]):
+        return stored.result
+    model, grasp = _prepared(branch, settings, progress.part(0.0, 0.2), warn)
+    run = _static if settings.kind == "static" else _dynamic
+    motion = run(model, grasp, settings, progress.part(0.2, 0.9))
+    for message in motion["warnings"]:
+        warn(message)
+    with branch.stage(STAGE, settings, reads=["mesh.vtu"]) as stage:
+        result = _write(stage, model, settings, motion)
+        stage.result.update(result)
+    progress(1.0, "done")
+    if not motion["converged"]:
+        raise ConvergenceError(
+            f"The branch could not follow: {motion['message']}",
+            f"{result['frame_count']} frames up to the last good state are in"
+            f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
+            "Pull less far, or check units and Young's modulus.")
+    return result
 
 
-def _model(branch: Branch, settings: SimulateSettings) -> BranchModel:
-    overrides: dict[str, Any] = {} if settings.gravity else {"gravity": None}
-    damping = RayleighDamping(settings.damping_mass, settings.damping_stiffness)
-    return BranchModel.from_branch(branch, damping=damping, **overrides)
+def _prepared(branch: Branch, settings: SimulateSettings, progress: Progress,
+              warn: Any) -> tuple[BranchModel, Grasp]:
+    progress(0.0, "preparing")
+    model = BranchModel.from_branch(
+        branch, material=settings.material, gravity=GRAVITY if settings.gravity else None,
+        damping=RayleighDamping(settings.damping_mass, settings.damping_stiffness))
+    if settings.gravity and settings.rest_shape:
+        try:
+            mesh = unloaded_rest_shape(model, progress=progress)
+            model = model.with_rest_nodes(mesh.nodes)
+        except ConvergenceError as error:
+            warn(f"{error} The scan is taken as the shape without load.")
+    if settings.grasp_point is None:
+        return model, Grasp.from_mesh(model.mesh, settings.grasp_mode)
+    return model, Grasp.at(model.mesh, np.array(settings.grasp_point), settings.grasp_radius,
+                           settings.grasp_mode)
 
 
-def _move(model: BranchModel, settings: SimulateSettings, reach: float,
-          progress: Progress) -> Motion:
-    if settings.pull is not None and settings.load is not None:
-        raise InputError("Both --pull and --load were given.",
-                         "A gripper's position and its force cannot both be prescribed.",
-                         "Give one of them.")
-    grasp = Grasp.from_mesh(model.mesh, settings.grasp)
-    rest = solve_static(model).require()
-    times = _times(settings)
-    # Half a cosine: starts and ends without a jolt.
-    rise = 0.5 - 0.5 * np.cos(np.pi * np.minimum(times / settings.duration, 1.0))
-    driven: dict[str, np.ndarray] = {}
-    if settings.load is not None:
-        driven["grasp_forces"] = rise[:, None] * np.array(settings.load)
+def _ramp(settings: SimulateSettings, hold: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and the part of the pull at each, starting and ending at rest."""
+    count = max(2, round((settings.duration + hold) * settings.frame_rate) + 1)
+    times = np.arange(count) / settings.frame_rate
+    part = np.clip(times / settings.duration, 0, 1)
+    return times, part**2 * (3 - 2 * part)
+
+
+def _way(start: StaticResult, grasp: Grasp, settings: SimulateSettings,
+         part: np.ndarray) -> np.ndarray:
+    """Return the grasp's poses [frames, 6], from where the loaded branch holds it."""
+    pose = start.pose if start.pose is not None else grasp.rest_pose
+    change = np.concatenate([settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
+    if settings.grasp_mode == "pinned":
+        pose = np.concatenate([pose[:3], np.zeros(3)])
+    return _composed(pose, part[:, None] * change)
+
+
+def _composed(pose: np.ndarray, changes: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_rotvec(changes[:, 3:]) * Rotation.from_rotvec(pose[3:])
+    return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])
+
+
+def _static(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
+            progress: Progress) -> dict[str, Any]:
+    times, _ = _ramp(settings, 0.0)
+    part = np.clip(times / settings.duration, 0, 1)
+    start = solve_static(model, grasp=grasp, grasp_force=np.zeros(3)).require()
+    if settings.force is None:
+        results = follow_poses(model, grasp, _way(start, grasp, settings, part), start=start,
+                               progress=progress)
     else:
-        begin = grasp.pose_of(model.mesh.nodes, rest.displacement)
-        pull = settings.pull or (_DEFAULT_PULL * reach, 0.0, 0.0)
-        driven["poses"] = begin + rise[:, None] * np.concatenate([pull, settings.turn])
-    if settings.motion == "static":
-        return _static(model, grasp, times, rest, driven, progress)
-    result = simulate_dynamics(model, grasp=grasp, times=times, start=rest, progress=progress,
-                               **driven)
-    return _dynamic(result.require())
+        results = [start]
+        for number, share in enumerate(part[1:]):
+            progress(number / len(part), "following the force")
+            results.append(solve_static(
+                model, grasp=grasp, grasp_force=share * np.array(settings.force),
+                start=results[-1]))
+            if not results[-1].converged:
+                break
+    good = [r for r in results if r.converged]
+    bad = next((r for r in results if not r.converged), None)
+    if bad is not None:
+        good = results[:results.index(bad)] + [bad]
+    force = [r.reaction_force if settings.force is None else s * np.array(settings.force)
+             for r, s in zip(good, part, strict=False)]
+    return {
+        "times": times[:len(good)], "displacement": np.array([r.displacement for r in good]),
+        "strain_energy": [r.strain_energy for r in good], "kinetic_energy": [0.0] * len(good),
+        "grasp_force": np.array(force), "grasp_torque": [r.reaction_torque for r in good],
+        "min_det_f": [r.min_det_f for r in good], "converged": bad is None,
+        "message": "" if bad is None else bad.message, "warnings": good[-1].warnings}
 
 
-def _times(settings: SimulateSettings) -> np.ndarray:
-    end = settings.duration + (settings.hold if settings.motion == "dynamic" else 0.0)
-    return np.linspace(0.0, end, max(2, round(end * settings.frame_rate) + 1))
-
-
-def _dynamic(result: DynamicResult) -> Motion:
-    return Motion(result.times, result.displacement, result.strain_energy, result.reaction_force,
-                  result.min_det_f, result.warnings)
-
-
-def _static(model: BranchModel, grasp: Grasp, times: np.ndarray, rest: StaticResult,
-            driven: dict[str, np.ndarray], progress: Progress) -> Motion:
-    if "poses" in driven:
-        states = follow_poses(model, grasp, driven["poses"], start=rest, progress=progress)
+def _dynamic(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
+             progress: Progress) -> dict[str, Any]:
+    times, part = _ramp(settings, settings.hold)
+    newmark = NewmarkSettings(max_step=settings.step)
+    start = solve_static(model, grasp=grasp, grasp_force=np.zeros(3)).require()
+    if settings.force is None:
+        found = simulate_dynamics(model, grasp=grasp, poses=_way(start, grasp, settings, part),
+                                  times=times, start=start, settings=newmark, progress=progress)
+        force = found.reaction_force
     else:
-        states = _follow_forces(model, grasp, driven["grasp_forces"], rest, progress)
-    for number, state in enumerate(states):
-        if not state.converged:
-            before = max(number - 1, 0)
-            raise ConvergenceError(
-                f"The branch cannot follow beyond frame {before} of {len(states) - 1} "
-                f"({100 * before / (len(states) - 1):.0f} % of the way): {state.message}",
-                f"Status: {state.status}.",
-                "Pull less far, or check Young's modulus and units.", result=state)
-    forces = driven.get("grasp_forces", np.array([state.reaction_force for state in states]))
-    return Motion(
-        times, np.array([state.displacement for state in states]),
-        np.array([state.strain_energy for state in states]), forces,
-        np.array([state.min_det_f for state in states]),
-        sorted({warning for state in states for warning in state.warnings}))
+        pull = part[:, None] * np.array(settings.force)
+        found = simulate_dynamics(model, grasp=grasp, grasp_forces=pull, times=times, start=start,
+                                  settings=newmark, progress=progress)
+        force = pull[:len(found.times)]
+    return {
+        "times": found.times, "displacement": found.displacement,
+        "strain_energy": found.strain_energy, "kinetic_energy": found.kinetic_energy,
+        "grasp_force": force, "grasp_torque": found.reaction_torque,
+        "min_det_f": found.min_det_f, "converged": found.converged, "message": found.message,
+        "warnings": found.warnings}
 
 
-def _follow_forces(model: BranchModel, grasp: Grasp, forces: np.ndarray, rest: StaticResult,
-                   progress: Progress) -> list[StaticResult]:
-    states, last = [], rest
-    for number, grasp_force in enumerate(forces):
-        progress(number / len(forces), "following forces", frame=number)
-        state = solve_static(model, grasp=grasp, grasp_force=grasp_force, start=last)
-        states.append(state)
-        if not state.converged:
-            break
-        last = state
-    return states
-
-
-def _write(stage: Stage, settings: SimulateSettings, model: BranchModel, motion: Motion) -> None:
-    from limber.scene_data import at_nodes
-
-    mesh = model.mesh
-    nodes, _ = surface_vertices(mesh)
-    frames = mesh.nodes[nodes] + motion.displacement[:, nodes]
-    base = f"frames/{settings.name}"
-    write_pc2(stage.path(f"{base}.pc2"), frames, 0.0, 1.0)
-    stage.path(f"{base}.json").write_text(json.dumps(plain({
-        "frame_count": len(motion.times), "rate": settings.frame_rate,
-        "vertex_count": len(nodes), "times_s": motion.times, "energies_j": motion.strain_energy,
-        "forces_n": motion.grasp_force, "min_det_f": motion.min_det_f}), allow_nan=False) + "\n",
-        encoding="utf-8")
-    density = [strain_state(model, u).energy_density for u in motion.displacement]
-    np.savez_compressed(
-        stage.path(f"{base}.npz"), strain_energy_density_j_m3=np.array(
-            [at_nodes(mesh, values)[nodes] for values in density], np.float32))
-    if settings.series:
-        write_pvd_series(stage.path(f"frames/{settings.name}-series/{settings.name}.pvd"), mesh,
-                         motion.times, motion.displacement,
-                         {"strain_energy_density": np.array(density)})
-
-
-def _reach(mesh: TetMesh) -> float:
-    """Distance [m] from the fixed base to the grasp."""
-    base = mesh.nodes[np.asarray(mesh.point_data["fixed"], bool)].mean(axis=0)
-    return float(np.linalg.norm(Grasp.from_mesh(mesh).centre - base))
-
-
-def _tip(branch: Branch, mesh: TetMesh) -> int:
-    """Node nearest the tip of the main path; without a skeleton the one farthest from the base."""
-    if branch.has("skeleton.swc"):
-        skeleton = Skeleton.read_swc(branch.path("skeleton.swc"))
-        target = skeleton.nodes[skeleton.main_path()[-1]]
-        return int(np.linalg.norm(mesh.nodes - target, axis=1).argmin())
-    base = mesh.nodes[np.asarray(mesh.point_data["fixed"], bool)].mean(axis=0)
-    return int(np.linalg.norm(mesh.nodes - base, axis=1).argmax())
+def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
+           motion: dict[str, Any]) -> dict[str, Any]:
+    displacement = motion["displacement"]
+    nodes = surface_nodes(model.mesh)
+    write_pc2(stage.path(f"frames/{settings.name}.pc2"),
+              model.mesh.nodes[nodes] + displacement[:, nodes])
+    if settings.vtu:
+        folder = stage.path(f"frames/{settings.name}/{settings.name}.pvd").parent
+        write_pvd_series(folder, settings.name, model, motion["times"], displacement)
+    tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
+                             axis=1).argmax())
+    last = strain_state(model, displacement[-1])
+    rows = {name: np.asarray(motion[name]).tolist()
+            for name in ("times", "strain_energy", "kinetic_energy", "grasp_force",
+                         "grasp_torque", "min_det_f")}
+    frames = {
+        "frame_count": len(displacement), "rate": settings.frame_rate,
+        "times_s": rows["times"], "energies_j": rows["strain_energy"],
+        "kinetic_energies_j": rows["kinetic_energy"], "grasp_forces_n": rows["grasp_force"],
+        "grasp_torques_nm": rows["grasp_torque"], "min_det_f": rows["min_det_f"],
+        "converged": motion["converged"],
+        "largest_principal_strain": float(last.principal_strain[:, -1].max()),
+        "largest_principal_stress_pa": float(last.principal_stress[:, -1].max())}
+    write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
+    return {
+        "converged": motion["converged"], "frame_count": len(displacement),
+        "energy_j": rows["strain_energy"][-1], "grasp_force_n": rows["grasp_force"][-1],
+        "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
+        "min_det_f": float(np.min(rows["min_det_f"]))}
