@@ -153,7 +153,7 @@ def _change(before: float, after: float, sign: int) -> float | None:
 
 def _write(stage: Stage, name: str, grasp_model: GraspModel, summary: dict[str, Any],
            field: EnergyField, baseline: ResolvedPath, plan: ResolvedPath) -> None:
-    from limber.mechanics.frames import surface_vertices, write_pc2
+    from limber.mechanics.frames import write_pc2
     from limber.scene_data import at_nodes
 
     detailed = dict(summary)
@@ -166,7 +166,7 @@ def _write(stage: Stage, name: str, grasp_model: GraspModel, summary: dict[str, 
         json.dumps(plain(detailed), allow_nan=False, indent=1) + "\n", encoding="utf-8")
     stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
     stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
-    vertices, _ = surface_vertices(grasp_model.mesh)
+    vertices = np.unique(grasp_model.mesh.surface_faces())
     frames = grasp_model.mesh.nodes[vertices] + plan.displacements[:, vertices]
     write_pc2(stage.path(f"frames/{name}.pc2"), frames, 0.0, 1.0)
     stage.path(f"frames/{name}.json").write_text(json.dumps(plain({
