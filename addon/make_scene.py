@@ -15,6 +15,8 @@ from pathlib import Path
 
 import bpy
 
+_PLAY_SECONDS = 4.0
+
 
 def _load_addon():
     """Import the folder of this file as a package, whatever it is called there."""
@@ -57,6 +59,8 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     scene.name = data.info["name"]
     scene.unit_settings.system = "METRIC"
     shown = scenes.show_branch(scene, data, color)
+    # A path has a few dozen poses, one a frame: slow enough to follow.
+    scene.render.fps = min(max(round(shown.frame_count / _PLAY_SECONDS), 5), 24)
     camera = studio.set_up_studio(scene, data, studio.Picture(width))
     legend.add_legend(scene, camera, data, shown)
     _say(progress=0.2, message="scene built")

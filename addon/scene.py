@@ -107,11 +107,12 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     name = data.info["name"]
     _remove_shown(scene, name, data.folder)
     collection = bpy.data.collections.new(name)
-    collection[FOLDER_KEY], collection[NAME_KEY] = str(data.folder), name
+    collection[FOLDER_KEY], collection[NAME_KEY] = animation.shown_path(data.folder), name
     scene.collection.children.link(collection)
     mesh = meshes.new_mesh(name, data.arrays["vertices"], data.arrays["faces"])
     surface = add_object(collection, name, mesh)
-    surface[INFO_KEY] = json.dumps(data.info)
+    # Not the folder: it may move, and the file with it.
+    surface[INFO_KEY] = json.dumps({**data.info, "folder": None})
     for key in data.info["scalars"]:
         meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
         meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
@@ -126,7 +127,7 @@ def _remove_shown(scene: bpy.types.Scene, name: str, folder: Path) -> None:
     for collection in list(scene.collection.children):
         if FOLDER_KEY not in collection:
             continue
-        before = Path(collection[FOLDER_KEY])
+        before = Path(bpy.path.abspath(collection[FOLDER_KEY]))
         if before == folder or (collection[NAME_KEY] == name and not before.is_dir()):
             for thing in list(collection.objects):
                 bpy.data.objects.remove(thing)
@@ -204,5 +205,8 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     scene.frame_set(1)
     if "grasp_motion" in data.arrays and "grasp" in shown.objects:
         animation.move_along(shown.objects["grasp"][0], data.arrays["grasp_motion"])
+    if "control_points_motion" in data.arrays:
+        for number, thing in enumerate(shown.objects["control_points"]):
+            animation.move_along(thing, data.arrays["control_points_motion"][:, number])
     if "frame_energy" in data.arrays:
         shown.surface[ENERGY_KEY] = [float(value) for value in data.arrays["frame_energy"]]

@@ -81,11 +81,15 @@ def test_content(bpy, addon, beam, tmp_path):
                                atol=1e-6)
     assert objects["RRT* path"].active_material != objects["D-RRT* path"].active_material
     assert len(shown.objects["control_points"]) == 4
+    bpy.context.scene.frame_set(1)
     heights = [thing.location.z for thing in shown.objects["control_points"]]
     np.testing.assert_allclose(heights, [0.12, 0.24, 0.36, 0.48], atol=0.03)
     np.testing.assert_allclose(objects["Goal"].location, beam.path[-1], atol=1e-6)
     assert objects["Goal"].dimensions.x == pytest.approx(0.04, rel=0.02)
     bpy.context.scene.frame_set(6)
+    for thing in shown.objects["control_points"]:
+        # Bent towards x by the square of the height: the points go with the branch.
+        assert thing.location.x == pytest.approx(thing.location.z ** 2, abs=0.01)
     np.testing.assert_allclose(objects["Grasp 1"].location, beam.path[-1], atol=1e-6)
     assert objects["Fixed base"].location.z < 0.01
 

@@ -55,8 +55,9 @@ def scene_data(branch: Branch, plan: str | None = None) -> SceneData:
     values ``scalar:NAME`` [v] and linear colours ``color:NAME`` [v, 4]; ``control_points``
     [k, 3] m and ``grasp`` [1, 3] m, with the radii of the balls that mark them,
     ``control_points_radius`` [k] m and ``grasp_radius`` [1] m; for each of ``info["paths"]`` the
-    points ``path:NAME`` [p, 3] m; ``grasp_motion`` [frames, 3] m; ``frame_energy`` [frames] J;
-    ``view_points`` [n, 3] m and ``view_direction`` [3].
+    points ``path:NAME`` [p, 3] m; ``grasp_motion`` [frames, 3] m, ``control_points_motion``
+    [frames, k, 3] m and ``frame_energy`` [frames] J; ``view_points`` [n, 3] m and
+    ``view_direction`` [3].
 
     Raises:
         BranchFolderError: no mesh yet, no such plan, or frames of another mesh.
@@ -260,6 +261,9 @@ def _add_frames(data: SceneData, branch: Branch, plan: str | None, vertex_count:
         data.arrays["frame_energy"] = np.asarray(about["energies_j"], float)
     if branch.has(f"frames/{name}.npz"):
         _add_strain_energy(data, branch.path(f"frames/{name}.npz"), vertex_count)
+    if "control_points" in data.arrays:
+        data.arrays["control_points_motion"] = _carried(
+            data.arrays["control_points"], data.arrays["vertices"], positions)
     if "path:plan" in data.arrays:
         data.arrays["grasp_motion"] = _along(data.arrays["path:plan"], len(positions))
 
@@ -288,6 +292,18 @@ def _read_pc2(path: Path, vertex_count: int) -> np.ndarray:
             "The frames belong to another mesh; Blender would silently show the rest shape.",
             "Run `limber plan` again.")
     return np.frombuffer(content, "<f4", offset=_PC2_HEADER.size).reshape(frames, points, 3)
+
+
+def _carried(points: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return where ``points`` inside the branch go: as the surface around them; [frames, k, 3].
+
+    By inverse-distance weights of a high power: the ring of vertices about a point counts, and
+    both rings where a point lies between two.
+    """
+    distance = np.linalg.norm(points[:, None] - vertices, axis=2)
+    weights = np.maximum(distance, 1e-9) ** -4
+    weights /= weights.sum(axis=1, keepdims=True)
+    return points + np.einsum("kv,fvi->fki", weights, positions - vertices)
 
 
 def _along(points: np.ndarray, count: int) -> np.ndarray:
