@@ -19,7 +19,7 @@ from limber.mechanics.session_client import InteractiveSession
 from limber.mechanics.session_frames import FrameReader, FrameWriter
 from limber.store import Branch
 
-SMALL = ("--grasps", "14", "--size", "24", "--fields", "50", "--no-cache")
+SMALL = ("--grasps", "24", "--size", "36", "--fields", "70", "--no-cache")
 
 
 @pytest.fixture(scope="module")

@@ -40,6 +40,8 @@ from limber.progress import SILENT, Progress
 
 FORMAT = 1
 _NO_INCREMENT = np.empty(0)
+_LEADING = 20
+"""Modes that tell whether a state is like those of the training."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,10 @@ class ReducedModel:
     def __post_init__(self) -> None:
         self.held = GraspCoordinates(self.grasp)
         self.young = self.control_young
-        self._largest = np.abs(self.basis.states).max(axis=0) + 1e-12
+        self._largest = np.abs(self.basis.states).max(axis=0)
+        # The leading modes: those of vibrations are not in the states, the last are small.
+        modes = np.arange(self.size) >= self.basis.lift_count
+        self._known = np.flatnonzero(modes & (self._largest > 0))[:_LEADING]
         self._table = _PoseTable(self.poses, self.extent)
         self._spacing = self._table.spacing()
         self._set()
@@ -350,10 +355,10 @@ class ReducedModel:
             increment = np.concatenate([np.zeros(count) if move is None else move, step])
             q = q + increment
             gain = 0.5 * abs(right @ step)
-            if not np.isfinite(gain) or np.abs(q[count:]).max() > 1e3 * self._largest.max():
+            if not np.isfinite(gain) or np.abs(q).max() > 1e3 * self._largest.max():
                 return _Found(q, False, np.inf, iteration + 1, np.inf)
             if move is None and gain <= settings.tolerance * max(energy, 1e-12):
-                novelty = float((np.abs(q) / self._largest)[count:][:20].max())
+                novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
                 return _Found(q, stable, novelty, iteration + 1,
                               self.strain_energy(q) - float(load @ q))
             move = None

@@ -374,6 +374,8 @@ def _trainer_arguments(options: argparse.Namespace) -> list[str]:
     told = [str(options.folder), "--mode", options.mode, "--grasps", str(options.grasps),
             "--size", str(options.size), "--fields", str(options.fields),
             "--young-spread", str(options.young_spread)]
+    if options.cache is not None:
+        told += ["--cache", str(options.cache)]
     return [*told, "--no-cache"] if options.no_cache else told
 
 

@@ -49,8 +49,8 @@ def session_arguments(parser: argparse.ArgumentParser) -> argparse.ArgumentParse
     parser.add_argument("--fields", type=int, default=130, help="reduced strain fields")
     parser.add_argument("--young-spread", type=float, default=1.0,
                         help="factor within which Young's modulus will change; 1: it stays")
-    parser.add_argument("--no-cache", action="store_true",
-                        help="neither use nor keep a model in the user's cache folder")
+    parser.add_argument("--cache", type=Path, help="folder for models; default the user's cache")
+    parser.add_argument("--no-cache", action="store_true", help="neither use nor keep a model")
     return parser
 
 
@@ -131,7 +131,8 @@ def main(arguments: list[str] | None = None) -> int:
 def _serve(options: argparse.Namespace, own: Path) -> None:
     model, grasp = load_branch(options)
     settings = settings_of(options)
-    folder = own if options.no_cache else platformdirs.user_cache_path("limber") / "reduced"
+    folder = own if options.no_cache else options.cache or (
+        platformdirs.user_cache_path("limber") / "reduced")
     cache = ModelCache(folder, model_key(model, grasp, settings))
     began = time.perf_counter()
     known = None if options.no_cache else cache.load()
