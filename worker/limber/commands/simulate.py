@@ -10,9 +10,9 @@ from limber.mechanics.simulate import SimulateSettings, simulate
 
 @stage_command("simulate")
 @click.argument("branch_folder", type=click.Path(path_type=Path))
-@click.option("--force-run", is_flag=True, help="Run again even if nothing has changed.")
+@click.option("--force", is_flag=True, help="Run again even if nothing has changed.")
 @settings_options(SimulateSettings)
-def command(run: Run, branch_folder: Path, force_run: bool, settings: SimulateSettings) -> dict:
+def command(run: Run, branch_folder: Path, force: bool, settings: SimulateSettings) -> dict:
     """Pull a branch by a pose or a force; writes motion, energy and forces."""
-    return simulate(branch_folder, settings, force=force_run, progress=run.progress,
+    return simulate(branch_folder, settings, force=force, progress=run.progress,
                     warn=run.warn)

@@ -522,9 +522,13 @@ class _Motion:
             change = refined_solve(self.equations, force, -history)
             strain = past.strain if viscous is None else model.strain_changes(
                 new.displacement, change)
-            self.tangents[number] = MotionState(
-                new.time, change, v_zero + rate * change, a_zero + inertia * change,
-                strain, past.strain, dt)
+            motion = (v_zero + rate * change, a_zero + inertia * change)
+            for grasp in self.equations.pinned:
+                # The path gives the means' velocity and acceleration, whatever the parameters.
+                for values in motion:
+                    values[grasp.nodes] -= grasp.weights @ values[grasp.nodes]
+            self.tangents[number] = MotionState(new.time, change, *motion, strain, past.strain,
+                                                dt)
             self.tangent_out.append(history + force(change))
 
     def _frame(self) -> dict[str, np.ndarray | float]:

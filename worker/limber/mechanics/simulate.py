@@ -35,7 +35,7 @@ class SimulateSettings(BaseModel):
         None, description="Move the grasp by X Y Z [m].")
     turn: tuple[float, float, float] | None = Field(
         None, description="Turn the grasp by a rotation vector X Y Z [rad].")
-    force: tuple[float, float, float] | None = Field(
+    grasp_force: tuple[float, float, float] | None = Field(
         None, description="Pull the grasp with a force X Y Z [N] instead of moving it.")
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Grasp at X Y Z [m] instead of where the mesh marks it.")
@@ -56,7 +56,7 @@ class SimulateSettings(BaseModel):
     vtu: bool = Field(False, description="Also write a VTU series that ParaView opens.")
 
 
-def simulate(branch_folder: str | Path, settings: SimulateSettings = SimulateSettings(), *,
+def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
              force: bool = False, progress: Progress = SILENT,
              warn: Any = lambda _message: None) -> dict[str, Any]:
     """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
@@ -71,10 +71,10 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings = SimulateSet
     """
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
-    if settings.force is not None and (settings.move or settings.turn):
+    if settings.grasp_force is not None and (settings.move or settings.turn):
         raise InputError("Both a motion and a force were given.",
                          "A grasp follows a pose or takes a force.",
-                         "Give --move and --turn, or --force.")
+                         "Give --move and --turn, or --grasp-force.")
     stored = branch.manifest.stages.get(STAGE)
     if not force and stored and stored.result.get("converged") and branch.is_current(
             STAGE, settings, reads=["mesh.vtu"]):
@@ -145,7 +145,7 @@ def _static(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
     times, _ = _ramp(settings, 0.0)
     part = np.clip(times / settings.duration, 0, 1)
     start = solve_static(model, grasp=grasp, grasp_force=np.zeros(3)).require()
-    if settings.force is None:
+    if settings.grasp_force is None:
         results = follow_poses(model, grasp, _way(start, grasp, settings, part), start=start,
                                progress=progress)
     else:
@@ -153,7 +153,7 @@ def _static(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
         for number, share in enumerate(part[1:]):
             progress(number / len(part), "following the force")
             results.append(solve_static(
-                model, grasp=grasp, grasp_force=share * np.array(settings.force),
+                model, grasp=grasp, grasp_force=share * np.array(settings.grasp_force),
                 start=results[-1]))
             if not results[-1].converged:
                 break
@@ -161,7 +161,7 @@ def _static(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
     bad = next((r for r in results if not r.converged), None)
     if bad is not None:
         good = results[:results.index(bad)] + [bad]
-    force = [r.reaction_force if settings.force is None else s * np.array(settings.force)
+    force = [r.reaction_force if settings.grasp_force is None else s * np.array(settings.grasp_force)
              for r, s in zip(good, part, strict=False)]
     return {
         "times": times[:len(good)], "displacement": np.array([r.displacement for r in good]),
@@ -176,12 +176,12 @@ def _dynamic(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
     times, part = _ramp(settings, settings.hold)
     newmark = NewmarkSettings(max_step=settings.step)
     start = solve_static(model, grasp=grasp, grasp_force=np.zeros(3)).require()
-    if settings.force is None:
+    if settings.grasp_force is None:
         found = simulate_dynamics(model, grasp=grasp, poses=_way(start, grasp, settings, part),
                                   times=times, start=start, settings=newmark, progress=progress)
         force = found.reaction_force
     else:
-        pull = part[:, None] * np.array(settings.force)
+        pull = part[:, None] * np.array(settings.grasp_force)
         found = simulate_dynamics(model, grasp=grasp, grasp_forces=pull, times=times, start=start,
                                   settings=newmark, progress=progress)
         force = pull[:len(found.times)]

@@ -1,0 +1,140 @@
+"""Derivatives against central differences, static and dynamic, and the rest shape."""
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.mechanics import (
+    BranchModel,
+    Grasp,
+    NewmarkSettings,
+    ParameterSet,
+    RayleighDamping,
+    StaticSettings,
+    simulate_dynamics,
+    solve_static,
+    static_sensitivities,
+    young_weights,
+)
+from limber.mechanics.rest_shape import unloaded_rest_shape
+from tests.mechanics.conftest import box_mesh
+
+PRECISE = StaticSettings(tolerance=1e-12)
+CONTROL = np.array([2e7, 1e7, 3e7])
+DAMPING = RayleighDamping(0.8, 0.004)
+NAMES = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")
+STEP = 1e-4
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return box_mesh((0.012, 0.012, 0.2), (1, 1, 8))
+
+
+@pytest.fixture(scope="module")
+def weights(mesh):
+    return young_weights(mesh, np.array([[0, 0, z] for z in (0.03, 0.1, 0.17)]))
+
+
+def base_model(mesh, weights):
+    return BranchModel(mesh, young=weights @ CONTROL, poisson=0.3, density=900, damping=DAMPING,
+                       gravity=(1.0, 0, -9.8))
+
+
+def varied(model, weights, column, step):
+    """The model with one parameter changed by ``step``."""
+    if column < 3:
+        factor = np.ones(3)
+        factor[column] = np.exp(step)
+        return model.with_young(weights @ (CONTROL * factor))
+    return [
+        lambda: model.with_parameters(poisson=model.poisson + step),
+        lambda: model.with_parameters(density=model.density * np.exp(step)),
+        lambda: model.with_parameters(damping=RayleighDamping(
+            model.damping.mass + step, model.damping.stiffness)),
+        lambda: model.with_parameters(damping=RayleighDamping(
+            model.damping.mass, model.damping.stiffness + 0.01 * step)),
+    ][column - 3]()
+
+
+@pytest.mark.parametrize("mode", ["clamped", "pinned", "force"])
+def test_static_derivatives(mesh, weights, mode):
+    """Displacement, reaction and energy change as central differences say, to 1e-5."""
+    model = base_model(mesh, weights)
+    grasp = Grasp.at(mesh, [0, 0, 0.15], 0.015, "clamped" if mode == "clamped" else "pinned")
+    pull = ({"grasp_force": [0.05, 0.02, 0]} if mode == "force" else
+            {"pose": grasp.rest_pose + np.array([0.04, 0.01, -0.006, 0, 0.1, 0.1])})
+
+    def solve(candidate):
+        return solve_static(candidate, grasp=grasp, settings=PRECISE, **pull).require()
+
+    result = solve(model)
+    found = static_sensitivities(model, result, grasp, weights, NAMES[:3],
+                                 is_held=mode != "force")
+    assert found.labels == ["log_young_0", "log_young_1", "log_young_2", "poisson",
+                            "log_density"]
+    for column in range(5):
+        ahead, behind = (solve(varied(model, weights, column, s)) for s in (STEP, -STEP))
+        moved = (ahead.displacement - behind.displacement) / (2 * STEP)
+        error = np.linalg.norm(found.displacement[:, :, column] - moved)
+        assert error < 1e-5 * np.linalg.norm(moved)
+        energy = (ahead.strain_energy - behind.strain_energy) / (2 * STEP)
+        assert found.strain_energy[column] == pytest.approx(energy, rel=1e-4, abs=1e-9)
+        if mode != "force":
+            force = (ahead.reaction_force - behind.reaction_force) / (2 * STEP)
+            assert found.reaction_force[:, column] == pytest.approx(
+                force, rel=1e-4, abs=1e-5 * np.abs(force).max())
+
+
+@pytest.mark.parametrize("mode", ["clamped", "pinned"])
+def test_dynamic_derivatives(mesh, weights, mode):
+    """The same along a motion, all frames, with density and both damping factors."""
+    model = base_model(mesh, weights)
+    grasp = Grasp.at(mesh, [0, 0, 0.15], 0.015, mode)
+    times = np.linspace(0, 0.3, 7)
+    part = (times / 0.3)**2 * (3 - 2 * times / 0.3)
+    poses = grasp.rest_pose + part[:, None] * np.array([0.04, 0.01, -0.006, 0, 0.1, 0.1])
+    settings = NewmarkSettings(max_step=0.025, tolerance=1e-10)
+
+    def move(candidate, **options):
+        return simulate_dynamics(candidate, grasp=grasp, poses=poses, times=times,
+                                 settings=settings, **options).require()
+
+    found = move(model, sensitivities=ParameterSet(NAMES, weights),
+                 sensitivity_nodes=np.array([5, -1])).sensitivities
+    assert found.displacement.shape == (7, 2, 3, 7)
+    for column in range(7):
+        ahead, behind = (move(varied(model, weights, column, s)) for s in (STEP, -STEP))
+        scale = 0.01 if column == 6 else 1.0
+        moved = (ahead.displacement - behind.displacement)[:, [5, -1]] / (2 * STEP * scale)
+        error = np.abs(found.displacement[..., column] - moved).max()
+        assert error < 2e-4 * np.abs(moved).max()
+        force = (ahead.reaction_force - behind.reaction_force) / (2 * STEP * scale)
+        error = np.abs(found.reaction_force[..., column] - force).max()
+        assert error < 1e-3 * np.abs(force).max()
+
+
+def test_derivatives_want_matching_weights(mesh, weights):
+    """Weights that do not give the model's field are refused, as is an unknown name."""
+    model = base_model(mesh, weights).with_young(np.linspace(1e7, 2e7, mesh.tet_count))
+    result = solve_static(model).require()
+    with pytest.raises(InputError, match="weights"):
+        static_sensitivities(model, result, None, weights)
+    with pytest.raises(InputError, match="no parameter"):
+        static_sensitivities(model, result, None, None, ("colour",))
+
+
+def test_rest_shape_sags_to_the_scan():
+    """Gravity on the found rest shape gives the scanned shape within 0.1 mm; new E, new shape."""
+    mesh = box_mesh((0.012, 0.012, 0.2), (1, 1, 20))
+    weights = young_weights(mesh, np.array([[0, 0, z] for z in (0.03, 0.1, 0.17)]))
+    model = base_model(mesh, weights).with_parameters(gravity=(25.0, 5.0, 0))
+    shape = unloaded_rest_shape(model)
+    assert np.abs(shape.nodes - mesh.nodes).max() > 0.01
+    loaded = solve_static(model.with_rest_nodes(shape.nodes)).require()
+    assert np.abs(shape.nodes + loaded.displacement - mesh.nodes).max() < 1e-4
+    stiffer = model.with_young(3 * model.young)
+    again = unloaded_rest_shape(stiffer, start=shape.nodes)
+    loaded = solve_static(stiffer.with_rest_nodes(again.nodes)).require()
+    assert np.abs(again.nodes + loaded.displacement - mesh.nodes).max() < 1e-4
+    assert np.abs(again.nodes - shape.nodes).max() > 0.005
