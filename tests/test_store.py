@@ -55,7 +55,7 @@ def test_is_current_follows_settings_inputs_and_files(branch: Branch):
     with branch.stage("first", {"size": 5}) as stage:
         stage.path("data.txt").write_text("changed")
     assert not branch.is_current("second", {"k": 1}, **current)
-    branch.path("data.txt").write_text("by hand")
+    (branch.folder / "data.txt").write_text("by hand")
     assert not branch.is_current("first", {"size": 5})
 
 
@@ -63,14 +63,27 @@ def test_damaged_file_is_named(branch: Branch):
     """Changed bytes of the same length are found by checksum; the message names file and stage."""
     branch.path("data.txt").write_text("eno")
     with pytest.raises(BranchFolderError, match=r"data\.txt \(other content\).*first"):
-        Branch.open(branch.folder)
+        Branch.open(branch.folder, verify=True)
+
+
+def test_damaged_file_stops_its_readers_but_not_its_maker(branch: Branch):
+    """A damaged file cannot be read or built on; the stage that makes it puts things right."""
+    branch.path("data.txt").write_text("eno")
+    again = Branch.open(branch.folder)
+    for use in (lambda: again.path("data.txt"), lambda: again.require("data.txt", "x"),
+                lambda: again.stage("second", reads=["data.txt"]).__enter__()):
+        with pytest.raises(BranchFolderError, match="other content"):
+            use()
+    with again.stage("first", {"size": 3}) as stage:
+        stage.path("data.txt").write_text("one")
+    assert Branch.open(branch.folder, verify=True).path("data.txt").read_text() == "one"
 
 
 def test_missing_file_is_named(branch: Branch):
     """A file that was deleted is reported as missing."""
     branch.path("data.txt").unlink()
     with pytest.raises(BranchFolderError, match=r"data\.txt \(missing\)"):
-        Branch.open(branch.folder)
+        Branch.open(branch.folder).path("data.txt")
 
 
 def test_newer_format_is_refused(branch: Branch):
@@ -130,7 +143,7 @@ def test_removed_and_listed(branch: Branch):
         stage.path("pulls/a/robot.csv").write_text("t")
         stage.remove("pulls/a/clouds/0.ply")
     assert not branch.path("pulls/a/clouds/0.ply").exists()
-    Branch.open(branch.folder)
+    Branch.open(branch.folder, verify=True)
 
 
 def test_two_openers_do_not_lose_each_others_stages(branch: Branch):

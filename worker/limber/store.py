@@ -136,6 +136,7 @@ class Branch:
     def __init__(self, folder: Path, manifest: Manifest):
         self.folder = folder
         self.manifest = manifest
+        self._verified: dict[str, tuple[int, int, str]] = {}
 
     @property
     def name(self) -> str:
@@ -158,7 +159,7 @@ class Branch:
         """
         folder = Path(folder)
         if (folder / MANIFEST).exists() or (folder / _COMMIT).exists():
-            return cls.open(folder, verify=False)
+            return cls.open(folder)
         if folder.is_dir() and any(p.name != _LOCK for p in folder.iterdir()):
             raise BranchFolderError(
                 f"{folder} exists and is not a branch folder.",
@@ -171,8 +172,11 @@ class Branch:
         return branch
 
     @classmethod
-    def open(cls, folder: str | os.PathLike, *, verify: bool = True) -> "Branch":
-        """Open an existing branch folder; ``verify`` compares every file with its checksum.
+    def open(cls, folder: str | os.PathLike, *, verify: bool = False) -> "Branch":
+        """Open an existing branch folder.
+
+        A file is compared with its checksum when it is used (:meth:`path`), so that a damaged
+        one stops what needs it but not the stage that makes it anew; ``verify`` compares all.
 
         Raises:
             BranchFolderError: not a branch folder, damaged, or of a newer format.
@@ -191,11 +195,17 @@ class Branch:
         return branch
 
     def path(self, name: str) -> Path:
-        """Return the path of file ``name``, whether it exists or not."""
-        return self.folder / _checked_name(name)
+        """Return the path of file or folder ``name``, whether it exists or not.
+
+        Raises:
+            BranchFolderError: the manifest has it, or files in it, and they are damaged.
+        """
+        name = _checked_name(name)
+        self._check(n for n in self.manifest.files if n == name or n.startswith(name + "/"))
+        return self.folder / name
 
     def has(self, name: str) -> bool:
-        return name in self.manifest.files and self.path(name).is_file()
+        return name in self.manifest.files and (self.folder / _checked_name(name)).is_file()
 
     def require(self, name: str, made_by: str) -> Path:
         """Return the path of file ``name``; ``made_by`` is the command that would make it.
@@ -221,14 +231,34 @@ class Branch:
         Raises:
             BranchFolderError: a file is missing or its bytes have changed; names each.
         """
-        wrong = [f"{name} ({trouble})" for name, entry in self.manifest.files.items()
-                 if (trouble := _trouble(self.path(name), entry))]
-        if wrong:
-            stages = sorted({self.manifest.files[w.split(" (")[0]].stage for w in wrong})
-            raise BranchFolderError(
-                f"Damaged files in {self.folder}: {', '.join(wrong)}.",
-                "They differ from the checksums written when they were made.",
-                f"Restore them from a copy, or run again: {', '.join(stages)} (--force).")
+        self._check(self.manifest.files)
+
+    def _check(self, names: Iterable[str]) -> None:
+        wrong = {name: trouble for name in names if (trouble := self._trouble(name))}
+        if not wrong:
+            return
+        shown = [f"{name} ({trouble})" for name, trouble in list(wrong.items())[:4]]
+        more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""
+        stages = sorted({self.manifest.files[name].stage for name in wrong})
+        raise BranchFolderError(
+            f"Damaged files in {self.folder}: {', '.join(shown)}{more}.",
+            "They differ from the checksums written when they were made.",
+            f"Restore them from a copy, or run again with --force: {', '.join(stages)}.")
+
+    def _trouble(self, name: str) -> str:
+        """Say what is wrong with a file, or "": read again only when its time or size changed."""
+        path, entry = self.folder / name, self.manifest.files[name]
+        if not path.is_file():
+            return "missing"
+        about = path.stat()
+        if about.st_size != entry.bytes:
+            return f"{about.st_size} bytes where {entry.bytes} were written"
+        state = (about.st_mtime_ns, about.st_size, entry.sha256)
+        if self._verified.get(name) != state:
+            if file_digest(path) != entry.sha256:
+                return "other content"
+            self._verified[name] = state
+        return ""
 
     def digest(self, name: str) -> str:
         """Return the sha256 that the manifest has for file ``name``."""
@@ -242,7 +272,7 @@ class Branch:
             return False
         wanted = self._read_digests(reads, digests)
         intact = all(name in self.manifest.files
-                     and not _trouble(self.path(name), self.manifest.files[name])
+                     and not self._trouble(name)
                      for name in entry.writes if self._owner(name) == key)
         return intact and entry.reads == wanted and entry.settings == plain(settings or {})
 
@@ -297,11 +327,13 @@ class Branch:
 
     def _read_digests(self, reads: Iterable[str], digests: Mapping[str, str] | None,
                       ) -> dict[str, str]:
+        reads = list(reads)
         missing = [name for name in reads if name not in self.manifest.files]
         if missing:
             raise BranchFolderError(
                 f"{self.folder} has no {', '.join(missing)}.",
                 "The stage that makes it has not been run.", "Run the earlier stages first.")
+        self._check(reads)
         return {name: self.digest(name) for name in reads} | dict(digests or {})
 
     def _manifest_text(self) -> str:
@@ -386,14 +418,6 @@ def _read_manifest(folder: Path) -> Manifest:
         raise BranchFolderError(
             f"{path}: {place or 'content'}: {first['msg']}.", "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
-
-
-def _trouble(path: Path, entry: FileEntry) -> str:
-    if not path.is_file():
-        return "missing"
-    if path.stat().st_size != entry.bytes:
-        return f"{path.stat().st_size} bytes where {entry.bytes} were written"
-    return "" if file_digest(path) == entry.sha256 else "other content"
 
 
 def _checked_name(name: str) -> str:
