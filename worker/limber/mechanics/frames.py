@@ -28,7 +28,8 @@ def write_pc2(path: Path, positions: np.ndarray, start: float = 0.0, rate: float
         rate: Frames a sample.
     """
     positions = np.asarray(positions, np.float32)
-    if positions.ndim != 3 or positions.shape[2] != 3 or not np.isfinite(positions).all():
+    shaped = positions.ndim == 3 and positions.shape[2] == 3 and len(positions) > 0
+    if not shaped or not np.isfinite(positions).all():
         raise InputError(f"Frames of shape {positions.shape}, or not finite.",
                          "A cache needs [frames, vertices, 3].", "Check the motion.")
     header = _PC2_HEADER.pack(b"POINTCACHE2\0", 1, positions.shape[1], start, rate,
@@ -43,11 +44,13 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
         InputError: it is not one, or it is cut short.
     """
     data = Path(path).read_bytes()
-    name, _, count, start, rate, frames = _PC2_HEADER.unpack(data[:_PC2_HEADER.size])
-    body = np.frombuffer(data[_PC2_HEADER.size:], "<f4")
-    if name != b"POINTCACHE2\0" or body.size != frames * count * 3:
+    whole = len(data) >= _PC2_HEADER.size
+    header = data[:_PC2_HEADER.size] if whole else bytes(_PC2_HEADER.size)
+    name, _, count, start, rate, frames = _PC2_HEADER.unpack(header)
+    if name != b"POINTCACHE2\0" or len(data) - _PC2_HEADER.size != frames * count * 12:
         raise InputError(f"{path} is not a whole PC2 file.", "It is damaged or of another kind.",
                          "Write it again.")
+    body = np.frombuffer(data, "<f4", offset=_PC2_HEADER.size)
     return body.reshape(frames, count, 3), start, rate
 
 

@@ -12,7 +12,7 @@ from limber.mechanics.dynamics import NewmarkSettings, simulate_dynamics
 from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import GRAVITY, BranchModel
+from limber.mechanics.model import BranchModel
 from limber.mechanics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics import StaticResult, follow_poses, solve_static
 from limber.mechanics.strain import strain_state
@@ -101,7 +101,7 @@ def _prepared(branch: Branch, settings: SimulateSettings, progress: Progress,
               warn: Any) -> tuple[BranchModel, Grasp]:
     progress(0.0, "preparing")
     model = BranchModel.from_branch(
-        branch, material=settings.material, gravity=GRAVITY if settings.gravity else None,
+        branch, material=settings.material, gravity=branch.gravity if settings.gravity else None,
         damping=RayleighDamping(settings.damping_mass, settings.damping_stiffness))
     if settings.gravity and settings.rest_shape:
         try:
