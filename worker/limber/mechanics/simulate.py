@@ -21,9 +21,13 @@ from limber.store import Branch, write_atomically
 
 STAGE = "simulate"
 
+_PROBE = 1e-6
+# Of the way from base to grasp: how far a branch is bent when nothing is asked for.
+_DEFAULT_BEND = 0.2
+
 
 class SimulateSettings(BaseModel):
-    """Options of `limber simulate`."""
+    """Options of `limber simulate`; with no motion and no force, one that bends it a little."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -46,7 +50,7 @@ class SimulateSettings(BaseModel):
     hold: float = Field(0.5, ge=0, description="Time at the end of the pull [s] (dynamic).")
     frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames a second.")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
-    gravity: bool = Field(True, description="Gravity along -z.")
+    gravity: bool = Field(True, description="Gravity, as it acts on the scan.")
     rest_shape: bool = Field(
         True, description="Take the scan as already sagging under gravity.")
     material: Literal["st_venant_kirchhoff", "stable_neo_hookean", "linear"] = Field(
@@ -81,7 +85,10 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         return stored.result
     model, grasp = _prepared(branch, settings, progress.part(0.0, 0.2), warn)
     run = _static if settings.kind == "static" else _dynamic
-    motion = run(model, grasp, settings, progress.part(0.2, 0.9))
+    driven = settings
+    if settings.move is None and settings.turn is None and settings.grasp_force is None:
+        driven = settings.model_copy(update={"grasp_force": bending_force(model, grasp)})
+    motion = run(model, grasp, driven, progress.part(0.2, 0.9))
     for message in motion["warnings"]:
         warn(message)
     with branch.stage(STAGE, settings, reads=["mesh.vtu"]) as stage:
@@ -95,6 +102,22 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
             f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
             "Pull less far, or check units and Young's modulus.")
     return result
+
+
+def bending_force(model: BranchModel, grasp: Grasp) -> tuple[float, float, float]:
+    """Return the force [N] across the branch that would bend it by a fifth of its reach.
+
+    By the stiffness at rest. A motion along a line invented in space would buckle or stretch a
+    branch, whose length is fixed; under a force it goes where it can.
+    """
+    axis = grasp.centre - model.mesh.nodes[model.fixed].mean(axis=0)
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    weightless = model.with_parameters(gravity=(0.0, 0.0, 0.0))
+    probe = solve_static(weightless, grasp=grasp, grasp_force=_PROBE * across).require()
+    moved = np.linalg.norm(grasp.weights @ probe.displacement[grasp.nodes])
+    x, y, z = _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
+    return float(x), float(y), float(z)
 
 
 def _prepared(branch: Branch, settings: SimulateSettings, progress: Progress,
@@ -161,8 +184,9 @@ def _static(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
     bad = next((r for r in results if not r.converged), None)
     if bad is not None:
         good = results[:results.index(bad)] + [bad]
-    force = [r.reaction_force if settings.grasp_force is None else s * np.array(settings.grasp_force)
-             for r, s in zip(good, part, strict=False)]
+    force = [result.reaction_force for result in good]
+    if settings.grasp_force is not None:
+        force = part[:len(good), None] * np.array(settings.grasp_force)
     return {
         "times": times[:len(good)], "displacement": np.array([r.displacement for r in good]),
         "strain_energy": [r.strain_energy for r in good], "kinetic_energy": [0.0] * len(good),
