@@ -127,10 +127,15 @@ def _colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> di
     if log:
         low = max(low, high / _MOST_DECADES)
     middle = float(np.sqrt(low * high)) if log else 0.5 * (low + high)
-    prefix = next((p for p in _PREFIXES if abs(high) >= p[0]), (1.0, ""))
-    ticks = [f"{value / prefix[0]:.3g} {prefix[1]}{unit}" for value in (low, middle, high)]
+    ticks = [_with_unit(value, unit, value if log else high) for value in (low, middle, high)]
     return {"title": title, "unit": unit, "low": low, "high": high, "log": log, "ticks": ticks,
             "stops": _stops(colours)}
+
+
+def _with_unit(value: float, unit: str, size: float) -> str:
+    """Return ``value`` in words, with the prefix that suits ``size``."""
+    factor, prefix = next((p for p in _PREFIXES if abs(size) >= p[0]), (1.0, ""))
+    return f"{value / factor:.3g} {prefix}{unit}"
 
 
 def _stops(name: str) -> list[list[float]]:
