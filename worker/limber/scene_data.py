@@ -134,7 +134,8 @@ def _colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> di
 
 def _with_unit(value: float, unit: str, size: float) -> str:
     """Return ``value`` in words, with the prefix that suits ``size``."""
-    factor, prefix = next((p for p in _PREFIXES if abs(size) >= p[0]), (1.0, ""))
+    # What rounds up to a prefix gets it: 1 MPa, not 1e+03 kPa.
+    factor, prefix = next((p for p in _PREFIXES if 1.0005 * abs(size) >= p[0]), (1.0, ""))
     return f"{value / factor:.3g} {prefix}{unit}"
 
 
