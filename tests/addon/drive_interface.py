@@ -188,7 +188,7 @@ def run():
         if STEPS[0]():
             STEPS.pop(0)
             del started["step"]
-        elif waited(40):
+        elif waited(80):
             raise TimeoutError(f"{started['name']}, {len(STEPS)} steps from the end")
         if STEPS:
             return 0.05

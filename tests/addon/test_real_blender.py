@@ -163,7 +163,7 @@ def virtual_screen() -> Iterator[str]:
 
 def _take_pictures(folder: Path, display: str, process: subprocess.Popen) -> None:
     """Take a picture of the screen whenever Blender asks for one; return when it has ended."""
-    end = time.monotonic() + 150
+    end = time.monotonic() + 240
     while process.poll() is None and time.monotonic() < end:
         for request in folder.glob("*.request"):
             picture = request.with_suffix(".png")
