@@ -16,7 +16,7 @@ from limber.estimation.recording import (
 @pytest.fixture(scope="session")
 def small() -> PaperBranch:
     """Short and thick: few tetrahedra; E falls by a factor of 4 along it."""
-    return PaperBranch("small", (40e6, 25e6, 16e6, 10e6), 0.36, 0.35, (0.012, 0.009), 0.4)
+    return PaperBranch("small", (40e6, 22e6, 12e6, 3e6), 0.36, 0.40, (0.010, 0.008), 0.4)
 
 
 @pytest.fixture(scope="session")

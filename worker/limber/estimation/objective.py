@@ -110,10 +110,12 @@ class Objective:
         try:
             pulls = [forward.simulate(values, self.space.extra, jacobian)
                      for forward in self.forwards]
-            self.forward_count += 1
             found = None if any(pull is None for pull in pulls) else self._compare(free, pulls)
-            self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
-                         found.loss if found else np.inf)
+            if last is None or not np.array_equal(last.free, free):
+                # The derivative at a state that is known already is not another simulation.
+                self.forward_count += 1
+                self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
+                             found.loss if found else np.inf)
             best = self.log.best
             self._progress(min(self.forward_count / self._expected, 0.99), "fitting",
                            loss_m2=found.loss if found else np.inf, best_m2=best.loss,

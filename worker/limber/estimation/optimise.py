@@ -8,6 +8,9 @@ from scipy.optimize import least_squares, minimize
 from limber.errors import WorkError
 from limber.estimation.objective import FAILED_OBJECTIVE, Evaluation, Objective
 
+FIRST_STEP = 1.5
+"""Longest first step of Gauss-Newton in the space of log E."""
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -25,7 +28,7 @@ class Fit:
 
 
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
-                 evaluation_limit: int = 40, tolerance: float = 1e-6) -> Fit:
+                 evaluation_limit: int = 40, tolerance: float = 3e-5) -> Fit:
     """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
 
     Args:
@@ -34,31 +37,38 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         robust: Residuals beyond 3 standard deviations count linearly (``soft_l1``), so that an
             outlier cannot pull the fit.
         evaluation_limit: At most so many forward simulations.
-        tolerance: Relative change of cost and of parameters that ends it.
+        tolerance: Relative change of cost that ends it.
 
     Raises:
         WorkError: no equilibrium at the start.
     """
     lower, upper = objective.space.bounds()
     start = np.clip(start, lower + 1e-6, upper - 1e-6)
-    first = _required(objective, start)
-    size = len(first.residual)
+    size = len(_required(objective, start).residual)
+    # scipy takes the length of its first vector for the first step's limit: a change of the
+    # moduli by about a factor of e in all, where log E itself would allow any.
+    shift = start - FIRST_STEP / np.sqrt(len(start))
 
-    def residual(free: np.ndarray) -> np.ndarray:
-        found = objective.evaluate(free, jacobian=True)
+    def residual(moved: np.ndarray) -> np.ndarray:
+        found = objective.evaluate(moved + shift)
         if found is None:
             # Farther off than anything: the trust region shrinks.
             return np.full(size, np.sqrt(FAILED_OBJECTIVE / size))
         return found.residual
 
-    def jacobian(free: np.ndarray) -> np.ndarray:
-        return _required(objective, free).jacobian
+    def jacobian(moved: np.ndarray) -> np.ndarray:
+        return _required(objective, moved + shift).jacobian
 
-    found = least_squares(
-        residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale="jac",
-        loss="soft_l1" if robust else "linear", f_scale=3.0, ftol=tolerance, xtol=tolerance,
-        gtol=1e-12, max_nfev=evaluation_limit)
-    return Fit(_required(objective, found.x), found.status > 0, str(found.message))
+    # Far from the solution all residuals are large, and a robust loss would only slow the way.
+    phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
+    moved = start - shift
+    for loss, ending in phases:
+        found = least_squares(
+            residual, moved, jacobian, bounds=(lower - shift, upper - shift), method="trf",
+            loss=loss, f_scale=3.0, ftol=ending, xtol=1e-6, gtol=1e-12,
+            max_nfev=evaluation_limit)
+        moved = found.x
+    return Fit(_required(objective, found.x + shift), found.status > 0, str(found.message))
 
 
 def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: int = 400,

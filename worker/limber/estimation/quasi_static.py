@@ -27,8 +27,12 @@ YOUNG_STEP_LIMIT = 0.7
 class _Memory:
     """State of one key frame under the last parameters: where the next solve starts."""
 
-    displacement: np.ndarray
+    result: StaticResult
     slope: np.ndarray | None = None
+
+    @property
+    def displacement(self) -> np.ndarray:
+        return self.result.displacement
 
 
 class QuasiStaticForward:
@@ -75,7 +79,7 @@ class QuasiStaticForward:
             along = frames.times - frames.times[0]
         self.keys, self._spread = key_frames(along, count)
         self._memory: list[_Memory | None] = [None] * len(self.keys)
-        self._values: np.ndarray | None = None
+        self._values: Values | None = None
         if self.drive == "pose":
             self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
                             for pose in frames.poses[self.keys]]
@@ -98,7 +102,7 @@ class QuasiStaticForward:
         """Return the pull under ``values``; None where a frame finds no equilibrium."""
         model = self.model_with(values)
         log_young = np.log(values.young)
-        jump = None if self._values is None else log_young - self._values
+        jump = None if self._values is None else log_young - np.log(self._values.young)
         shape = (len(self.keys), len(self.rest_points), 3)
         count = len(values.young) + len(extra)
         points, forces = np.empty(shape), np.empty((len(self.keys), 3))
@@ -107,20 +111,22 @@ class QuasiStaticForward:
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
         for key, drive in enumerate(self._drives):
-            result = self._solved(model, drive, self._memory[key], jump, before)
+            memory = self._memory[key]
+            same = memory is not None and _equal(self._values, values)
+            result = memory.result if same else self._solved(model, drive, memory, jump, before)
             if result is None:
                 return None
             before = result.displacement
             # An old derivative still foretells most of a small change.
-            slope = None if self._memory[key] is None else self._memory[key].slope
+            slope = None if memory is None else memory.slope
             points[key] = self.rest_points + self._observed(before)
             forces[key] = result.reaction_force if self.drive == "pose" else drive
             if sensitivities:
                 slope, d_forces[key] = self._slopes(model, values, extra, result)
                 for column in range(count):
                     d_points[key, ..., column] = self._observed(slope[..., column])
-            states.append(_Memory(before, slope))
-        self._memory, self._values = states, log_young
+            states.append(_Memory(result, slope))
+        self._memory, self._values = states, values
         return self._at_all_frames(points, forces, d_points, d_forces)
 
     def displacements(self) -> list[np.ndarray]:
@@ -189,6 +195,12 @@ class QuasiStaticForward:
         return Simulated(spread(points), spread(forces),
                          None if d_points is None else spread(d_points),
                          None if d_forces is None else spread(d_forces))
+
+
+def _equal(one: Values | None, other: Values) -> bool:
+    return one is not None and np.array_equal(one.young, other.young) and (
+        (one.poisson, one.density, one.damping)
+        == (other.poisson, other.density, other.damping))
 
 
 def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:

@@ -200,7 +200,7 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
     return PullEntry(
         observation="depth" if settings.camera else "markers",
         gravity_m_s2=GRAVITY if settings.gravity else None,
-        grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.8 * radius),
+        grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
                          mode=settings.mode),
         rest_points_m=None if settings.camera else tuple(
             tuple(map(float, p)) for p in truth.control_points),
