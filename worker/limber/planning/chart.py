@@ -13,7 +13,8 @@ in the gentle valley (scripts/bench planning).
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+from limber.mechanics.compiled import compiled
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class Chart:
         return unit * np.sum(unit * vectors, axis=1, keepdims=True)
 
 
-@njit(cache=True)
+@compiled
 def mapped(point, base, radius, stretch):
     """Return the chart coordinates of one point [3]."""
     if stretch == 1.0:
@@ -66,7 +67,7 @@ def mapped(point, base, radius, stretch):
     return base + arm * ((radius + stretch * (r - radius)) / r)
 
 
-@njit(cache=True)
+@compiled
 def _mapped(points, base, radius, stretch):
     out = np.empty_like(points)
     for i in range(len(points)):
@@ -74,7 +75,7 @@ def _mapped(points, base, radius, stretch):
     return out
 
 
-@njit(cache=True)
+@compiled
 def pulled_back_size(point, gradient, base, radius, stretch):
     """Return the magnitude of one gradient [3] taken back to the point's coordinates."""
     if stretch == 1.0:

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from limber.errors import InputError, WorkError
+from limber.mechanics.compiled import compiled
 from limber.planning.chart import Chart, mapped, pulled_back_size
 from limber.planning.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.trust import TrustRegion, trusted_at
@@ -310,13 +310,13 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@njit(cache=True)
+@compiled
 def energy_at(point, field):
     """Return the clamped energy [J] at ``point`` [3]."""
     return max(value_at(mapped(point, *field.chart), 0, *field.energy), 0.0)
 
 
-@njit(cache=True)
+@compiled
 def allowed_at(point, energy, field):
     """Return whether ``point``, whose energy is known, is trusted and within the limits."""
     if energy > field.max_energy:

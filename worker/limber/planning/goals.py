@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
 from limber.errors import NoPathError
+from limber.mechanics.compiled import compiled
 from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
 
 
@@ -97,7 +97,7 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
     return np.ascontiguousarray(allowed)
 
 
-@njit(cache=True)
+@compiled
 def allowed_points(points: np.ndarray, limits: FieldArrays) -> np.ndarray:
     """Return whether each of ``points`` [n, 3] is trusted and within the limits, bool [n]."""
     allowed = np.empty(len(points), np.bool_)

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.integrate import trapezoid
 
+from limber.mechanics.compiled import compiled
 from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
 
 STEP = 0.005
@@ -113,7 +113,7 @@ def resample(path: np.ndarray, spacing: float) -> np.ndarray:
     return np.stack([np.interp(spots, along, path[:, k]) for k in range(path.shape[1])], axis=1)
 
 
-@njit(cache=True)
+@compiled
 def edge_cost(start, stop, field, weights):
     """Return the cost of the straight edge; infinite if any of it is not allowed.
 
@@ -136,7 +136,7 @@ def edge_cost(start, stop, field, weights):
     return length * (weights.energy * total / pieces + weights.length)
 
 
-@njit(cache=True)
+@compiled
 def path_cost(path, field, weights):
     """Return the summed cost of a polyline's edges."""
     total = 0.0

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numba import njit
 
 from limber.errors import WorkError
+from limber.mechanics.compiled import compiled
 
 KERNELS = {"cubic": 0, "quintic": 1, "multiquadric": 2, "gaussian": 3}
 """Kernel name to its number in the compiled loops."""
@@ -162,7 +162,7 @@ def _polynomial_rows(centres: np.ndarray, powers: np.ndarray, with_gradients: bo
     return np.concatenate([rows, slopes.reshape(count * dimension, -1)])
 
 
-@njit(cache=True)
+@compiled
 def radial_terms(kernel, shape, squared):
     """Return ``phi``, ``a``, ``b`` at squared distance: grad phi = a d, Hessian = a I + b d d^T."""
     if kernel == 0:
@@ -179,7 +179,7 @@ def radial_terms(kernel, shape, squared):
     return phi, -2.0 * square * phi, 4.0 * square * square * phi
 
 
-@njit(cache=True)
+@compiled
 def _system(centres, kernel, shape, with_gradients):
     count, dimension = centres.shape
     size = count * (1 + dimension) if with_gradients else count
@@ -205,7 +205,7 @@ def _system(centres, kernel, shape, with_gradients):
     return matrix
 
 
-@njit(cache=True)
+@compiled
 def value_at(point, channel, kernel, shape, shift, scale, centres, value_weights,
              gradient_weights, polynomial, powers):
     """Return one channel of the field at ``point`` [dimension]."""
@@ -232,7 +232,7 @@ def value_at(point, channel, kernel, shape, shift, scale, centres, value_weights
     return total
 
 
-@njit(cache=True)
+@compiled
 def gradient_at(point, channel, kernel, shape, shift, scale, centres, value_weights,
                 gradient_weights, polynomial, powers, out):
     """Write the gradient of one channel at ``point`` into ``out`` [dimension]."""
@@ -270,7 +270,7 @@ def gradient_at(point, channel, kernel, shape, shift, scale, centres, value_weig
         out[k] /= scale
 
 
-@njit(cache=True)
+@compiled
 def _values(points, kernel, shape, shift, scale, centres, value_weights, gradient_weights,
             polynomial, powers):
     out = np.empty((len(points), value_weights.shape[1]))
@@ -282,7 +282,7 @@ def _values(points, kernel, shape, shift, scale, centres, value_weights, gradien
     return out
 
 
-@njit(cache=True)
+@compiled
 def _gradients(points, kernel, shape, shift, scale, centres, value_weights, gradient_weights,
                polynomial, powers):
     channels = value_weights.shape[1]

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from limber.errors import NoPathError
+from limber.mechanics.compiled import compiled
 from limber.planning.field import EnergyField, FieldArrays
 from limber.planning.objective import EdgeWeights, edge_cost, path_cost
 from limber.planning.smoothing import polish, shortcut, slide_end
@@ -179,7 +179,7 @@ class _Tree:
         return self.nodes[chain[::-1]].copy()
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _grow(samples, count, nodes, cost, parent, first_child, next_sibling, reach, field, weights):
     """Add a node for each sample that can be reached; returns the new node count."""
     dimension = nodes.shape[1]
@@ -227,7 +227,7 @@ def _grow(samples, count, nodes, cost, parent, first_child, next_sibling, reach,
     return count
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _distances(point, nodes, count, distance):
     """Write squared distances to all nodes; returns the nearest node."""
     nearest = 0
@@ -241,7 +241,7 @@ def _distances(point, nodes, count, distance):
     return nearest
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _smallest(distance, count, wanted):
     """Return the indices of the ``wanted`` smallest of ``distance[:count]``, in rising order."""
     wanted = min(wanted, count)
@@ -260,14 +260,14 @@ def _smallest(distance, count, wanted):
     return kept
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _attach(node, to, parent, first_child, next_sibling):
     parent[node] = to
     next_sibling[node] = first_child[to]
     first_child[to] = node
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _detach(node, parent, first_child, next_sibling):
     above = parent[node]
     if first_child[above] == node:
@@ -279,7 +279,7 @@ def _detach(node, parent, first_child, next_sibling):
     next_sibling[child] = next_sibling[node]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _lower(node, saving, cost, first_child, next_sibling):
     """Take ``saving`` off the cost of ``node`` and of all below it."""
     stack = [node]

@@ -7,10 +7,10 @@ accepted samples, unless a pose that the branch model refused lies nearer than a
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.spatial import ConvexHull, QhullError
 
 from limber.errors import WorkError
+from limber.mechanics.compiled import compiled
 
 _EDGE = 1e-9  # [m] a sample on the hull belongs to it in spite of rounding
 
@@ -65,7 +65,7 @@ class TrustRegion:
         return np.concatenate(found)
 
 
-@njit(cache=True)
+@compiled
 def trusted_at(point, planes, accepted, rejected):
     """Return whether ``point`` [d] is in the region."""
     dimension = len(point)
@@ -80,7 +80,7 @@ def trusted_at(point, planes, accepted, rejected):
     return _nearest(point, accepted) <= _nearest(point, rejected)
 
 
-@njit(cache=True)
+@compiled
 def _nearest(point, others):
     best = np.inf
     for i in range(len(others)):
@@ -91,7 +91,7 @@ def _nearest(point, others):
     return best
 
 
-@njit(cache=True)
+@compiled
 def _contain(points, planes, accepted, rejected):
     inside = np.empty(len(points), np.bool_)
     for i in range(len(points)):
