@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.errors import ConvergenceError
+from limber.errors import ConvergenceError, InputError
 from limber.geometry.tet_mesh import EDGES, TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics import StaticSettings, solve_static
@@ -40,7 +40,13 @@ def unloaded_rest_shape(model: BranchModel, *, tolerance: float = 1e-6,
     for number in range(_MAX_ITERATIONS):
         progress(number / _MAX_ITERATIONS, "seeking the rest shape",
                  miss=misses[-1] if misses else 0.0)
-        candidate = model.with_rest_nodes(rest)
+        try:
+            candidate = model.with_rest_nodes(rest)
+        except InputError as error:
+            raise ConvergenceError(
+                f"No rest shape: on the way to it elements turn inside out. {error.seen}",
+                "The branch is too soft to carry itself in the scanned shape.",
+                "Check Young's modulus, density and gravity.") from error
         guess = None if displacement is None else scan - rest
         found = solve_static(candidate, start=guess, settings=settings)
         if not found.converged and guess is not None:
