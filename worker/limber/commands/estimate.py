@@ -13,8 +13,16 @@ from limber.estimation.settings import EstimateSettings
 @stage_command("estimate")
 @click.argument("branch_folder", type=click.Path(path_type=Path))
 @click.option("--force", is_flag=True, help="Estimate again even if nothing has changed.")
+@click.option("--follow", "is_online", is_flag=True,
+              help="Estimate frame by frame while a pull is recorded, or replay one.")
+@click.option("--pace", type=click.FloatRange(min=0), default=1.0, show_default=True,
+              help="Speed of a replay; 0: as fast as it goes.")
 @settings_options(EstimateSettings)
-def command(run: Run, branch_folder: Path, force: bool,
+def command(run: Run, branch_folder: Path, force: bool, is_online: bool, pace: float,
             settings: EstimateSettings) -> dict[str, Any]:
     """Young's modulus along the branch with its uncertainty, from recorded or virtual pulls."""
+    if is_online:
+        from limber.estimation.follow import follow
+
+        return follow(branch_folder, settings, pace=pace, progress=run.progress, warn=run.warn)
     return estimate(branch_folder, settings, force=force, progress=run.progress, warn=run.warn)

@@ -1,0 +1,74 @@
+"""A fast pull, simulated in time: inertia, damping and what swings on after the gripper stops."""
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.estimation.alignment import Frames
+from limber.estimation.grasping import grasp_on, pose_on
+from limber.estimation.objective import Simulated
+from limber.estimation.parameters import Values
+from limber.estimation.points import point_operator
+from limber.estimation.quasi_static import mechanics_names
+from limber.estimation.recording import PullEntry
+from limber.mechanics.dynamics import simulate_dynamics
+from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.sensitivities import ParameterSet
+
+
+class DynamicForward:
+    """Simulates one pull by Newmark steps; see :class:`limber.estimation.objective.Forward`.
+
+    Arguments as for :class:`limber.estimation.quasi_static.QuasiStaticForward`. Every frame
+    counts, none is thinned: motion has no shortcuts.
+    """
+
+    def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
+                 frames: Frames, rest_points: np.ndarray):
+        self.name, self.frames, self.entry = name, frames, entry
+        measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+        if entry.drive == "force" and not measured.all():
+            raise InputError(f"{name}: the force is missing in {np.sum(~measured)} frames.",
+                             "A force-driven motion needs it throughout.", "Use --drive pose.")
+        self.uses_force = entry.drive == "pose" and bool(measured.any())
+        self.rest_points = np.asarray(rest_points, float)
+        self.weights = weights
+        gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
+        self._model = model.with_parameters(gravity=gravity)
+        self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._operator = point_operator(model.mesh, self.rest_points)
+        # Only the nodes that the observed points hang on need derivatives.
+        self._nodes = np.unique(self._operator.indices // 3)
+        columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
+        self._near = self._operator[:, columns]
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None:
+        """Return the pull under ``values``; None where the motion cannot be followed."""
+        model = self._model.with_parameters(
+            young=self.weights @ values.young, poisson=values.poisson, density=values.density,
+            damping=RayleighDamping(*values.damping))
+        frames, by_pose = self.frames, self.entry.drive == "pose"
+        drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
+                                     for pose in frames.poses])} if by_pose
+                 else {"grasp_forces": frames.wrenches[:, :3]})
+        wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
+        asked = {"sensitivities": wanted, "followed": self._nodes} if sensitivities else {}
+        result = simulate_dynamics(model, grasp=self.grasp, times=frames.times, **drive, **asked)
+        if not result.converged:
+            return None
+        moved = (self._operator @ result.displacement.reshape(len(frames), -1).T).T
+        positions = self.rest_points + moved.reshape(len(frames), -1, 3)
+        forces = result.reaction_force if by_pose else frames.wrenches[:, :3]
+        if not sensitivities:
+            return Simulated(positions, forces)
+        slopes = result.sensitivities
+        count = slopes.displacement.shape[-1]
+        # Damping enters the fit by its logarithm.
+        scale = np.array([*np.ones(len(values.young)), *(
+            {"alpha": values.damping[0], "beta": values.damping[1]}.get(name, 1.0)
+            for name in extra)])
+        flat = slopes.displacement.reshape(len(frames), -1, count)
+        d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
+        d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
+        return Simulated(positions, forces, d_positions * scale, d_forces * scale)
