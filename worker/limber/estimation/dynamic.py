@@ -53,7 +53,7 @@ class DynamicForward:
                                      for pose in frames.poses])} if by_pose
                  else {"grasp_forces": frames.wrenches[:, :3]})
         wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
-        asked = {"sensitivities": wanted, "followed": self._nodes} if sensitivities else {}
+        asked = {"sensitivities": wanted, "sensitivity_nodes": self._nodes} if sensitivities else {}
         result = simulate_dynamics(model, grasp=self.grasp, times=frames.times, **drive, **asked)
         if not result.converged:
             return None

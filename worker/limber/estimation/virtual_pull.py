@@ -127,7 +127,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
         pull, states = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
         write_pull(folder, pull)
         if settings.camera:
-            _write_depth_frames(folder, truth, pull, states, settings)
+            write_depth_frames(folder, truth, pull, states, settings)
         reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
         stage.result.update({
             "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
@@ -218,8 +218,9 @@ def _pose(grasp: Any, point: np.ndarray, state: StaticResult) -> np.ndarray:
     return np.concatenate([state.pose[:3] + rotation_matrix(turn) @ (point - grasp.centre), turn])
 
 
-def _write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, states: list[StaticResult],
+def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, states: list[StaticResult],
                         settings: VirtualPullSettings) -> None:
+    """Write what a D455 would see of a pull's states: ``depth/`` and ``camera.toml``."""
     camera = viewing(truth.mesh.nodes, [state.displacement for state in states])
     write_camera(folder / "camera.toml", camera)
     (folder / "depth").mkdir(exist_ok=True)
