@@ -92,12 +92,17 @@ def _add_color_bar(sheet: _Sheet, name: str, scale: dict) -> None:
     sheet.y += _BAR_HEIGHT + 1.2 * _LINE
 
 
+def _goal_words(goal: dict) -> str:
+    words = f"goal of the {goal.get('kind', 'grasp')}"
+    return f"{words}, within {100 * goal['radius_m']:.3g} cm" if goal.get("radius_m") else words
+
+
 def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
     thin, dot = (0.05, 0.009), (0.022, 0.022)
     keys = [(f"path:{key}", f"{about['title']} path", about["note"], thin)
             for key, about in data.info["paths"].items()]
-    goal = (data.info.get("goal") or {}).get("kind", "grasp")
-    keys += [("goal", f"goal of the {goal}", "", dot), ("grasp", "grasp", "", dot),
+    keys += [("goal", _goal_words(data.info.get("goal") or {}), "", dot),
+             ("grasp", "grasp", "", dot),
              ("control_points", "control points", "", dot), ("rest", "rest shape", "", dot),
              ("base", "fixed base", "", dot)]
     for name, words, note, (width, height) in keys:

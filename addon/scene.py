@@ -166,7 +166,10 @@ def _add_goal(shown: ShownBranch, data: SceneData) -> None:
     goal = data.info.get("goal")
     if not goal:
         return
-    ball = meshes.new_sphere("Goal", goal["radius_m"] or 0.02 * data.info["size_m"])
+    # Never smaller than what shall reach it; the legend says how near is near enough.
+    least = 1.6 * data.arrays["grasp_radius"][0] if "grasp_radius" in data.arrays else (
+        0.02 * data.info["size_m"])
+    ball = meshes.new_sphere("Goal", max(goal["radius_m"] or 0.0, least))
     meshes.set_one_color(ball, COLORS["goal"])
     material = materials.plain_material("Goal", COLORS["goal"], alpha=0.3)
     thing = add_object(shown.collection, "Goal", ball, material)

@@ -173,7 +173,7 @@ def _add_markers(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
         at = np.flatnonzero(np.asarray(points["grasp"]) > 0)
         if len(at):
             data.arrays["grasp"] = mesh.nodes[at].mean(axis=0).reshape(1, 3)
-    for name, share in (("control_points", 0.013), ("grasp", 0.015)):
+    for name, share in (("control_points", 0.011), ("grasp", 0.012)):
         if len(data.arrays.get(name, ())):
             data.arrays[f"{name}_radius"] = _marker_radii(
                 data.arrays[name], data.arrays["vertices"], share)
@@ -189,8 +189,9 @@ def _add_markers(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
 def _marker_radii(points: np.ndarray, vertices: np.ndarray, share: float) -> np.ndarray:
     """Return radii [m] of balls at ``points`` that are seen: as a share of all, and not inside."""
     distance = np.linalg.norm(points[:, None] - vertices, axis=2)
-    around = np.sort(distance, axis=1)[:, :6].mean(axis=1)
-    return np.maximum(share * np.ptp(vertices, axis=0).max(), 1.4 * around)
+    around = np.sort(distance, axis=1)[:, :4].mean(axis=1)
+    least = share * np.ptp(vertices, axis=0).max()
+    return np.clip(1.35 * around, least, 2.5 * least)
 
 
 def _add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
@@ -235,7 +236,8 @@ def _path_note(summary: dict[str, Any]) -> str:
     if summary.get("length_m") is not None:
         parts.append(f"{100 * summary['length_m']:.1f} cm")
     if summary.get("energy_sum_nmm") is not None:
-        parts.append(f"{summary['energy_sum_nmm']:.3g} N mm")
+        total = summary["energy_sum_nmm"]
+        parts.append(f"{total:.0f} N mm" if abs(total) >= 100 else f"{total:.3g} N mm")
     return ", ".join(parts)
 
 
@@ -338,13 +340,17 @@ def _add_view(data: SceneData) -> None:
     data.info["size_m"] = np.ptp(arrays["view_points"], axis=0).max()
     data.info["ground_m"] = arrays["view_points"][:, 2].min()
     motion = [arrays[name] for name in arrays if name.startswith("path:")]
-    flat = np.vstack(motion or [vertices])[:, :2]
-    _, _, axes = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
-    across = axes[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]]) if len(axes) else np.array([0.0, 1.0])
+    arrays["view_direction"] = _view_direction(np.vstack(motion or [vertices])[:, :2])
+
+
+def _view_direction(points: np.ndarray) -> np.ndarray:
+    """Return a unit vector that looks across the main direction of ``points`` [n, 2], downwards."""
+    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    across = axes[0] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     # Of the two sides, always the same one, so that a picture made twice is the same picture.
     across = across if across[1] >= 0 else -across
     turned = np.array([across[0] - 0.3 * across[1], across[1] + 0.3 * across[0], -0.22])
-    arrays["view_direction"] = turned / np.linalg.norm(turned)
+    return turned / np.linalg.norm(turned)
 
 
 def _corners(bounds: np.ndarray) -> np.ndarray:
