@@ -8,9 +8,10 @@ import pytest
 from limber.errors import Cancelled, WorkError
 from limber.mechanics import Grasp, solve_static
 from limber.planning.chart import Chart
-from limber.planning.grasp_model import Reach
+from limber.planning.grasp_model import Reach, read_grasp_model
 from limber.planning.sampling import sample_branch, sample_positions, without_taut
 from limber.progress import Progress
+from limber.store import Branch
 
 REACH = Reach(np.zeros(3), 0.4, 0.38, np.array([0.0, 0.0, 0.6]))
 REST = np.array([0.0, 0.0, 0.38])
@@ -130,3 +131,16 @@ def test_chart_gradients_are_those_of_the_map():
     pulled = chart.pull_back(points, gradient)
     assert np.allclose(pulled, differences, atol=1e-7)
     assert np.allclose(chart.push_forward(points, pulled), gradient, atol=1e-9)
+
+
+def test_weight_leaves_the_scan_as_the_rest_state(planned_branch, small_mesh):
+    """With gravity the branch hangs at rest in the shape that was scanned, strained by its weight.
+
+    Energy counts from there, so it is zero at rest though the strain energy is not.
+    """
+    model = read_grasp_model(Branch.open(planned_branch), gravity=True)
+    hanging = model.mesh.nodes + model.rest.displacement
+    assert np.abs(hanging - small_mesh.nodes).max() < 1e-4
+    assert np.abs(model.rest.displacement).max() > 1e-3, "the weight must matter here"
+    assert model.rest.strain_energy > 0.0 and model.energy(model.rest) == 0.0
+    assert np.allclose(model.rest_position, Grasp.from_mesh(small_mesh).centre, atol=1e-4)

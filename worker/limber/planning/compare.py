@@ -31,7 +31,7 @@ class PlanSettings(BaseModel):
         "Start from a random deformed configuration instead, as in the paper's trials."))
     deformation_weight: float = Field(1.0, ge=0, description=(
         "Weight of deformation, the paper's alpha_def."))
-    distance_weight: float = Field(1.0, gt=0, description=(
+    distance_weight: float = Field(1.5, gt=0, description=(
         "Weight of distance, the paper's alpha_dis."))
     max_energy: float | None = Field(None, gt=0, description=(
         "Deformation energy that no pose may exceed [J]."))

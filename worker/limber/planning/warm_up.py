@@ -1,0 +1,22 @@
+"""Compiles the planner's loops once, so that no user waits for a compiler."""
+
+import numpy as np
+
+from limber.planning.compare import PlanSettings, plan_pair
+from limber.planning.field import GraspSamples, fit_field
+from limber.planning.goals import GraspGoal
+from limber.progress import SILENT, Progress
+
+
+def warm_up(progress: Progress = SILENT) -> None:
+    """Plan once on an invented branch; the compiled code stays in the user's cache folder."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1.0, 1.0, (40, 3))
+    points[0] = 0.0
+    energies = 0.5 * (points**2).sum(axis=1)
+    samples = GraspSamples(np.hstack([points, 0 * points]), energies, energies, points, points,
+                           np.ones(40), np.empty((0, 6)))
+    field = fit_field(samples, np.array([0.0, 0.0, -3.0]), progress=progress.part(0.0, 0.5))
+    settings = PlanSettings(iterations=100, engine="own", max_energy=1e3, max_force=1e3)
+    plan_pair(field, np.zeros(3), GraspGoal((0.2, 0.0, 0.0), 0.05), settings,
+              progress=progress.part(0.5, 1.0))
