@@ -370,11 +370,11 @@ class _Motion:
             return False
         if viscous is not None:
             new.strain, new.strain_before = self.model.strains(new.displacement), old.strain
-        if self.path:
-            self._impose(new, new.time)
         self.viscous, self.state = viscous, new
         if self.wanted is not None:
             self._advance_tangents(old, new, dt)
+        if self.path:
+            self._impose(new, new.time)
         self.step_count += 1
         return True
 

@@ -1,0 +1,548 @@
+"""Mechanics against exact solutions, its own convergence rates, and the clock.
+
+Times are processor seconds of this process, the least of several runs: other work on the machine
+disturbs them least. Ratios are taken within one run.
+"""
+
+import csv
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from limber.benchmarks.table import Row
+from limber.geometry.cylinder_mesh import straight_beam
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics import (
+    BranchModel,
+    Grasp,
+    NewmarkSettings,
+    RayleighDamping,
+    StaticSettings,
+    follow_poses,
+    simulate_dynamics,
+    solve_static,
+)
+from limber.mechanics import elements as fe
+from limber.mechanics.grasp import rotation_matrix
+from limber.mechanics.rest_shape import unloaded_rest_shape
+from limber.mechanics.statics import solve_prescribed
+from limber.progress import SILENT, Progress
+
+ELASTICA = Path(__file__).parents[4] / "shared" / "data" / "elastica"
+LENGTH, RADIUS, YOUNG, DENSITY = 0.6, 0.004, 5e7, 900.0
+_UNDAMPED = RayleighDamping(0.0, 0.0)
+_FREQUENCY = 1.87510407
+
+
+def rows(quick: bool, progress: Progress = SILENT, out: Path | None = None) -> list[Row]:
+    """Measure; ``quick`` takes fewer grasps and the smaller meshes."""
+    steps: list[Callable[[], list[Row]]] = [
+        elastica_rows, lambda: [element_rate_row(quick)], lambda: [time_rate_row()],
+        exactness_rows, lambda: [vibration_row()], lambda: [rest_shape_row()],
+        lambda: speed_rows(quick), lambda: [linear_row()], lambda: [grasp_row(quick)],
+        lambda: [memory_row(quick)]]
+    found = []
+    for number, step in enumerate(steps):
+        progress(0.6 * number / len(steps), "measuring")
+        found += step()
+    found += _reduced_rows(quick, progress.part(0.6, 0.9), out)
+    found += _peer_rows()
+    progress(1.0, "done")
+    return found
+
+
+def _reduced_rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
+    try:
+        from limber.benchmarks import mechanics_reduced
+    except ImportError as error:
+        return [Row("reduced model and session", "-", f"not there yet ({error})", None)]
+    return mechanics_reduced.rows(quick, progress, out)
+
+
+def _peer_rows() -> list[Row]:
+    from limber.benchmarks import mechanics_peers
+
+    return mechanics_peers.rows()
+
+
+# --- exact solutions -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cantilever:
+    """A slender round beam of about 1,500 quadratic tetrahedra along z, and its end face."""
+
+    mesh: TetMesh
+    end: Grasp
+    inertia: float
+    area: float
+
+    @classmethod
+    def make(cls, ratio: float = 1.0, slices: int = 83) -> "Cantilever":
+        mesh = straight_beam(LENGTH, RADIUS, RADIUS * ratio, slice_count=slices)
+        end = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > LENGTH - 1e-9), "pinned")
+        area, inertia = section(mesh)
+        return cls(mesh, end, inertia, area)
+
+    def model(self, gravity: tuple[float, float, float] | None = None) -> BranchModel:
+        return BranchModel(self.mesh, young=YOUNG, poisson=0.35, density=DENSITY, gravity=gravity)
+
+    def errors(self, moved: np.ndarray, sideways: float, shortening: float) -> list[float]:
+        """Relative errors [%] of the end's motion [m, 3] in w/L and u/L."""
+        middle = self.end.weights @ moved[self.end.nodes] / LENGTH
+        return [100 * abs(np.linalg.norm(middle[:2]) / sideways - 1),
+                100 * abs(-middle[2] / shortening - 1)]
+
+
+def section(mesh: TetMesh) -> tuple[float, float]:
+    """Return area [m^2] and second moment [m^4] of the polygon at z = 0."""
+    corners = mesh.nodes[np.unique(mesh.tets[:, :4])]
+    base = corners[np.abs(corners[:, 2]) < 1e-9][:, :2]
+    radius = np.linalg.norm(base, axis=1)
+    ring = base[radius > radius.max() - 1e-9]
+    ring = ring[np.argsort(np.arctan2(ring[:, 1], ring[:, 0]))]
+    after = np.roll(ring, -1, axis=0)
+    cross = ring[:, 0] * after[:, 1] - after[:, 0] * ring[:, 1]
+    second = cross * (ring[:, 0]**2 + ring[:, 0] * after[:, 0] + after[:, 0]**2)
+    return float(cross.sum() / 2), float(second.sum() / 12)
+
+
+def elastica_rows() -> list[Row]:
+    """Tip load, own weight, end moment and taper against the reference tables."""
+    asked = "0.7 % in w/L and u/L"
+    if not ELASTICA.is_dir():
+        return [Row("cantilever against the elastica", asked, f"no data in {ELASTICA}", None)]
+    beam = Cantilever.make()
+    stiffness = YOUNG * beam.inertia
+    found = []
+    errors = []
+    for row in _table("elastica_tip_load.csv", "alpha_PL2_over_EI", (1, 2, 5, 10)):
+        force = row["alpha_PL2_over_EI"] * stiffness / LENGTH**2
+        result = solve_static(beam.model(), grasp=beam.end, grasp_force=[force, 0, 0]).require()
+        errors += beam.errors(result.displacement, row["delta_v_over_L"], row["delta_h_over_L"])
+    found.append(_elastica_row("dead tip load alpha 1, 2, 5, 10", asked, errors, beam))
+    errors = []
+    for row in _table("elastica_self_weight.csv", "beta_qL3_over_EI", (1, 3, 5, 10)):
+        gravity = row["beta_qL3_over_EI"] * stiffness / LENGTH**3 / (DENSITY * beam.area)
+        result = solve_static(beam.model((gravity, 0, 0))).require()
+        errors += beam.errors(result.displacement, row["delta_v_over_L"], row["delta_h_over_L"])
+    found.append(_elastica_row("own weight beta 1, 3, 5, 10", asked, errors, beam))
+    errors = []
+    for row in _table("end_moment_exact.csv", "ML_over_EI", (0.5, 1.0, 1.57079633, 3.14159265)):
+        moved = _under_end_moment(beam, row["ML_over_EI"] * stiffness / LENGTH)
+        errors += beam.errors(moved, row["delta_v_over_L"], row["delta_h_over_L"])
+    found.append(_elastica_row("end moment ML/EI 0.5 ... pi", asked, errors, beam))
+    errors = []
+    for row in _table("tapered_circular_small_deflection.csv", "r_tip_over_r_base",
+                      (1.0, 0.7, 0.5, 0.3)):
+        taper = Cantilever.make(row["r_tip_over_r_base"])
+        force = 1e-3 * stiffness / LENGTH**2
+        result = solve_static(taper.model(), grasp=taper.end, grasp_force=[force, 0, 0]).require()
+        wanted = row["delta_tip_E_I0_over_P_L3_numeric"] * 1e-3
+        middle = taper.end.weights @ result.displacement[taper.end.nodes]
+        errors.append(100 * abs(middle[0] / LENGTH / wanted - 1))
+    found.append(_elastica_row("taper 1, 0.7, 0.5, 0.3", asked, errors, beam))
+    return found
+
+
+def _elastica_row(what: str, asked: str, errors: list[float], beam: Cantilever) -> Row:
+    return Row(f"cantilever against the elastica: {what}", asked,
+               f"{max(errors):.2f} % at worst ({beam.mesh.tet_count} tetrahedra)",
+               max(errors) <= 0.7)
+
+
+def _table(name: str, key: str, wanted: tuple[float, ...]) -> list[dict[str, float]]:
+    with (ELASTICA / name).open() as stream:
+        table = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(stream)]
+    return [row for row in table if any(abs(row[key] - value) < 1e-6 for value in wanted)]
+
+
+def _under_end_moment(beam: Cantilever, moment: float) -> np.ndarray:
+    """Return the displacement under a moment about y that turns with the end face."""
+    face = replace(beam.end, mode="clamped")
+    arm = beam.mesh.nodes[face.nodes, 0]
+    share = face.weights * arm / (face.weights @ arm**2)
+    turn, result = np.eye(3), None
+    for _ in range(40):
+        forces = np.zeros_like(beam.mesh.nodes)
+        forces[face.nodes] = np.outer(-moment * share, turn[:, 2])
+        result = solve_static(beam.model(), nodal_forces=forces, start=result).require()
+        last = turn
+        turn = rotation_matrix(face.pose_of(beam.mesh.nodes, result.displacement)[3:])
+        if np.abs(turn - last).max() < 1e-6:
+            break
+    return result.displacement
+
+
+# --- convergence -----------------------------------------------------------------------------
+
+
+def element_rate_row(quick: bool) -> Row:
+    """Total potential of a manufactured large-strain solution on refined cubes."""
+    potentials = [_manufactured_potential(n) for n in ((2, 4, 8) if quick else (3, 6, 12))]
+    rate = np.log2((potentials[0] - potentials[1]) / (potentials[1] - potentials[2]))
+    return Row("convergence rate in element size (energy, manufactured StVK solution)",
+               "4 +- 0.3", f"{rate:.2f}", bool(abs(rate - 4) <= 0.3))
+
+
+def _manufactured_potential(cells: int) -> float:
+    mesh = _cube(cells)
+    model = BranchModel(mesh, young=1.0, poisson=0.3, density=1.0, gravity=None,
+                        fixed=(np.abs(mesh.nodes - 0.5) > 0.5 - 1e-9).any(axis=1))
+    rule = fe.quadrature(5)
+    shape = fe.shape_functions(rule.points, 10)
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    places = np.einsum("qc,ecx->eqx", rule.points, corners)
+    load = -_divergence(places.reshape(-1, 3)).reshape(places.shape)
+    weights = mesh.volumes[:, None] * rule.weights
+    forces = np.zeros_like(mesh.nodes)
+    np.add.at(forces, mesh.tets, np.einsum("eq,qa,eqx->eax", weights, shape, load))
+    result = solve_prescribed(model, np.zeros_like(forces), nodal_forces=forces,
+                              settings=StaticSettings(tolerance=1e-11)).require()
+    return result.strain_energy - float((forces * result.displacement).sum())
+
+
+def _smooth_gradient(points: np.ndarray) -> np.ndarray:
+    """Gradient of u = (0.08, -0.05, 0.06) sin(pi x) sin(pi y) sin(pi z), shape [n, 3, 3]."""
+    s, c = np.sin(np.pi * points), np.pi * np.cos(np.pi * points)
+    slope = np.stack([c[:, 0] * s[:, 1] * s[:, 2], s[:, 0] * c[:, 1] * s[:, 2],
+                      s[:, 0] * s[:, 1] * c[:, 2]], axis=1)
+    return np.array([0.08, -0.05, 0.06])[None, :, None] * slope[:, None, :]
+
+
+def _first_stress(points: np.ndarray) -> np.ndarray:
+    lam, mu = 0.3 / (1.3 * 0.4), 1 / 2.6
+    F = np.eye(3) + _smooth_gradient(points)
+    strain = 0.5 * (np.swapaxes(F, 1, 2) @ F - np.eye(3))
+    trace = np.trace(strain, axis1=1, axis2=2)[:, None, None]
+    return F @ (lam * trace * np.eye(3) + 2 * mu * strain)
+
+
+def _divergence(points: np.ndarray) -> np.ndarray:
+    total, h = np.zeros_like(points), 1e-3
+    for axis in range(3):
+        shift = h * np.eye(3)[axis]
+        near = _first_stress(points + shift) - _first_stress(points - shift)
+        far = _first_stress(points + 2 * shift) - _first_stress(points - 2 * shift)
+        total += ((8 * near - far) / (12 * h))[:, :, axis]
+    return total
+
+
+def _cube(cells: int) -> TetMesh:
+    from itertools import permutations, product
+
+    line = np.linspace(0, 1, cells + 1)
+    nodes = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
+    tets, strides = [], np.array([(cells + 1)**2, cells + 1, 1])
+    for cell in product(range(cells), repeat=3):
+        first = int(np.dot(cell, strides))
+        for turn in permutations(range(3)):
+            tets.append(first + np.concatenate([[0], np.cumsum(strides[list(turn)])]))
+    return TetMesh(nodes, np.array(tets)).oriented().quadratic()
+
+
+def _short_beam(slices: int = 16) -> tuple[TetMesh, Grasp]:
+    mesh = straight_beam(0.2, 0.005, slice_count=slices)
+    return mesh, Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "pinned")
+
+
+def time_rate_row() -> Row:
+    """Halved steps of a large swing, undamped and viscous."""
+    mesh, tip = _short_beam(8)
+    rates, end = [], 0.24
+    for damping in (_UNDAMPED, RayleighDamping(1.0, 0.01)):
+        model = BranchModel(mesh, young=1e7, poisson=0.3, density=DENSITY, gravity=None,
+                            damping=damping)
+        ends = []
+        for count in (48, 96, 192):
+            times = np.linspace(0, end, count + 1)
+            pull = np.outer(np.sin(np.pi * times / end)**2, [0.25, 0.1, 0.0])
+            ends.append(simulate_dynamics(
+                model, grasp=tip, grasp_forces=pull, times=times, start="rest",
+                settings=NewmarkSettings(max_step=1.0, tolerance=1e-9),
+            ).require().displacement[-1])
+        first, second = (np.linalg.norm(a - b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+        rates.append(np.log2(first / second))
+    return Row("convergence rate in the time step (undamped; viscous)", "2 +- 0.1",
+               f"{rates[0]:.2f}; {rates[1]:.2f}", bool(max(abs(r - 2) for r in rates) <= 0.1))
+
+
+def exactness_rows() -> list[Row]:
+    """Rigid motion, patch test, finite differences."""
+    mesh = _cube(3)
+    rng = np.random.default_rng(1)
+    model = BranchModel(mesh, young=rng.uniform(1, 3, mesh.tet_count), poisson=0.3, density=1.0,
+                        gravity=None, fixed=(np.abs(mesh.nodes - 0.5) > 0.5 - 1e-9).any(axis=1))
+    turn = rotation_matrix(np.array([0.9, -1.4, 0.7]))
+    turned = model.internal(mesh.nodes @ turn.T + [4.0, -2, 1] - mesh.nodes)
+    stretched = model.internal(0.01 * mesh.nodes)
+    rigid = max(np.linalg.norm(turned.force) / np.linalg.norm(stretched.force),
+                abs(turned.strain_energy) / stretched.strain_energy)
+    linear_map = mesh.nodes @ np.array([[0.02, 0.01, 0], [0.03, -0.01, 0.02], [0, 0.01, 0.03]])
+    plain = BranchModel(mesh, young=1.0, poisson=0.3, density=1.0, gravity=None,
+                        fixed=model.fixed)
+    patch = solve_prescribed(plain, linear_map).require().displacement
+    miss = np.abs(patch - linear_map).max() / np.abs(linear_map).max()
+    u, d = 0.02 * rng.standard_normal(mesh.nodes.shape), rng.standard_normal(mesh.nodes.shape)
+    h = 1e-6
+    ahead, behind = model.internal(u + h * d), model.internal(u - h * d)
+    by_energy = (ahead.strain_energy - behind.strain_energy) / (2 * h)
+    differences = max(
+        abs(by_energy / (model.internal(u).force * d).sum() - 1),
+        np.linalg.norm((ahead.force - behind.force) / (2 * h) - model.tangent_times(u, d))
+        / np.linalg.norm(model.tangent_times(u, d)))
+    return [Row("rigid motion: force and energy", "1e-10 relative", f"{rigid:.1e}",
+                bool(rigid < 1e-10)),
+            Row("patch test", "1e-10 relative", f"{miss:.1e}", bool(miss < 1e-10)),
+            Row("finite differences of energy and force", "1e-6 relative", f"{differences:.1e}",
+                bool(differences < 1e-6))]
+
+
+def vibration_row() -> Row:
+    """1,000 undamped steps of a bent beam let go."""
+    mesh, tip = _short_beam()
+    area, inertia = section(mesh)
+    model = BranchModel(mesh, young=1e7, poisson=0.3, density=DENSITY, gravity=None,
+                        damping=_UNDAMPED)
+    bent = solve_static(model, grasp=tip, grasp_force=[0.004, 0, 0]).require()
+    frequency = _FREQUENCY**2 / (2 * np.pi * 0.2**2) * np.sqrt(1e7 * inertia / (DENSITY * area))
+    step = 1 / frequency / 100
+    times = step * np.arange(1001)
+    result = simulate_dynamics(model, times=times, start=bent,
+                               settings=NewmarkSettings(max_step=step)).require()
+    sway = result.displacement[:, tip.nodes, 0].mean(axis=1)
+    down = np.flatnonzero((sway[:-1] > 0) & (sway[1:] <= 0))
+    exact = times[down] + step * sway[down] / (sway[down] - sway[down + 1])
+    off = 100 * abs(1 / np.diff(exact).mean() / frequency - 1)
+    energy = result.strain_energy + result.kinetic_energy
+    drift = 100 * np.abs(energy / energy[0] - 1).max()
+    return Row("undamped free vibration, 1,000 steps: first frequency; energy drift",
+               "1 % of the beam's; 1 %", f"{off:.2f} %; {drift:.3f} %",
+               bool(off <= 1 and drift <= 1))
+
+
+def rest_shape_row() -> Row:
+    """Gravity on the found rest shape of a branch that sags by a fifth of its length."""
+    mesh = bench_mesh(2.0)
+    model = BranchModel(mesh, young=1.5e8, poisson=0.35, density=DENSITY,
+                        gravity=(0.0, -9.80665, 0.0))
+    shape = unloaded_rest_shape(model)
+    loaded = solve_static(model.with_rest_nodes(shape.nodes)).require()
+    miss = 1e3 * np.linalg.norm(shape.nodes + loaded.displacement - mesh.nodes, axis=1).max()
+    sag = 1e3 * np.linalg.norm(shape.nodes - mesh.nodes, axis=1).max()
+    return Row("inverse statics: gravity on the found rest shape gives the scan", "0.1 mm",
+               f"{miss:.4f} mm (a sag of {sag:.0f} mm)", bool(miss <= 0.1))
+
+
+# --- speed -----------------------------------------------------------------------------------
+
+
+def bench_mesh(spacing: float) -> TetMesh:
+    """Return the notes' branch (0.6 m, radius 6 to 2 mm, curved, one fork), by the sweep."""
+    from limber.benchmarks.mechanics_reduced import bench_branch
+
+    return bench_branch(spacing).model.mesh
+
+
+def _sized_mesh(tet_count: int) -> TetMesh:
+    """Return the branch with about so many quadratic tetrahedra."""
+    spacings = np.geomspace(0.15, 6, 24)
+    low, high = 0, len(spacings) - 1
+    meshes = {}
+    while high - low > 1:
+        middle = (low + high) // 2
+        meshes[middle] = bench_mesh(float(spacings[middle]))
+        low, high = (middle, high) if meshes[middle].tet_count > tet_count else (low, middle)
+    return min(meshes.values(), key=lambda m: abs(m.tet_count - tet_count))
+
+
+def least_seconds(work: Callable[[], object], count: int = 15) -> float:
+    """Return the least processor time [s] of ``work`` after one run to warm up."""
+    work()
+    times = []
+    for _ in range(count):
+        start = time.process_time()
+        work()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Processor times [s] of the parts of an iteration."""
+
+    assembly: float
+    factorisation: float
+    solve: float
+
+    @property
+    def total(self) -> float:
+        return self.assembly + self.factorisation + self.solve
+
+
+def parts_of(model: BranchModel) -> Parts:
+    """Time assembly of force and stiffness, factorisation and solve."""
+    equations = model.equations()
+    zero = np.zeros_like(model.mesh.nodes)
+    right = np.ones_like(zero)
+
+    def assemble() -> None:
+        model.internal(zero)
+        equations.assemble(model, zero)
+
+    assembly = least_seconds(assemble)
+    return Parts(assembly, least_seconds(equations.factorise),
+                 least_seconds(lambda: equations.solve(right)))
+
+
+def _stepping(model: BranchModel, count: int = 40) -> tuple[float, float]:
+    """Return processor seconds and iterations a converged step, dt 1/60, load at the tip."""
+    tip = int(model.mesh.nodes[:, 2].argmax())
+    force = np.zeros_like(model.mesh.nodes)
+    force[tip, 0] = 0.05
+    settings = NewmarkSettings(tolerance=1e-4)
+    best, iterations = np.inf, 0.0
+    for _ in range(3):
+        start = time.process_time()
+        result = simulate_dynamics(model, nodal_forces=force, times=np.arange(count + 1) / 60,
+                                   start="rest", settings=settings).require()
+        best = min(best, (time.process_time() - start) / count)
+        iterations = result.iteration_count / result.step_count
+    return best, iterations
+
+
+def speed_rows(quick: bool) -> list[Row]:
+    """Assembly against factorisation, converged steps."""
+    found = []
+    model = _branch_model(_sized_mesh(2800))
+    parts = parts_of(model)
+    ratio = 100 * parts.assembly / parts.factorisation
+    count = model.mesh.tet_count
+    found.append(Row(
+        f"assembly of stiffness and force, {count} quadratic tetrahedra, one thread",
+        "under 30 % of the factorisation",
+        f"{ratio:.0f} % ({1e3 * parts.assembly:.1f} of {1e3 * parts.factorisation:.1f} ms;"
+        " prototype 7.1 of 27.1)", bool(ratio < 30)))
+    step, iterations = _stepping(model, 20 if quick else 40)
+    units = step / parts.total
+    found.append(Row(
+        "converged implicit step, same mesh, dt 1/60",
+        "under 3.2 times (assembly + factorisation + solve)",
+        f"{units:.2f} times ({1e3 * step:.0f} ms, {iterations:.1f} iterations, residual 1e-4;"
+        " prototype 91 ms)", bool(units < 3.2)))
+    small = _branch_model(_sized_mesh(1000))
+    step, _ = _stepping(small, 20 if quick else 40)
+    found.append(Row(
+        f"converged implicit steps, {small.mesh.tet_count} quadratic tetrahedra",
+        "40 steps a second", f"{1 / step:.0f} a second (prototype 35)", bool(1 / step >= 40)))
+    return found
+
+
+def _branch_model(mesh: TetMesh) -> BranchModel:
+    return BranchModel(mesh, young=YOUNG, poisson=0.35, density=DENSITY, gravity=None)
+
+
+def linear_row() -> Row:
+    """One Newton step in time with linear tetrahedra."""
+    mesh = _sized_mesh(7500).linear()
+    model = _branch_model(mesh)
+    equations = model.equations()
+    zero = np.zeros_like(mesh.nodes)
+    right = np.ones_like(zero)
+
+    def step() -> None:
+        model.internal(zero)
+        equations.assemble(model, zero, mass_factor=14400.0)
+        equations.factorise()
+        equations.solve(right - model.mass_matrix @ zero)
+
+    seconds = least_seconds(step)
+    return Row(f"linear tetrahedra, one-Newton step, {mesh.tet_count} tetrahedra",
+               "12 ms where the prototype took 11.6", f"{1e3 * seconds:.1f} ms",
+               bool(seconds <= 0.012))
+
+
+def grasp_row(quick: bool) -> Row:
+    """Random grasps to 40 % of the length by the full model, each solved on two paths."""
+    count = 40 if quick else 300
+    model = _branch_model(_sized_mesh(2800))
+    reach = 2 / 3 * LENGTH
+    grasp = Grasp.at(model.mesh, model.mesh.nodes[_node_at(model.mesh, reach)], 0.0, "pinned")
+    poses = np.array([np.concatenate([grasp.centre + move, np.zeros(3)])
+                      for move in _tour(grasp.centre, count)])
+    start = time.process_time()
+    results = follow_poses(model, grasp, poses)
+    seconds = time.process_time() - start
+    careful = StaticSettings(max_step=0.1)
+    again = follow_poses(model, grasp, poses[::-1], settings=careful)[::-1]
+    both = [(a, b) for a, b in zip(results, again, strict=True) if a.converged and b.converged]
+    off = [abs(a.strain_energy / b.strain_energy - 1) for a, b in both]
+    false = sum(a.strain_energy > (1 + 1e-3) * b.strain_energy for a, b in both)
+    failed = sum(not r.converged for r in results)
+    lowest = min(r.min_det_f for r in results)
+    measured = (f"{seconds:.0f} s for {count} ({seconds * 300 / count:.0f} s for 300; prototype"
+                f" 104); {failed} failed; min det F {lowest:.2f}; energy on the way back differs"
+                f" by {max(off):.1e} at most; {false} higher than there")
+    return Row("300 random grasps to 40 % of the length, full model, one process",
+               "105 s; no false equilibrium", measured,
+               bool(seconds * 300 / count <= 105 and not false and lowest > 0 and not failed))
+
+
+def _node_at(mesh: TetMesh, height: float) -> int:
+    corners = np.unique(mesh.tets[:, :4])
+    main = corners[mesh.nodes[corners, 0] > 0.2 * mesh.nodes[corners, 2] - 0.02]
+    return int(main[np.abs(np.linalg.norm(mesh.nodes[main], axis=1) - height).argmin()])
+
+
+def _tour(centre: np.ndarray, count: int) -> np.ndarray:
+    """Return reachable random moves [m] in the order of nearest neighbours, [count, 3]."""
+    rng = np.random.default_rng(0)
+    moves: list[np.ndarray] = []
+    while len(moves) < count:
+        move = rng.standard_normal(3)
+        move *= 0.4 * LENGTH * rng.uniform() ** (1 / 3) / np.linalg.norm(move)
+        place = centre + move
+        if 0.4 < np.linalg.norm(place) / np.linalg.norm(centre) < 0.97 and place[2] > 0.05:
+            moves.append(move)
+    left, order, at = list(range(count)), [], np.zeros(3)
+    while left:
+        nearest = min(left, key=lambda k: float(np.linalg.norm(moves[k] - at)))
+        order.append(nearest)
+        left.remove(nearest)
+        at = moves[nearest]
+    return np.array([moves[k] for k in order])
+
+
+def memory_row(quick: bool) -> Row:
+    """A static solve with 50,000 quadratic tetrahedra, in a process of its own."""
+    count = 10_000 if quick else 50_000
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        found, megabytes, seconds, converged = pool.submit(_solve_large, count).result()
+    return Row("memory at 50,000 quadratic tetrahedra", "4 GB, and it solves",
+               f"{megabytes / 1024:.2f} GB at {found} tetrahedra,"
+               f" {'solved' if converged else 'not solved'} in {seconds:.0f} s",
+               bool(converged and megabytes < 4096 and found >= 45_000) if not quick else None)
+
+
+def _solve_large(count: int) -> tuple[int, float, float, bool]:
+    import psutil
+
+    mesh = straight_beam(LENGTH, 0.01, slice_count=count // (3 * 24), sides=24)
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=DENSITY)
+    start = time.perf_counter()
+    grasp = Grasp.at(mesh, np.array([0, 0, 0.4]), 0.012)
+    pose = grasp.rest_pose + np.array([0.05, 0, -0.004, 0, 0.1, 0])
+    result = solve_static(model, grasp=grasp, pose=pose)
+    process = psutil.Process()
+    memory = process.memory_info()
+    peak = getattr(memory, "peak_wset", None)
+    if peak is None:
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return mesh.tet_count, peak / 2**20, time.perf_counter() - start, result.converged
