@@ -186,11 +186,13 @@ def renewed_contraction(points: np.ndarray) -> np.ndarray:
     """Contract as pc-skeletor 1.0 does by default: the Laplacian renewed in every iteration.
 
     Its published defaults: 30 neighbours, contraction weight 1000 sqrt(mean area) growing
-    fivefold, attraction 0.5 growing with the loss of area, until 0.5 % of the area is left.
+    fivefold, attraction 0.5 growing with the loss of area, until 0.5 % of the area is left. Solved
+    by our Cholesky, which is faster than its solver.
     """
+    import cvxopt
     import robust_laplacian
     import scipy.sparse as sparse
-    from scipy.sparse.linalg import splu
+    from cvxopt import cholmod
 
     positions = points - points.mean(axis=0)
     laplacian, mass = robust_laplacian.point_cloud_laplacian(positions, n_neighbors=30)
@@ -199,10 +201,11 @@ def renewed_contraction(points: np.ndarray) -> np.ndarray:
     for _ in range(20):
         if mass.diagonal().mean() / first.mean() <= 0.005:
             break
-        matrix = pull**2 * laplacian.T @ laplacian + sparse.diags(hold**2)
-        factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A",
-                      options={"SymmetricMode": True})
-        positions = factor.solve((hold**2)[:, None] * positions)
+        matrix = sparse.tril(pull**2 * laplacian.T @ laplacian + sparse.diags(hold**2)).tocoo()
+        right = cvxopt.matrix((hold**2)[:, None] * positions)
+        cholmod.linsolve(cvxopt.spmatrix(
+            matrix.data, matrix.row, matrix.col, matrix.shape), right)
+        positions = np.array(right)
         pull = min(5 * pull, 2048.0)
         hold = np.clip(hold * np.sqrt(first / mass.diagonal()), 0.1, 1024.0)
         laplacian, mass = robust_laplacian.point_cloud_laplacian(positions, n_neighbors=30)

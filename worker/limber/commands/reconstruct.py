@@ -16,9 +16,14 @@ from limber.geometry.reconstruct import ReconstructSettings, reconstruct
               help="The branch folder to make; with a folder of scans, where to make them.")
 @click.option("--skeleton", "skeleton_path", type=click.Path(path_type=Path),
               help="Your own skeleton (SWC or cylinder CSV) in the cloud's coordinates.")
+@click.option("--camera", "camera_path", type=click.Path(path_type=Path),
+              help="camera.toml: then CLOUD is a depth image.")
+@click.option("--mask", "mask_path", type=click.Path(path_type=Path),
+              help="With --camera: an image that is over 0 on the branch.")
 @click.option("--force", is_flag=True, help="Run again even if nothing has changed.")
 @settings_options(ReconstructSettings)
-def command(run: Run, cloud: Path, folder: Path, skeleton_path: Path | None, force: bool,
+def command(run: Run, cloud: Path, folder: Path, skeleton_path: Path | None,
+            camera_path: Path | None, mask_path: Path | None, force: bool,
             settings: ReconstructSettings) -> dict[str, Any]:
     """Scan to tetrahedra: skeleton, radii, surface, mesh.
 
@@ -28,5 +33,6 @@ def command(run: Run, cloud: Path, folder: Path, skeleton_path: Path | None, for
     if cloud.is_dir():
         return reconstruct_folder(cloud, folder, settings, force=force, progress=run.progress,
                                   warn=run.warn)
-    return reconstruct(cloud, folder, settings, skeleton_path=skeleton_path, force=force,
+    return reconstruct(cloud, folder, settings, skeleton_path=skeleton_path,
+                       camera_path=camera_path, mask_path=mask_path, force=force,
                        progress=run.progress, warn=run.warn)

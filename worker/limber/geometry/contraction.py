@@ -7,8 +7,7 @@ as the paper has it: each iteration solves, in the least-squares sense,
     [ W_H ]  P'  = [ W_H P ].
 
 The Laplacian is taken once, on the scan. Taken anew on the contracted points, as is usual, it
-follows every hole of the scan: on generated branches with noise and holes that ends three times
-as far from the axis, in six times the time (`scripts/bench geometry`).
+follows every hole of the scan and costs several times the time (`scripts/bench geometry`).
 """
 
 import time
@@ -26,6 +25,7 @@ NEIGHBOURS = 12
 
 _LINE_NEIGHBOURS = 20
 _GROWTH = 3.0
+_STILL_THICK = 0.6  # share of points not yet on a line, down to which the weights grow
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,10 @@ def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: fl
         positions = drawn
         linearity = local_linearity(positions)
         active = linearity < linear_enough
-        weight *= np.where(active, _GROWTH, 1.0 / _GROWTH)
+        # Past that share it is forks and noise that never become lines; more weight only pulls
+        # the rest off its axis.
+        growth = _GROWTH if active.mean() > _STILL_THICK else 1.0
+        weight *= np.where(active, growth, 0.1)
         history.append({"moved": moved * scale, "active": float(active.mean()),
                         "seconds": time.perf_counter() - started})
         progress((iteration + 1) / iteration_limit, "contracting", iteration=iteration + 1,
@@ -90,7 +93,7 @@ def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: fl
         if active.mean() < active_share:
             status = "contracted"
             break
-        if iteration > 3 and moved * scale < 0.05 * history[0]["moved"]:
+        if iteration > 3 and moved * scale < 0.1 * max(done["moved"] for done in history):
             status = "stalled"
             break
     return Contraction(positions * scale + centre, linearity, len(history), status, history)

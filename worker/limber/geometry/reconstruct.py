@@ -12,6 +12,7 @@ from limber.errors import InputError
 from limber.geometry.cloud import Cloud
 from limber.geometry.cloud_files import read_points
 from limber.geometry.control_points import FRACTIONS
+from limber.geometry.depth_files import read_depth
 from limber.geometry.marks import GRASP_FRACTION, mark
 from limber.geometry.mesh_quality import measure_quality
 from limber.geometry.preparation import PreparationSettings, Prepared, prepare
@@ -51,7 +52,8 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
 
 
 def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
-                skeleton_path: Path | None = None, force: bool = False,
+                skeleton_path: Path | None = None, camera_path: Path | None = None,
+                mask_path: Path | None = None, force: bool = False,
                 progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
                 ) -> dict[str, Any]:
     """Make a branch folder of a scan: skeleton, surface and tetrahedra.
@@ -60,6 +62,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
         folder: The branch folder to make or renew.
         settings: How.
+        camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
+        mask_path: The depth image's mask of the branch.
         skeleton_path: The user's own skeleton in the scan's coordinates and unit (SWC or
             cylinder CSV), instead of ours.
         force: Run even if nothing has changed.
@@ -74,11 +78,13 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         WorkError: the work failed; the folder is as it was.
     """
     settings = settings or ReconstructSettings()
-    raw = read_points(cloud_path)
+    raw = read_points(cloud_path) if camera_path is None else read_depth(
+        cloud_path, camera_path, mask_path)
     branch = Branch.create(folder)
     digests = {"cloud": file_digest(cloud_path)}
-    if skeleton_path is not None:
-        digests["skeleton"] = file_digest(skeleton_path)
+    for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
+        if path is not None:
+            digests[name] = file_digest(require_file(path, f"A {name} file"))
     if not force and branch.is_current("reconstruct", settings, digests=digests):
         return branch.manifest.stages["reconstruct"].result
     warnings: list[str] = []
@@ -92,9 +98,10 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         for text in prepared.warnings:
             tell(text)
         found = _skeleton(prepared, settings, skeleton_path, progress.part(0.02, 0.55))
+        alignment, cloud, found = _aligned(prepared, found, settings)
+        skeleton = found.skeleton
         for text in found.warnings:
             tell(text)
-        alignment, cloud, skeleton = _aligned(prepared, found, settings)
         stage.manifest.alignment = alignment
         stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
                                  "sha256": digests["cloud"]}
@@ -219,11 +226,10 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: 
 
 
 def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,
-             ) -> tuple[Alignment, Cloud, Skeleton]:
+             ) -> tuple[Alignment, Cloud, SkeletonResult]:
     """Move the root to the origin and turn the branch upright."""
     root = found.skeleton.nodes[0]
     rotation = upright_rotation(found.skeleton, np.array(settings.up), settings.upright)
-    skeleton = found.skeleton.moved((found.skeleton.nodes - root) @ rotation.T)
     attributes = dict(prepared.cloud.attributes)
     if "normal" in attributes:
         attributes["normal"] = (attributes["normal"] @ rotation.T).astype(np.float32)
@@ -233,7 +239,7 @@ def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSet
     alignment = Alignment(scale=UNIT_METRES[settings.unit],
                           origin=tuple((prepared.origin + root).tolist()),
                           rotation=tuple(map(tuple, rotation.tolist())))
-    return alignment, cloud, skeleton
+    return alignment, cloud, found.moved(lambda points: (points - root) @ rotation.T)
 
 
 def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:

@@ -1,5 +1,6 @@
 """A scan's skeleton: thin, contract, connect, root, prune, fit."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from limber.geometry.curve_graph import CurveGraph, curve_graph, prune_spurs, ro
 from limber.geometry.skeleton import Skeleton
 from limber.progress import SILENT, Progress
 
+GIVEN = "skeleton given"
 FIT_POINT_LIMIT = 60_000
 """More points than that do not make the fit better, only slower."""
 
@@ -59,7 +61,6 @@ class SkeletonResult:
         split_off: Pieces left away: ``points``, ``distance`` [m], ``at``.
         loops: Lengths [m] of closed loops that were opened.
         pruned: Number of spurs pruned.
-        warnings: What the user should know.
     """
 
     skeleton: Skeleton
@@ -71,7 +72,19 @@ class SkeletonResult:
     split_off: list[dict] = field(default_factory=list)
     loops: list[float] = field(default_factory=list)
     pruned: int = 0
-    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know, with places in the cloud's frame."""
+        return _warnings(self)
+
+    def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
+        """Return the result in another frame; ``move`` takes points [n, 3] there."""
+        bridges = [bridge | {"from": move(bridge["from"][None])[0],
+                             "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
+        split_off = [piece | {"at": move(piece["at"][None])[0]} for piece in self.split_off]
+        return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
+                       bridges=bridges, split_off=split_off)
 
     def report(self) -> dict[str, Any]:
         """Numbers for the stage's result."""
@@ -103,17 +116,17 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     progress(0.6, "connecting")
     graph = curve_graph(points[thin], contraction.points, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal)
-    _check_branch_like(points[thin], contraction, graph, diagonal)
+    _check_one_plant(graph, len(thin), diagonal)
     start = _root_node(graph, points[thin], contraction.points, root,
                        np.array([0.0, 0.0, 1.0]) if up is None else up)
     first, pruned = _first_skeleton(graph, settings, start)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
+    _check_round(fitted.skeleton, points, segment, residual)
     result = SkeletonResult(
         fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
         graph.split_off, graph.loops, pruned + more)
-    result.warnings.extend(_warnings(result, len(points)))
     progress(1.0, "skeleton", nodes=fitted.skeleton.node_count)
     return result
 
@@ -122,14 +135,8 @@ def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
     """Wrap a user's own skeleton, in the cloud's frame; nothing is changed in it."""
     segment, residual = nearest_cylinders(skeleton, points)
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
-    nothing = Contraction(points[:0], np.empty(0), 0, "skeleton given")
-    result = SkeletonResult(skeleton, nothing, segment, residual, noise)
-    far = float(np.mean(np.abs(residual) > 3 * skeleton.radius[segment]))
-    if far > 0.5:
-        result.warnings.append(
-            f"{100 * far:.0f} % of the points are far from the given skeleton: is it in the "
-            "cloud's coordinates and unit?")
-    return result
+    nothing = Contraction(points[:0], np.empty(0), 0, GIVEN)
+    return SkeletonResult(skeleton, nothing, segment, residual, noise)
 
 
 def thinned(points: np.ndarray, limit: int) -> np.ndarray:
@@ -283,29 +290,66 @@ def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleto
 
 
 
-def _check_branch_like(points: np.ndarray, contraction: Contraction, graph: CurveGraph,
-                       diagonal: float) -> None:
-    fix = "Cut out one branch (--crop), or bring a skeleton of your own (--skeleton)."
+_FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--skeleton)."
+
+
+def _check_one_plant(graph: CurveGraph, count: int, diagonal: float) -> None:
     if len(graph.nodes) < 4:
         raise InputError(f"The cloud contracts to {len(graph.nodes)} points.",
-                         "It is not branch-like: no axis was found (a ball or a blob?).", fix)
+                         "It is not branch-like: no axis was found (a ball or a blob?).", _FIX)
     length = float(np.linalg.norm(
         graph.nodes[graph.edges[:, 0]] - graph.nodes[graph.edges[:, 1]], axis=1).sum())
     thick = float(np.median(graph.thickness))
-    curve = float(np.median(contraction.linearity))
-    if curve < 0.8:
-        raise InputError(
-            f"Only {100 * curve:.0f} % of the contracted cloud's local variance lies on lines.",
-            "It is not branch-like: it stays a sheet or a blob (a wall, the ground, foliage?).",
-            fix)
     if length < 4 * thick:
         raise InputError(
             f"The axes are {length:.3g} m long at {thick:.3g} m radius.",
-            "It is not branch-like: too stout for an axis (a ball or a fruit?).", fix)
+            "It is not branch-like: too stout for an axis (a ball or a fruit?).", _FIX)
+    for piece in graph.split_off:
+        share = piece["points"] / count
+        if share > 0.2 and piece["distance"] > 0.25 * diagonal:
+            raise InputError(
+                f"There are two far-apart clusters: {100 * share:.0f} % of the points lie "
+                f"{piece['distance']:.3g} m from the rest.", "A branch is in one piece.", _FIX)
 
 
-def _warnings(result: SkeletonResult, count: int) -> list[str]:
+def _check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
+                 residual: np.ndarray) -> None:
+    """Refuse what has an axis but no roundness at all: a wall, the ground, a ball of foliage."""
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))
+    away = float(np.median(np.abs(residual + skeleton.radius[segment])))
+    if round_share < 0.15 and away > 0.08 * extent:
+        raise InputError(
+            f"Only {100 * round_share:.0f} % of the points lie on round axes; the others are "
+            f"{away:.3g} m away (median).", "It is not branch-like.", _FIX)
+    thick = float(np.median(skeleton.radius))
+    if thick > 0.03 * extent and (share := _sheet_share(points, 1.5 * thick)) > 0.7:
+        raise InputError(
+            f"{100 * share:.0f} % of the points lie in flat sheets.",
+            "It is not branch-like (a wall or the ground?).", _FIX)
+
+
+def _sheet_share(points: np.ndarray, reach: float) -> float:
+    """Share of points whose surroundings within ``reach`` [m] are flat, on a sample of them."""
+    tree = cKDTree(points)
+    sample = points[:: max(len(points) // 300, 1)]
+    flat = []
+    for near in tree.query_ball_point(sample, reach):
+        if len(near) > 10:
+            values = np.linalg.eigvalsh(np.cov(points[near].T))
+            flat.append(values[0] < 0.03 * values[1])
+    return float(np.mean(flat)) if flat else 0.0
+
+
+def _warnings(result: SkeletonResult) -> list[str]:
     texts = []
+    if result.contraction.status == GIVEN:
+        far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
+            result.node_of_point]))
+        if far > 0.5:
+            texts.append(f"{100 * far:.0f} % of the points are far from the given skeleton: is it "
+                         "in the cloud's coordinates and unit?")
+        return texts
     for bridge in result.bridges:
         texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
                      f"{_place(bridge['to'])}.")
