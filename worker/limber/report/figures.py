@@ -110,6 +110,28 @@ def pull(recording: Any) -> "Figure":
     return figure
 
 
+def motion(frames: Mapping[str, Any]) -> "Figure":
+    """Energies and grasp force of a simulated motion over time."""
+    import matplotlib.pyplot as plt
+
+    time = frames["times_s"]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6))
+    left.plot(time, 1e3 * np.array(frames["energies_j"]), color=ORDER_COLOURS[0], label="strain")
+    kinetic = 1e3 * np.array(frames["kinetic_energies_j"])
+    if kinetic.any():
+        left.plot(time, kinetic, color=ORDER_COLOURS[1], label="kinetic")
+    left.set(xlabel="time [s]", ylabel="energy [mJ]")
+    left.legend(frameon=False)
+    force = np.array(frames["grasp_forces_n"])
+    for name, column, colour in zip("xyz", force.T, ORDER_COLOURS, strict=False):
+        right.plot(time, column, color=colour, label=name)
+    right.set(xlabel="time [s]", ylabel="force on the grasp [N]")
+    right.legend(ncols=3, frameon=False)
+    for axis in (left, right):
+        axis.grid(alpha=0.25)
+    return figure
+
+
 def energy_samples(data: Mapping[str, np.ndarray]) -> "Figure":
     """Energy and force of the sampled grasp poses over their distance from rest."""
     import matplotlib.pyplot as plt

@@ -48,8 +48,9 @@ def write_report(folder: Path, *, picture: Path | None = None, progress: Progres
     """
     branch = Branch.open(folder)
     page = [_summary(branch, picture)]
-    builders: list[Callable[[Branch], Section]] = [_scan, _mesh, *_pulls(branch), _estimate,
-                                                   _energy, *_plans(branch), _provenance]
+    builders: list[Callable[[Branch], Section]] = [
+        _scan, _mesh, *_pulls(branch), _estimate, *_simulations(branch), _energy,
+        *_plans(branch), _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
@@ -160,6 +161,32 @@ def _estimate(branch: Branch) -> Section:
     for figure, caption in estimation_figures.report_figures(branch, estimate):
         section.draw(figure, caption)
     section.text += estimate.get("warnings", [])
+    return section
+
+
+def _simulations(branch: Branch) -> list[Callable[[Branch], Section]]:
+    keys = [key for key in branch.manifest.stages if key.split(":")[0] == "simulate"]
+    if not keys:
+        return [lambda _branch: Section("Simulated motion",
+                                        missing="limber simulate NAME.branch")]
+    return [lambda opened, key=key: _simulation(opened, key) for key in keys]
+
+
+def _simulation(branch: Branch, key: str) -> Section:
+    entry = branch.manifest.stages[key]
+    section = Section(f"Simulated motion: {entry.settings['name']}")
+    frames = json.loads(branch.path(f"frames/{entry.settings['name']}.json")
+                        .read_text(encoding="utf-8"))
+    section.draw(figures.motion(frames), "Strain and kinetic energy, and the force on the grasp, "
+                                         "over time.")
+    if not entry.result["converged"]:
+        section.text.append("The branch could not follow to the end; the frames stop at the last "
+                            "good state.")
+    tip = np.linalg.norm(entry.result["tip_displacement_m"])
+    section.text.append(
+        f"{entry.result['frame_count']} frames. At the end the tip has moved by "
+        f"{1e3 * tip:.1f} mm and the branch holds {entry.result['energy_j']:.4g} J; smallest "
+        f"det F {min(frames['min_det_f']):.3f}.")
     return section
 
 
