@@ -27,6 +27,7 @@ from limber.mechanics.reduced_strain import (
     StrainPolynomial,
     evaluate_strain,
     make_polynomial,
+    reduced_mass,
     strain_only,
 )
 from limber.mechanics.reduced_training import (
@@ -305,7 +306,7 @@ class ReducedModel:
     def doubt(self, pose: np.ndarray, novelty: float, limit: float) -> str:
         """Return why a state lies outside of what the basis knows, or an empty string."""
         distance = self._table.distance(pose).min()
-        if distance > 2 * self._spacing:
+        if distance > 3 * self._spacing:
             return f"the pose is {distance:.3g} m from the nearest training grasp"
         factor = np.exp(np.abs(np.log(self.young / self.control_young)).max())
         if factor > 1.05 * self.young_spread:
@@ -457,7 +458,8 @@ def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
     """
     training = settings.training
     rng = np.random.default_rng(training.seed)
-    trainer = Trainer(model, grasp, weights, control_young)
+    trainer = Trainer(model, grasp, weights, control_young,
+                      young_tangents=training.young_spread > 1)
     poses = sample_poses(model, grasp, training.grasp_count, rng, training)
     young = sample_young(control_young, len(poses), rng, training.young_spread)
     snapshots = trainer.take(poses, young, vibration_every=training.vibration_every,
@@ -478,12 +480,11 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                        settings.vibration_count if len(snapshots.vibrations) else 0)
     polynomial = make_polynomial(model, basis, weights, control_young, snapshots,
                                  settings.field_count)
-    heavy = np.array([model.mass_matrix @ column for column in basis.columns])
     flat = basis.columns.reshape(basis.size, -1)
     spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
     return ReducedModel(
         grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(),
-        flat @ heavy.reshape(basis.size, -1).T, model.damping, control_young, snapshots.poses,
+        reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
         snapshots.young, snapshots.energy, max(spread, 1.0), model.extent)
 
 

@@ -23,7 +23,7 @@ MOVE_STEP = 0.05
 """Step of a tangent to the position, as part of the extent."""
 TURN_STEP = 0.15
 """Step of a tangent to the rotation [rad]."""
-VIBRATION_STEP = 0.2
+VIBRATION_STEP = 0.03
 """Amplitude of a vibration among the strain fields, as part of the extent: large, since free ends
 have next to no strain in the states, and would flutter if their own strains were left out."""
 
@@ -117,6 +117,7 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     lifts = lifts + _regressed(held, snapshots.displacement - _span(lifts, held))
     rest = snapshots.displacement - _span(lifts, held)
     columns = np.concatenate([rest, *_tangent_columns(model, coordinates, snapshots, lifts)])
+    columns = _let_go(grasp, lifts, columns)
     heavy = _apply(metric, columns)
     gram = columns.reshape(len(columns), -1) @ heavy.reshape(len(columns), -1).T
     values, vectors = np.linalg.eigh((gram + gram.T) / 2)
@@ -129,10 +130,20 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
                          "Take more training grasps, or a smaller model.")
     modes = np.tensordot(vectors[:, :wanted] / np.sqrt(values[:wanted]), columns, (0, 0))
     own = heavy[:len(rest)].reshape(len(rest), -1) @ modes.reshape(wanted, -1).T
-    beside = _beside(metric, modes, snapshots.vibrations.astype(float), vibration_count)
+    vibrations = _let_go(grasp, lifts, snapshots.vibrations.astype(float))
+    beside = _beside(metric, modes, vibrations, vibration_count)
     return Basis(np.concatenate([lifts, modes, beside]), count,
                  np.hstack([held, own, np.zeros((len(held), len(beside)))]),
                  float(values[:wanted].sum() / values[values > 0].sum()))
+
+
+def _let_go(grasp: Grasp, lifts: np.ndarray, fields: np.ndarray) -> np.ndarray:
+    """Take out what single precision has left of motion at the grasp."""
+    if grasp.mode == "pinned":
+        return fields - np.tensordot(np.einsum("k,fki->fi", grasp.weights,
+                                               fields[:, grasp.nodes]), lifts, 1)
+    fields[:, grasp.nodes] = 0.0
+    return fields
 
 
 def _beside(metric: sp.csr_matrix, modes: np.ndarray, fields: np.ndarray,
@@ -186,8 +197,10 @@ def _tangent_columns(model: BranchModel, coordinates: GraspCoordinates, snapshot
     shape = (-1, *lifts.shape[1:])
     change = np.array([coordinates.by_pose(pose).T for pose in snapshots.poses])
     by_pose = snapshots.pose_tangents - np.tensordot(change, lifts, 1)
-    return [TANGENT_SHARE * (by_pose * steps[:, None, None]).reshape(shape),
-            TANGENT_SHARE * snapshots.young_tangents.reshape(shape)]
+    columns = [TANGENT_SHARE * (by_pose * steps[:, None, None]).reshape(shape)]
+    if snapshots.young_tangents.size:
+        columns.append(TANGENT_SHARE * snapshots.young_tangents.reshape(shape))
+    return columns
 
 
 def _regressed(held: np.ndarray, rest: np.ndarray) -> np.ndarray:

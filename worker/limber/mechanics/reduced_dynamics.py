@@ -107,10 +107,12 @@ class ReducedStepper:
         free = slice(count, None)
         by_rate = settings.gamma / (settings.beta * step)
         by_mass = 1 / (settings.beta * step**2)
-        q = old.coordinates + step * old.velocity + 0.5 * step**2 * old.acceleration
+        # Without the acceleration: that of the stiff coordinates swings from step to step.
+        q = old.coordinates + step * old.velocity
         q[:count] = held
         viscous, massive = model.damping.stiffness, model.damping.mass
         mass_part = (by_mass + massive * by_rate) * model.mass[free, free]
+        mass_coupling = (by_mass + massive * by_rate) * model.mass[free, :count]
         last = np.inf
         for _ in range(settings.max_iterations):
             moved = q - old.coordinates
@@ -121,7 +123,9 @@ class ReducedStepper:
             velocity[:count], acceleration[:count] = held_velocity, held_acceleration
             energy, force, tangent = model.tangent(q)
             inertia = model.mass @ (acceleration + massive * velocity)
-            force, tangent = force.copy(), tangent[free, free] + mass_part
+            # Lower triangle alone is filled: the columns of the grasp are whole below it.
+            force, coupling = force.copy(), tangent[free, :count] + mass_coupling
+            tangent = tangent[free, free] + mass_part
             if viscous:
                 force, tangent = self._add_viscous(force, tangent, velocity, by_rate, free)
             self.out = force + inertia - self.load
@@ -138,6 +142,7 @@ class ReducedStepper:
             if expected <= settings.tolerance**2 * scale:
                 velocity[free] += by_rate * change
                 acceleration[free] += by_mass * change
+                self.out[:count] += coupling.T @ change
                 self.strain_energy = energy
                 self.state = ReducedMotionState(old.time + step, q, velocity, acceleration)
                 return True

@@ -129,7 +129,8 @@ class RefreshingModel:
             reduced, snapshots = build_reduced(model, grasp, weights, control_young,
                                                self.settings, progress)
         self.reduced, self.snapshots = reduced, snapshots
-        self.trainer = Trainer(model, grasp, weights, reduced.control_young)
+        self.trainer = Trainer(model, grasp, weights, reduced.control_young,
+                               young_tangents=snapshots.young_tangents.shape[1] > 0)
         self.refresh_count = 0
         self._new: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 

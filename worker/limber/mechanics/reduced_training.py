@@ -6,7 +6,7 @@ basis made of them bears a change of Young's modulus that one of states alone do
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -68,7 +68,8 @@ class Snapshots:
         force: Of the gripper on the branch [N], shape [s, 3].
         pose_tangents: Derivative to the pose [m per m or rad], [s, 3 or 6, node_count, 3], single
             precision.
-        young_tangents: Derivative to log Young at the control points, [s, K, node_count, 3].
+        young_tangents: Derivative to log Young at the control points, [s, K, node_count, 3];
+            [s, 0, node_count, 3] where it is known.
         vibrations: Lowest modes about some of the states, scaled to a largest motion of 1 m,
             shape [v, node_count, 3].
         vibration_states: The states they belong to, shape [v].
@@ -98,6 +99,10 @@ class Snapshots:
         """Return the snapshots of :meth:`arrays`."""
         return cls(**{name: arrays[name] for name in cls.__dataclass_fields__
                       if name != "failed"}, failed=int(arrays["failed"]))
+
+    def for_known_young(self) -> "Snapshots":
+        """Return the same without the derivatives to Young's modulus."""
+        return replace(self, young_tangents=self.young_tangents[:, :0])
 
     def joined(self, other: "Snapshots") -> "Snapshots":
         """Return these snapshots and those of ``other``."""
@@ -174,11 +179,14 @@ class Trainer:
         grasp: The patch that is held.
         weights: From control points to tetrahedra, shape [tet_count, K].
         control_young: Young's modulus at the control points [Pa], shape [K].
+        young_tangents: Whether derivatives to Young's modulus are taken; where it is known they
+            would only take room in the basis.
     """
 
     def __init__(self, model: BranchModel, grasp: Grasp, weights: np.ndarray,
-                 control_young: np.ndarray):
+                 control_young: np.ndarray, *, young_tangents: bool = True):
         self.model, self.grasp = model, grasp
+        self.young_tangents = young_tangents
         self.weights = weights
         self.control_young = np.asarray(control_young, float)
         self.solver = StaticSettings(max_iterations=25)
@@ -275,7 +283,8 @@ class Trainer:
         moved = [self._pose_tangent(model, u, pose, axis)
                  for axis in range(6 if self.grasp.mode == "clamped" else 3)]
         stiffer = []
-        for share, modulus in zip(self.weights.T, young, strict=True):
+        shares = zip(self.weights.T, young, strict=True) if self.young_tangents else ()
+        for share, modulus in shares:
             part = share * modulus / model.young
             force = model.internal(u, lame_pair=(model.lame_lambda * part,
                                                  model.lame_mu * part)).force
@@ -283,7 +292,7 @@ class Trainer:
         return {"poses": pose, "young": young, "displacement": u,
                 "energy": np.float64(result.strain_energy), "force": result.reaction_force,
                 "pose_tangents": np.array(moved, np.float32),
-                "young_tangents": np.array(stiffer, np.float32)}
+                "young_tangents": np.array(stiffer, np.float32).reshape(-1, *u.shape)}
 
     def _pose_tangent(self, model: BranchModel, u: np.ndarray, pose: np.ndarray,
                       axis: int) -> np.ndarray:

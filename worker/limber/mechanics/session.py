@@ -43,6 +43,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError, LimberError
+from limber.mechanics.dynamics import NewmarkSettings
 from limber.mechanics.grasp import check_pose, pose_between
 from limber.mechanics.reduced import (
     ReducedModel,
@@ -62,6 +63,8 @@ _FULL_STEP = 0.05
 """Longest way to the wanted pose that the full model goes before it shows a frame, as part of the
 branch's extent."""
 _CHECK_INTERVAL = 1.0
+_LIVE = NewmarkSettings(beta=0.3025, gamma=0.6)
+"""Damps what is too quick for the step: poses of a mouse come in jumps."""
 _QUICK = ReducedStaticSettings(max_iterations=12, max_halvings=2, start_count=2)
 
 
@@ -254,7 +257,7 @@ class Session:
             self.stepper = None
             if wishes.dynamics and self.reduced is not None:
                 start = self.state or self.reduced.solve_static(self.full_pose)
-                self.stepper = ReducedStepper(self.reduced, start)
+                self.stepper = ReducedStepper(self.reduced, start, settings=_LIVE)
                 self._next_step = time.monotonic()
             changed = True
         return changed
@@ -287,7 +290,8 @@ class Session:
         stepper = self.stepper
         good = stepper.move(pose, 1 / RATE)
         if not good:
-            self.stepper = ReducedStepper(self.reduced, self.reduced.solve_static(pose))
+            self.stepper = ReducedStepper(self.reduced, self.reduced.solve_static(pose),
+                                          settings=_LIVE)
         self._publish(self.stepper.state.coordinates, received, id=move_id, is_trusted=good,
                       is_converged=good, energy_j=stepper.strain_energy,
                       kinetic_energy_j=stepper.kinetic_energy, time_s=stepper.state.time,
