@@ -35,8 +35,8 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import scaled_start
 from limber.estimation.virtual_pull import (
     VirtualPullSettings,
-    write_depth_frames,
     simulate_pull,
+    write_depth_frames,
 )
 from limber.mechanics.reduced import ReducedModel, ReducedSettings, build_reduced
 from limber.mechanics.reduced_training import TrainingSettings

@@ -20,7 +20,9 @@ def travel(poses: np.ndarray, step_m: float = 5e-4) -> np.ndarray:
     for index in range(1, len(poses)):
         moved = float(np.linalg.norm(scaled[index] - scaled[last]))
         if moved >= step_m:
-            length[last:index + 1] = length[last] + np.linspace(0.0, moved, index - last + 1)
+            since = np.linalg.norm(scaled[last:index + 1] - scaled[last], axis=1)
+            length[last:index + 1] = length[last] + np.maximum.accumulate(since) * (
+                moved / since.max())
             last = index
         else:
             length[index] = length[last]

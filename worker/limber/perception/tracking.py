@@ -21,6 +21,8 @@ BEND_SIGMA = 0.6
 """Prior standard deviation of the turn between two knots [rad]."""
 SMOOTH_SIGMA = 0.2
 """Prior standard deviation of the change of that turn from knot to knot [rad]."""
+SEEN_SHARE = 0.01
+"""A direction of a rigid motion counts as seen from this share of the best one's information."""
 MODEL_SIGMA_M = 2e-4
 """How well a tube of the skeleton's radii stands for the branch [m]; added to the covariance."""
 
@@ -135,8 +137,8 @@ def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np
     centre = curve.nodes.mean(axis=0)
     rotation, shift = np.eye(3), np.zeros(3)
     cloud = tracker.thinned(cloud)
-    # What cannot be seen (a slide along the branch, a turn about it) stays where it was.
-    prior = np.r_[np.full(3, 0.1**-2), np.full(3, 0.03**-2)]
+    lever = tracker.rest.length / 2
+    scale = np.r_[np.full(3, 1 / lever), np.ones(3)]
     for reach in (0.2, 0.1, 0.05, 0.05, *([0.0] * 8)):
         moved = SeenCloud((cloud.points - centre) @ rotation.T + centre + shift,
                           cloud.sigma, cloud.view @ rotation.T)
@@ -145,10 +147,14 @@ def rest_offset(tracker: CurveTracker, cloud: SeenCloud) -> tuple[np.ndarray, np
         jacobian = np.concatenate([
             np.hstack([np.cross(points, direction), direction]) for direction in match.directions])
         residual, weight = np.concatenate(match.residuals), np.concatenate(match.weights)
+        jacobian = jacobian * scale
         scaled = jacobian.T * weight
-        total = np.r_[Rotation.from_matrix(rotation).as_rotvec(), shift]
-        step = -np.linalg.solve(scaled @ jacobian + np.diag(prior),
-                                scaled @ residual + prior * total)
+        values, directions = np.linalg.eigh(scaled @ jacobian)
+        # A slide along the branch, or a turn about it, shows in its taper and bow alone, if at
+        # all: errors of the model there would be taken for a motion.
+        seen = directions[:, values > SEEN_SHARE * values[-1]]
+        step = -scale * (seen @ np.linalg.solve(
+            seen.T @ (scaled @ jacobian) @ seen, seen.T @ (scaled @ residual)))
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         rotation, shift = turn @ rotation, turn @ shift + step[3:]
     return rotation, centre + shift - rotation @ centre

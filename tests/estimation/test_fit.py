@@ -1,0 +1,191 @@
+"""Estimates of a small branch whose truth is known, simulated on a finer mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import measured
+from limber.errors import Cancelled, InputError
+from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.identifiability import identifiability, require_scale, tie_unresolved
+from limber.estimation.objective import Objective, Stopped
+from limber.estimation.optimise import gauss_newton, nelder_mead
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.preparation import require_scale_in_principle
+from limber.estimation.recording import Observations
+from limber.estimation.settings import EstimateSettings
+from limber.progress import Progress
+
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=8)
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+@pytest.fixture(scope="module")
+def noisy(small_pull):
+    return measured(small_pull, 3, points=5e-4, force=0.01)
+
+
+@pytest.fixture(scope="module")
+def objective(small_bench, noisy):
+    return small_bench.objective([noisy], SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def at_truth(objective):
+    return objective.evaluate(np.log(TRUTH), jacobian=True)
+
+
+def relative(values):
+    return values.young / TRUTH - 1
+
+
+def test_sensitivities_equal_central_differences(small_bench, small_pull):
+    """Every column of the Jacobian, for log E and Poisson's ratio, in both kinds of drive."""
+    for drive in ("pose", "force"):
+        entry = small_pull.entry.model_copy(update={"drive": drive})
+        settings = SETTINGS.model_copy(update={"fit_poisson": True, "key_frames": 3})
+        objective = small_bench.objective([replace(small_pull, entry=entry)], settings)
+        free = np.r_[np.log(0.8 * TRUTH), 0.33]
+        exact = objective.evaluate(free, jacobian=True).jacobian
+        for column in range(5):
+            step = np.zeros(5)
+            step[column] = 2e-4
+            ahead, behind = (objective.evaluate(free + sign * step).residual for sign in (1, -1))
+            measured_slope = (ahead - behind) / 4e-4
+            assert np.linalg.norm(measured_slope - exact[:, column]) < 2e-3 * np.linalg.norm(
+                exact[:, column])
+
+
+def test_exact_data_give_the_truth(small_bench, small_pull):
+    """From another mesh and a uniform start, without noise: within what the meshes differ."""
+    found = small_bench.fit([measured(small_pull, 0, points=0, force=0)], SETTINGS)
+    assert np.abs(relative(found.values)).max() < 0.03
+    assert found.fit.converged and found.objective.forward_count <= 15
+    assert not found.warnings
+
+
+def test_intervals_hold_the_truth_and_noise_is_recognised(small_bench, noisy):
+    """With noise as stated: the variance factor is near 1, all intervals hold the truth."""
+    found = small_bench.fit([noisy], SETTINGS)
+    # Noise of half the stated size: a variance of a quarter.
+    assert 0.1 < found.uncertainty.variance_factor < 0.5
+    low, high = found.uncertainty.young_interval.T
+    wide = 1.6
+    assert np.all(TRUTH < found.values.young * (high / found.values.young) ** wide)
+    assert np.all(TRUTH > found.values.young * (low / found.values.young) ** wide)
+
+
+def test_nelder_mead_finds_the_same_with_many_more_simulations(small_bench, noisy):
+    """The paper's estimator ends at the loss of Gauss-Newton, after many more simulations."""
+    settings = SETTINGS.model_copy(update={"key_frames": 4})
+    start = np.log(TRUTH) + 0.3
+    ours, theirs = (small_bench.objective([noisy], settings) for _ in range(2))
+    quick, slow = gauss_newton(ours, start, robust=False), nelder_mead(theirs, start)
+    assert slow.converged
+    assert slow.evaluation.objective == pytest.approx(quick.evaluation.objective, rel=0.01)
+    assert theirs.forward_count > 8 * ours.forward_count
+
+
+def test_outliers_hardly_matter_and_are_named(small_bench, noisy):
+    """One point in twenty displaced by centimetres: the moduli stay, the outliers are named."""
+    rng = np.random.default_rng(5)
+    positions = noisy.observations.positions.copy()
+    stray = rng.random(positions.shape[:2]) < 0.06
+    positions[stray] += 0.05
+    pull = replace(noisy, observations=Observations(noisy.observations.times, positions))
+    clean_fit = small_bench.fit([noisy], SETTINGS)
+    found = small_bench.fit([pull], SETTINGS)
+    assert np.abs(np.log(found.values.young / clean_fit.values.young)).max() < 0.12
+    assert any("Outliers" in message for message in found.warnings)
+
+
+def test_positions_alone_are_refused(small_bench, noisy):
+    """Slow, without force, gravity or inertia: every scale of E fits, so none is given."""
+    pull = replace(noisy, wrenches=np.full_like(noisy.wrenches, np.nan))
+    objective = small_bench.objective([pull], SETTINGS)
+    with pytest.raises(InputError, match="soft or stiff"):
+        require_scale_in_principle(objective.forwards)
+    evaluation = objective.evaluate(np.log(TRUTH), jacobian=True)
+    judged = identifiability(evaluation, objective.space)
+    assert judged.singular_values[-1] < 1e-6 * judged.singular_values[0]
+    with pytest.raises(InputError, match="overall scale"):
+        require_scale(judged)
+
+
+def test_gravity_makes_the_scale_known(small_bench, noisy):
+    """The same pull is not refused where weight bends the branch as much as the pull does."""
+    entry = noisy.entry.model_copy(update={"gravity_m_s2": (0.0, 0.0, -100.0)})
+    pull = replace(noisy, entry=entry, wrenches=np.full_like(noisy.wrenches, np.nan))
+    objective = small_bench.objective([pull], SETTINGS)
+    require_scale_in_principle(objective.forwards)
+    judged = identifiability(objective.evaluate(np.log(TRUTH), jacobian=True), objective.space)
+    require_scale(judged)
+
+
+def test_what_lies_beyond_the_grasp_is_tied(at_truth, objective):
+    """A modulus that nothing depends on is tied to its neighbour, and the tie is explained."""
+    blind = replace(at_truth, jacobian=at_truth.jacobian * [1.0, 1.0, 1.0, 1e-4])
+    space, messages = tie_unresolved(blind, objective.space)
+    assert space.groups == (0, 1, 2, 2)
+    assert "E4" in messages[0] and "tied to E3" in messages[0]
+    assert tie_unresolved(at_truth, objective.space)[1] == []
+
+
+def test_a_pull_of_another_branch_shows(small_bench, noisy):
+    """Points that move otherwise than this branch can: the misfit is said."""
+    seen = noisy.observations
+    wrong = seen.positions[:, ::-1] - seen.positions[0, ::-1] + seen.positions[0]
+    found = small_bench.fit([replace(noisy, observations=Observations(seen.times, wrong))],
+                            SETTINGS)
+    assert any("pull of this branch" in message for message in found.warnings)
+
+
+def test_force_in_another_unit_shows(small_bench, noisy):
+    """Forces in kilonewtons, taken for newtons, give an impossible modulus: named."""
+    pull = replace(noisy, wrenches=noisy.wrenches * 1e-4, entry=noisy.entry.model_copy(
+        update={"sensor": noisy.entry.sensor.model_copy(update={
+            "force_sigma_n": noisy.entry.sensor.force_sigma_n * 1e-4})}))
+    found = small_bench.fit([pull], SETTINGS)
+    assert any("another unit than newtons" in message for message in found.warnings)
+    assert any("bound" in message for message in found.warnings)
+
+
+def test_a_stopped_estimate_keeps_its_best_and_resumes(tmp_path, small_bench, noisy):
+    """A cancel in the middle: the log has every evaluation, and a second run takes them over."""
+    path = tmp_path / "log.jsonl"
+    plain = small_bench.objective([noisy], SETTINGS)
+    progress = Progress()
+    log = EvaluationLog(path, "problem")
+    stopping = Objective(plain.forwards, plain.space, log=log,
+                         force_sigma=plain.force_sigma, progress=progress)
+    start = np.log(TRUTH) + 0.4
+    for step in range(3):
+        stopping.evaluate(start - 0.1 * step)
+    progress.cancel()
+    with pytest.raises(Stopped):
+        stopping.evaluate(start - 0.3)
+    assert issubclass(Stopped, Cancelled)
+    with open(path, "a") as stream:
+        stream.write('{"parameters": [1.0, 2.')
+    again = EvaluationLog(path, "problem")
+    assert again.resumed_count == 4
+    assert again.best.objective == min(entry.objective for entry in log.entries)
+    known = again.find(start)
+    assert known.objective == log.entries[0].objective
+    assert EvaluationLog(path, "another").resumed_count == 0
+
+
+def test_three_pulls_know_more_than_one(small_bench, small_pull):
+    """The same pull measured three times narrows every interval by about the root of three."""
+    names = [replace(measured(small_pull, seed), name=f"pull-{seed}") for seed in (1, 2, 3)]
+    one = small_bench.fit(names[:1], SETTINGS).uncertainty.young_interval
+    three = small_bench.fit(names, SETTINGS).uncertainty.young_interval
+    ratio = np.log(one[:, 1] / one[:, 0]) / np.log(three[:, 1] / three[:, 0])
+    assert np.all((1.3 < ratio) & (ratio < 2.3))
+
+
+def test_free_values_that_are_not_free(small_bench):
+    """Fixed values stay fixed: Poisson's ratio is what was given."""
+    space = ParameterSpace.separate(Values(TRUTH, 0.31, 900.0))
+    assert space.unpack(np.log(TRUTH)).poisson == 0.31
