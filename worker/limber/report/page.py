@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +110,7 @@ def _mesh(branch: Branch) -> Section:
     section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
                                                   "modulus; base in black, grasp patch in red.")
     result = _reconstruction(branch)
-    quality = {key: value for key, value in (result.get("quality") or {}).items()
+    quality = {key: value for key, value in (result.get("mesh_quality") or {}).items()
                if isinstance(value, int | float)}
     rows = [["what", "value"]]
     for key in ("surface_volume_m3", "mesh_volume_m3"):
@@ -294,4 +293,4 @@ def _render(branch: Branch, page: list[Section]) -> str:
         undefined=jinja2.StrictUndefined)
     made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     return environment.get_template("page.html").render(
-        name=escape(branch.name), sections=page, made=made, version=VERSION)
+        name=branch.name, sections=page, made=made, version=VERSION)

@@ -1,0 +1,57 @@
+"""The report on folders that are not finished, and its refusals; a finished one: test_pipeline."""
+
+import pytest
+
+from limber.errors import BranchFolderError, InputError
+from limber.geometry.cylinder_mesh import straight_beam
+from limber.report.page import write_report
+from limber.report.tables import comparison_rows, modulus_rows
+from limber.store import Branch
+
+
+@pytest.fixture
+def meshed(tmp_path) -> Branch:
+    """A branch folder with a mesh and nothing else."""
+    branch = Branch.create(tmp_path / "beam & co.branch")
+    with branch.stage("mesh") as stage:
+        straight_beam(0.3, 0.006, 0.004).write(stage.path("mesh.vtu"))
+        stage.result.update(tet_count=1)
+    return branch
+
+
+def test_unfinished_folder_says_what_is_missing(meshed: Branch):
+    """Each part that has not been done names the command that does it; the name is escaped."""
+    result = write_report(meshed.folder)
+    html = (meshed.folder / "report.html").read_text(encoding="utf-8")
+    assert result["sections"] == ["Summary", "Mesh", "How it was made"]
+    assert "Young&#39;s modulus along the branch" in html
+    for command in ("limber reconstruct", "limber estimate", "limber energy", "limber plan"):
+        assert command in html
+    assert "<title>beam &amp; co" in html
+
+
+def test_picture_must_be_a_png(meshed: Branch, tmp_path):
+    """Another file, or none, is refused with its name; no report is left behind."""
+    (tmp_path / "x.png").write_bytes(b"JFIF")
+    for picture in (tmp_path / "x.png", tmp_path / "none.png"):
+        with pytest.raises(InputError, match=picture.name):
+            write_report(meshed.folder, picture=picture)
+    assert not (meshed.folder / "report.html").exists()
+
+
+def test_damaged_mesh_is_named(meshed: Branch):
+    """A damaged file is reported by name, not drawn."""
+    with open(meshed.folder / "mesh.vtu", "a", encoding="utf-8") as stream:
+        stream.write(" ")
+    with pytest.raises(BranchFolderError, match=r"mesh\.vtu"):
+        write_report(meshed.folder)
+
+
+def test_tables_without_truth_or_numbers():
+    """A real pull has no truth columns; an undetermined interval and an absent measure say so."""
+    estimate = {"young_pa": [2e6, 3e6], "young_interval_pa": [[1e6, 4e6], [None, None]]}
+    rows = modulus_rows(estimate, None)
+    assert rows == [["control point", "E [MPa]", "95 % interval [MPa]"],
+                    ["1", "2.000", "1.000 to 4.000"], ["2", "3.000", "undetermined"]]
+    plan = {"baseline": {"length_m": 0.5, "peak_force_n": None}, "plan": {"length_m": 0.55}}
+    assert comparison_rows(plan)[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
