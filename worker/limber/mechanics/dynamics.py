@@ -30,6 +30,8 @@ from limber.mechanics.statics import StaticResult, checked_forces, solve_static,
 from limber.mechanics.strain import principal_stretch
 from limber.progress import SILENT, Progress
 
+_GOOD_FACTOR = 1e-3
+
 
 @dataclass(frozen=True)
 class NewmarkSettings:
@@ -411,7 +413,7 @@ class _Motion:
                       displacement=old.displacement.copy())
         moved, pins = self._constraint_moves(new)
         self._follow(new, dt)
-        increment, norms = None, []
+        increment, norms, fresh = None, [], False
         for _ in range(settings.max_iterations):
             out, inertial, min_det_f = self._imbalance(new, load, viscous)
             residual = equations.free_part(out)
@@ -424,14 +426,18 @@ class _Motion:
                 return None
             if increment is not None and norm <= max(settings.tolerance * reference,
                                                      self._floor()):
+                if fresh:
+                    self.factor_error = norm / norms[-1]
                 return self._accepted(new, min_det_f)
             first = increment is None
+            if fresh:
+                self.factor_error, fresh = norm / norms[-1], False
             keep = self._may_keep(dt) if first else (
                 norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
             if not keep:
                 if not self._factorise(new, increment, viscous, dt):
                     return None
-                self.factor_error = norm / reference if reference else 0.0
+                fresh = True
             norms.append(norm)
             self.iteration_count += 1
             if first and moved is not None:
@@ -448,9 +454,12 @@ class _Motion:
         return None
 
     def _may_keep(self, dt: float) -> bool:
-        """Whether the last factor was made near enough to the state before this step."""
-        limit = self.settings.keep_factor
-        return limit > 0 and self.factor_step == dt and self.factor_error <= 10 * limit
+        """Whether the last factor fits the state before this step.
+
+        It does if its own solve brought the residual down a thousandfold.
+        """
+        return (self.settings.keep_factor > 0 and self.factor_step == dt
+                and self.factor_error <= _GOOD_FACTOR)
 
     def _constraint_moves(self, new: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
         """Return how held nodes and pinned means move in the step; None: they do not."""
