@@ -25,8 +25,9 @@ class LimberPreferences(bpy.types.AddonPreferences):
         layout.operator("limber.check_worker", icon="CHECKMARK")
         for line in self.worker_status.splitlines():
             layout.label(text=line)
-        layout.label(text="The worker computes everything. This version of the extension does "
-                          "not bring it along.", icon="INFO")
+        column = layout.column(align=True)
+        column.label(text="The worker computes everything.", icon="INFO")
+        column.label(text="This version of the extension does not bring it along.", icon="BLANK1")
 
 
 def get(context: bpy.types.Context | None = None) -> LimberPreferences | None:
