@@ -148,6 +148,17 @@ def strain_only(linear, quadratic, q, strain):
     return energy
 
 
+def compile_kernels() -> None:
+    """Call every kernel once; the compiled code stays in the user's cache folder."""
+    linear, quadratic, q, strain = np.eye(2), np.ones((2, 3)), np.ones(2), np.empty(2)
+    for increment in (np.empty(0), q):
+        evaluate_strain(linear, quadratic, q, increment, strain, np.empty((2, 2)), np.empty(2),
+                        np.empty((2, 2)))
+    strain_only(linear, quadratic, q, strain)
+    gradient = np.zeros((1, 3, 3, 1))
+    _green_change(gradient, gradient, np.zeros(1, np.int64), np.ones(1), np.empty((1, 6, 1)))
+
+
 def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
                     control_young: np.ndarray, snapshots: Snapshots | None,
                     field_count: int | None) -> StrainPolynomial:

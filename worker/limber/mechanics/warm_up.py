@@ -5,6 +5,7 @@ import numpy as np
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.equations import Viscous
 from limber.mechanics.model import BranchModel
+from limber.mechanics.reduced_strain import compile_kernels
 from limber.progress import SILENT, Progress
 
 
@@ -30,4 +31,5 @@ def warm_up(progress: Progress = SILENT) -> None:
             progress(calls / 8, "compiling kernels")
             work()
             calls += 1
+    compile_kernels()
     progress(1.0, "compiling kernels")
