@@ -66,7 +66,8 @@ def plan_branch_motion(folder: Path, settings: PlanSettings, *, name: str = "pat
         pair = plan_pair(field, start, goal, settings, progress=progress.part(0.0, 0.3))
         progress(0.3, "both paths on the full model")
         baseline, plan = resolve_side_by_side(
-            grasp_model, [pair.baseline.points, pair.plan.points], pair.approach, workers)
+            grasp_model, [pair.baseline.points, pair.plan.points], pair.approach, workers,
+            progress.part(0.3, 0.95))
         progress(0.95, "writing")
         summary = _summary(field, goal, start, pair, baseline, plan, settings)
         for message in _doubts(summary, baseline, plan):

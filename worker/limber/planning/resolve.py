@@ -1,6 +1,5 @@
 """A planned path on the full model: what the branch really does along it."""
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 
@@ -9,6 +8,7 @@ import numpy as np
 from limber.errors import ConvergenceError
 from limber.planning.grasp_model import GraspModel, acceptable
 from limber.planning.objective import PathMeasures, measure_path, resample
+from limber.progress import SILENT, Progress
 
 _APPROACH_STEP = 0.02  # [m] between poses on the way from rest to the start
 _MOST_UNSOLVED = 0.1  # share of a path's poses
@@ -74,13 +74,19 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
 
 
 def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,
-                         workers: int) -> list[ResolvedPath]:
+                         workers: int, progress: Progress = SILENT) -> list[ResolvedPath]:
     """Solve several paths with the same approach, each in a process where ``workers`` allows."""
     if workers < 2:
         return [resolve_path(grasp_model, path, approach) for path in paths]
-    with ProcessPoolExecutor(min(workers, len(paths)), mp_context=get_context("spawn")) as pool:
-        futures = [pool.submit(resolve_path, grasp_model, path, approach) for path in paths]
-        return [future.result() for future in futures]
+    with get_context("spawn").Pool(min(workers, len(paths))) as pool:
+        # Leaving the block, also by a cancel, ends the processes.
+        waiting = [pool.apply_async(resolve_path, (grasp_model, path, approach))
+                   for path in paths]
+        while not all(result.ready() for result in waiting):
+            waiting[-1].wait(0.1)
+            progress(sum(result.ready() for result in waiting) / len(paths),
+                     "both paths on the full model")
+        return [result.get() for result in waiting]
 
 
 def _unsolved(reasons: list[str], count: int) -> ConvergenceError:
