@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from tests.mechanics.conftest import box_mesh
 
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp
 from limber.mechanics.equations import Viscous
 from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.statics import solve_prescribed
-from tests.mechanics.conftest import box_mesh
 
 MATERIALS = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.mechanics.conftest import box_mesh
 
 from limber.errors import InputError
 from limber.mechanics import (
@@ -13,7 +14,6 @@ from limber.mechanics import (
     simulate_dynamics,
     solve_static,
 )
-from tests.mechanics.conftest import box_mesh
 
 LENGTH, SIDE, YOUNG, DENSITY = 0.2, 0.01, 1e7, 900.0
 UNDAMPED = RayleighDamping(0.0, 0.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.mechanics.conftest import box_mesh
 
 from limber.errors import InputError
 from limber.mechanics import (
@@ -17,7 +18,6 @@ from limber.mechanics import (
     young_weights,
 )
 from limber.mechanics.rest_shape import unloaded_rest_shape
-from tests.mechanics.conftest import box_mesh
 
 PRECISE = StaticSettings(tolerance=1e-12)
 CONTROL = np.array([2e7, 1e7, 3e7])

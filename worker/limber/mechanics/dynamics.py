@@ -376,7 +376,12 @@ class _Motion:
         if self.wanted is not None:
             self._advance_tangents(old, new, dt)
         if self.path:
+            before = self._explicit(new)
             self._impose(new, new.time)
+            if before:
+                # The reaction is that of the motion imposed on pinned patches.
+                self.tangent_out = [out + now - was for out, now, was in zip(
+                    self.tangent_out, self._explicit(new), before, strict=True)]
         self.step_count += 1
         return True
 
@@ -505,6 +510,12 @@ class _Motion:
         self.status = "converged"
         return new
 
+    def _explicit(self, state: MotionState) -> list[np.ndarray]:
+        """Return the explicit derivatives of forces where pinned patches make them jump."""
+        if self.wanted is None or not self.equations.pinned:
+            return []
+        return explicit_forces(self.model, self.wanted, state, self.viscous)
+
     def _advance_tangents(self, old: MotionState, new: MotionState, dt: float) -> None:
         model, settings, viscous = self.model, self.settings, self.viscous
         beta, gamma = settings.beta, settings.gamma
@@ -532,13 +543,15 @@ class _Motion:
             strain = past.strain if viscous is None else model.strain_changes(
                 new.displacement, change)
             motion = (v_zero + rate * change, a_zero + inertia * change)
+            free = alpha * motion[0] + motion[1]
             for grasp in self.equations.pinned:
                 # The path gives the means' velocity and acceleration, whatever the parameters.
                 for values in motion:
                     values[grasp.nodes] -= grasp.weights @ values[grasp.nodes]
+            imposed = model.mass_matrix @ (alpha * motion[0] + motion[1] - free)
             self.tangents[number] = MotionState(new.time, change, *motion, strain, past.strain,
                                                 dt)
-            self.tangent_out.append(history + force(change))
+            self.tangent_out.append(history + force(change) + imposed)
 
     def _frame(self) -> dict[str, np.ndarray | float]:
         state, model = self.state, self.model
