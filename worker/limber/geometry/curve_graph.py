@@ -25,6 +25,7 @@ class CurveGraph:
         bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m].
         split_off: Each piece that was left away: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
+        point_kept: Whether each point belongs to a node that was kept, shape [m].
     """
 
     nodes: np.ndarray
@@ -34,6 +35,7 @@ class CurveGraph:
     bridges: list[dict] = field(default_factory=list)
     split_off: list[dict] = field(default_factory=list)
     loops: list[float] = field(default_factory=list)
+    point_kept: np.ndarray = field(default=None)
 
 
 def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float,
@@ -61,7 +63,8 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     graph.edges, graph.loops = _spanning_forest(nodes, edges, length, radius)
     typical = float(np.median(np.linalg.norm(
         nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
-    _join_pieces(graph, gap_factor * typical, bridge_limit)
+    kept = _join_pieces(graph, gap_factor * typical, bridge_limit)
+    graph.point_kept = kept[owner]
     return graph
 
 
@@ -190,20 +193,24 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
     return kept, loops
 
 
-def _join_pieces(graph: CurveGraph, gap: float, bridge_limit: float) -> None:
-    """Bridge pieces to the largest one, nearest first; what is too far is left away."""
+def _join_pieces(graph: CurveGraph, gap: float, bridge_limit: float) -> np.ndarray:
+    """Bridge pieces to the largest one, nearest first; what is too far is left away.
+
+    Returns:
+        Whether each node was kept.
+    """
     while True:
         count, label = connected_components(
             _matrix(len(graph.nodes), graph.edges), directed=False)
         if count == 1:
-            return
+            return np.ones(len(graph.nodes), bool)
         weight = np.bincount(label, graph.support, count)
         main = label == int(np.argmax(weight))
         distance, near = cKDTree(graph.nodes[main]).query(graph.nodes[~main])
         place = int(np.argmin(distance))
         if distance[place] > bridge_limit:
             _leave_away(graph, main, label)
-            return
+            return main
         one, other = np.flatnonzero(main)[near[place]], np.flatnonzero(~main)[place]
         graph.edges = np.vstack([graph.edges, [[one, other]]])
         if distance[place] > gap:

@@ -117,34 +117,60 @@ def section_axis(surface: Surface, root: np.ndarray | None, count: int = 24) -> 
         root: A point near the end that is held [m], shape [3], or None.
         count: Number of sections.
     """
-    import trimesh
-
-    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    inertia = mesh.principal_inertia_vectors
-    # The long axis is the one of the least moment of inertia.
-    axis = inertia[int(np.argmin(mesh.principal_inertia_components))]
+    axis = _long_axis(surface)
     along = surface.vertices @ axis
     low, high = float(along.min()), float(along.max())
-    middle = mesh.center_mass
     centres, radii = [], []
     for at in low + (high - low) * (np.arange(count) + 0.5) / count:
-        section = mesh.section(plane_origin=middle + (at - middle @ axis) * axis,
-                               plane_normal=axis)
-        if section is None:
-            continue
-        flat, to_space = section.to_2D()
-        areas = [(polygon.area, np.array(polygon.centroid.coords[0]))
-                 for polygon in flat.polygons_full]
-        area = sum(a for a, _ in areas)
-        if area <= 0:
-            continue
-        centre = sum(a * c for a, c in areas) / area
-        centres.append((to_space @ np.array([*centre, 0.0, 1.0]))[:3])
-        radii.append(np.sqrt(area / np.pi))
+        area, centre = _section(surface, axis, at)
+        if area > 0:
+            centres.append(centre)
+            radii.append(np.sqrt(area / np.pi))
     if len(centres) < 4:
         raise InputError("The surface has no clear long axis.", "It is not slender.",
                          "Use a surface that is longer than it is thick.")
     return _to_the_ends(np.array(centres), np.array(radii), axis, low, high, root)
+
+
+def _long_axis(surface: Surface) -> np.ndarray:
+    """Unit vector of the solid's least moment of inertia, from tetrahedra to the origin."""
+    corner = surface.vertices[surface.faces]
+    volume = np.linalg.det(corner) / 6.0
+    mean = corner.sum(axis=1) / 4.0
+    centre = (volume[:, None] * mean).sum(axis=0) / volume.sum()
+    # Second moments of a tetrahedron with one corner at the origin (Tonon 2004).
+    total = corner.sum(axis=1)
+    second = np.einsum("t,tij->ij", volume / 20.0, np.einsum(
+        "tki,tkj->tij", corner, corner) + np.einsum("ti,tj->tij", total, total))
+    spread = second - volume.sum() * np.outer(centre, centre)
+    return np.linalg.eigh(spread)[1][:, -1]
+
+
+def _section(surface: Surface, axis: np.ndarray, at: float) -> tuple[float, np.ndarray]:
+    """Area [m^2] and centroid [m] of the cut by the plane ``axis . x = at``, by Green's theorem."""
+    height = surface.vertices @ axis - at
+    above = height[surface.faces] > 0
+    cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
+    starts, ends = [], []
+    for k in range(3):
+        a, b = surface.faces[cut, k], surface.faces[cut, (k + 1) % 3]
+        share = height[a] / np.where(height[a] == height[b], 1.0, height[a] - height[b])
+        point = surface.vertices[a] + share[:, None] * (surface.vertices[b] - surface.vertices[a])
+        down, up = above[cut, k] & ~above[cut, (k + 1) % 3], ~above[cut, k] & above[
+            cut, (k + 1) % 3]
+        starts.append((point, down))
+        ends.append((point, up))
+    if len(cut) == 0:
+        return 0.0, np.zeros(3)
+    start = sum(np.where(used[:, None], point, 0.0) for point, used in starts)
+    end = sum(np.where(used[:, None], point, 0.0) for point, used in ends)
+    origin = start.mean(axis=0)
+    p, q = start - origin, end - origin
+    twice = np.cross(p, q) @ axis
+    area = twice.sum() / 2
+    if abs(area) < 1e-300:
+        return 0.0, origin
+    return abs(float(area)), origin + (twice[:, None] * (p + q)).sum(axis=0) / (6 * area)
 
 
 def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: float,

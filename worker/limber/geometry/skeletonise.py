@@ -111,6 +111,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     """
     settings = settings or SkeletonSettings()
     thin = thinned(points, settings.contraction_points)
+    _check_no_sheet(points[thin])
     contraction = contract(points[thin], progress=progress.part(0.0, 0.6))
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     progress(0.6, "connecting")
@@ -121,6 +122,9 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                        np.array([0.0, 0.0, 1.0]) if up is None else up)
     first, pruned = _first_skeleton(graph, settings, start)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
+    if not graph.point_kept.all():
+        # What was left away must not draw the rest towards it.
+        some = some[graph.point_kept[cKDTree(points[thin]).query(some)[1]]]
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     _check_round(fitted.skeleton, points, segment, residual)
@@ -280,7 +284,10 @@ def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleto
         offset = mine - nodes[end]
         along = offset @ direction
         across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
-        along = along[across < 2.0 * radius + 3 * fit.noise]
+        along = np.sort(along[across < 2.0 * radius + 3 * fit.noise])
+        # An end does not reach over a gap.
+        breaks = np.flatnonzero((np.diff(along) > 2 * radius) & (along[1:] > 0))
+        along = along[:breaks[0] + 1] if len(breaks) else along
         if len(along) < 3:
             continue
         reach = float(np.quantile(along, 0.98)) - (0.0 if is_root else radius)
@@ -314,7 +321,7 @@ def _check_one_plant(graph: CurveGraph, count: int, diagonal: float) -> None:
 
 def _check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
                  residual: np.ndarray) -> None:
-    """Refuse what has an axis but no roundness at all: a wall, the ground, a ball of foliage."""
+    """Refuse what has an axis but no roundness at all: a ball, a heap of foliage."""
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))
     away = float(np.median(np.abs(residual + skeleton.radius[segment])))
@@ -322,22 +329,23 @@ def _check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
         raise InputError(
             f"Only {100 * round_share:.0f} % of the points lie on round axes; the others are "
             f"{away:.3g} m away (median).", "It is not branch-like.", _FIX)
-    thick = float(np.median(skeleton.radius))
-    if thick > 0.03 * extent and (share := _sheet_share(points, 1.5 * thick)) > 0.7:
+def _check_no_sheet(points: np.ndarray) -> None:
+    share = _sheet_share(points, 0.06 * float(np.linalg.norm(np.ptp(points, axis=0))))
+    if share > 0.9:
         raise InputError(
-            f"{100 * share:.0f} % of the points lie in flat sheets.",
+            f"{100 * share:.0f} % of the points lie in wide flat sheets.",
             "It is not branch-like (a wall or the ground?).", _FIX)
 
 
 def _sheet_share(points: np.ndarray, reach: float) -> float:
-    """Share of points whose surroundings within ``reach`` [m] are flat, on a sample of them."""
+    """Share of points whose surroundings within ``reach`` [m] are wide and flat, on a sample."""
     tree = cKDTree(points)
     sample = points[:: max(len(points) // 300, 1)]
     flat = []
     for near in tree.query_ball_point(sample, reach):
         if len(near) > 10:
             values = np.linalg.eigvalsh(np.cov(points[near].T))
-            flat.append(values[0] < 0.03 * values[1])
+            flat.append(values[0] < 0.01 * values[1] and values[1] > 0.3 * values[2])
     return float(np.mean(flat)) if flat else 0.0
 
 

@@ -1,0 +1,161 @@
+"""Surfaces and tetrahedra: closed, of the right volume, sound elements; and the marks on them."""
+
+import numpy as np
+import pytest
+
+from limber.errors import MeshingError
+from limber.geometry.cylinder_mesh import curved_beam, split_wedges, straight_beam
+from limber.geometry.marks import mark
+from limber.geometry.mesh_quality import dihedral_angles, measure_quality, radius_ratios
+from limber.geometry.skeleton import Skeleton
+from limber.geometry.surface import Surface
+from limber.geometry.surface_checks import check_surface
+from limber.geometry.sweep import polygon_factor
+from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tetrahedra import MeshSettings, mesh_branch, tetrahedralise
+from limber.geometry.tubes import branch_surface
+
+
+def test_branch_surface_is_closed_and_of_the_right_volume(y_skeleton):
+    """Watertight, oriented, uncrossed; the volume is that of the round cylinders."""
+    surface = branch_surface(y_skeleton)
+    check = check_surface(surface)
+    assert check.valid and check.piece_count == 1
+    stem = np.pi * 0.5 * (0.012**2 + 0.012 * 0.008 + 0.008**2) / 3
+    twig = np.pi * 0.006**2 * (0.2 - 0.01 / 0.8)  # from the stem's side on
+    round_volume = stem + twig + 2 / 3 * np.pi * (0.008**3 + 0.006**3)
+    assert surface.volume == pytest.approx(round_volume, rel=0.03)
+
+
+def test_sharp_bend_does_not_cross_itself():
+    """A hairpin tighter than the branch is thick still gives a valid surface."""
+    angle = np.linspace(0, np.pi, 12)
+    bend = np.column_stack([0.006 * (1 - np.cos(angle)), np.zeros(12), 0.2 + 0.006 * np.sin(angle)])
+    up = np.column_stack([np.zeros(10), np.zeros(10), np.linspace(0, 0.195, 10)])
+    down = np.column_stack([np.full(10, 0.012), np.zeros(10), np.linspace(0.195, 0.1, 10)])
+    nodes = np.vstack([up, bend, down])
+    skeleton = Skeleton.from_edges(nodes, np.arange(len(nodes)) - 1, np.full(len(nodes), 0.01))
+    assert check_surface(branch_surface(skeleton)).valid
+
+
+def test_check_names_the_place():
+    """A hole and a crossing are found where they are."""
+    surface = branch_surface(Skeleton.from_edges(
+        np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]]), np.array([-1, 0, 1]), np.full(3, 0.01)))
+    holed = check_surface(Surface(surface.vertices, surface.faces[1:]))
+    assert not holed.watertight and len(holed.open_edges) == 3
+    with pytest.raises(MeshingError, match="open or double edges"):
+        holed.require()
+    other = Surface(surface.vertices[:, [2, 1, 0]] - [0.1, 0.003, -0.1], surface.faces[:, ::-1])
+    both = Surface(np.vstack([surface.vertices, other.vertices]),
+                   np.vstack([surface.faces, other.faces + len(surface.vertices)]))
+    crossing = check_surface(both)
+    assert len(crossing.crossings) > 4
+    assert np.linalg.norm(crossing.crossings - [0, 0, 0.1], axis=1).max() < 0.03
+
+
+def test_sweep_is_sound_repeatable_and_keeps_volume(forked_branch):
+    """The forked sweep: closed boundary, no flat elements, volume within 2 %, the same twice."""
+    first = mesh_branch(forked_branch.skeleton, MeshSettings(mesher="sweep"))
+    again = mesh_branch(forked_branch.skeleton, MeshSettings(mesher="sweep"))
+    np.testing.assert_array_equal(first.mesh.nodes, again.mesh.nodes)
+    assert not first.left_out and first.mesh.is_quadratic
+    quality = measure_quality(first.mesh, forked_branch.surface.volume, forked_branch.skeleton)
+    assert quality.volume_ratio == pytest.approx(1, abs=0.02)
+    assert quality.min_dihedral_deg > 3 and first.mesh.volumes.min() > 0
+    boundary = check_surface(Surface(first.mesh.nodes, first.mesh.surface_faces()))
+    assert boundary.watertight and boundary.piece_count == 1
+
+
+def test_sweep_joins_twigs_all_around():
+    """Twigs in many directions, angles and sizes all join the stem."""
+    stem = np.column_stack([np.zeros(41), np.zeros(41), np.linspace(0, 1.0, 41)])
+    nodes, parent, radius = [stem], [np.arange(41) - 1], [np.full(41, 0.012)]
+    count = 41
+    for k, at in enumerate(range(5, 36, 5)):
+        turn, lean = 2.4 * k, 0.4 + 0.12 * k
+        direction = np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn),
+                              np.cos(lean)])
+        twig = stem[at] + np.linspace(0.02, 0.25, 12)[:, None] * direction
+        nodes.append(twig)
+        parent.append(np.concatenate([[at], count + np.arange(11)]))
+        radius.append(np.full(12, 0.003 + 0.001 * k))
+        count += 12
+    skeleton = Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent),
+                                   np.concatenate(radius))
+    meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep"))
+    assert not meshed.left_out
+    assert dihedral_angles(meshed.mesh).min() > 2
+
+
+@pytest.mark.slow
+def test_tetwild_fills_a_branch_and_is_cached(y_skeleton, tmp_path, monkeypatch):
+    """fTetWild keeps the volume, comes out oriented, and the second time from the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    surface = branch_surface(y_skeleton, sides=6, spacing=4)
+    settings = MeshSettings(mesh_time_limit=120)
+    mesh, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, settings=settings)
+    assert not cached and mesh.volumes.min() > 0
+    assert mesh.volumes.sum() == pytest.approx(surface.volume, rel=0.03)
+    again, cached = tetrahedralise(surface, edge_length=0.06, epsilon=0.002, settings=settings)
+    assert cached
+    np.testing.assert_array_equal(mesh.nodes, again.nodes)
+
+
+def test_tetwild_time_limit_hands_over_to_the_sweep(y_skeleton, tmp_path, monkeypatch):
+    """Out of time, fTetWild is stopped; asked for it, the sweep takes over and says so."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    meshed = mesh_branch(y_skeleton, MeshSettings(mesher="ftetwild", mesh_time_limit=0.05))
+    assert meshed.mesher == "sweep"
+    assert "stopped" in meshed.warnings[0] and "sweep mesher took over" in meshed.warnings[0]
+
+
+def test_wedges_split_alike_on_shared_faces():
+    """Prisms side by side and on top of each other share whole triangles."""
+    mesh = straight_beam(0.2, 0.01, quadratic=False)
+    faces = mesh.surface_faces()
+    check = check_surface(Surface(mesh.nodes, faces))
+    assert check.watertight and check.oriented
+    assert split_wedges(np.array([[0, 1, 2, 3, 4, 5]])).shape == (3, 4)
+
+
+def test_beam_has_the_circles_area_and_inertia():
+    """The hexagon has the circle's area, and its second moment within a percent."""
+    mesh = straight_beam(0.3, 0.01, quadratic=False)
+    assert mesh.volumes.sum() == pytest.approx(np.pi * 0.01**2 * 0.3, rel=1e-9)
+    radius = 0.01 * polygon_factor(6)
+    hexagon = 5 * np.sqrt(3) / 16 * radius**4
+    assert hexagon == pytest.approx(np.pi * 0.01**4 / 4, rel=0.01)
+
+
+def test_curved_beam_keeps_its_volume():
+    """A quarter circle of a tapered beam: length times mean area."""
+    angle = np.linspace(0, np.pi / 2, 60)
+    points = 0.3 * np.column_stack([1 - np.cos(angle), np.zeros(60), np.sin(angle)])
+    radius = np.linspace(0.01, 0.006, 60)
+    mesh = curved_beam(points, radius)
+    volume = 0.3 * np.pi / 2 * np.pi * (0.01**2 + 0.01 * 0.006 + 0.006**2) / 3
+    assert mesh.volumes.sum() == pytest.approx(volume, rel=0.01)
+
+
+def test_marks(forked_branch):
+    """The base lies at the root, control points on the axis, the grasp at its fraction."""
+    skeleton = forked_branch.skeleton
+    mesh = mark(mesh_branch(skeleton).mesh, skeleton, young=1e8, poisson=0.35, density=900)
+    fixed = mesh.nodes[mesh.point_data["fixed"] == 1]
+    assert len(fixed) >= 7 and fixed[:, 2].max() < 0.003
+    for k, fraction in enumerate((0.2, 0.4, 0.6, 0.8)):
+        node = mesh.nodes[mesh.point_data["control_point"] == k]
+        assert len(node) == 1
+        assert np.linalg.norm(node[0] - skeleton.point_at(fraction)) < 0.02
+    grasp = mesh.nodes[mesh.point_data["grasp"] == 1]
+    assert len(grasp) >= 6
+    assert np.linalg.norm(grasp.mean(axis=0) - skeleton.point_at(2 / 3)) < 0.02
+
+
+def test_quality_of_a_regular_tetrahedron():
+    """Radius ratio 1, dihedral angles of 70.5 degrees."""
+    nodes = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
+    mesh = TetMesh(nodes, np.array([[0, 1, 2, 3]])).oriented()
+    assert radius_ratios(mesh)[0] == pytest.approx(1)
+    np.testing.assert_allclose(dihedral_angles(mesh), np.rad2deg(np.arccos(1 / 3)))
