@@ -50,3 +50,30 @@ def plain_pull() -> Pull:
     entry = PullEntry(grasp=GraspEntry(point_m=(0.0, 0.0, 0.5), radius_m=0.01),
                       sensor=SensorEntry(force_sigma_n=0.02))
     return Pull("spring", entry, times, poses, wrenches, Observations(seen, positions))
+
+
+@pytest.fixture(scope="session")
+def branch_template(tmp_path_factory, small, small_bench):
+    """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
+    from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+    from limber.store import Branch
+
+    folder = tmp_path_factory.mktemp("branches") / "small.branch"
+    branch = Branch.create(folder)
+    with branch.stage("reconstruct") as stage:
+        small.skeleton.write_swc(stage.path("skeleton.swc"))
+        count = small_bench.mesh.tet_count
+        small_bench.mesh.with_data(cell_data={
+            "young": np.full(count, 1e8), "poisson": np.full(count, 0.36),
+            "density": np.full(count, 900.0)}).write(stage.path("mesh.vtu"))
+    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=12, seed=4, phase=0.5)
+    virtual_pull(folder, "pull-1", settings)
+    return folder
+
+
+@pytest.fixture
+def branch_folder(branch_template, tmp_path):
+    """A copy to work in: a branch folder can be moved and copied."""
+    import shutil
+
+    return shutil.copytree(branch_template, tmp_path / "small.branch")

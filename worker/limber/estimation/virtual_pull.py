@@ -150,8 +150,8 @@ def true_branch(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
             raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
                              "Each control point needs one.", "Give --young A,B,C,D.")
     skeleton = Skeleton.read_swc(branch.path(where))
-    # Sixteen radii a slice would lock; two are finer than any mesh that is fitted.
-    meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=2.0))
+    # Reconstructed branches have sections four radii apart, of six sides.
+    meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3))
     mesh = meshed.mesh.with_data(point_data={"fixed": base_nodes(meshed.mesh, skeleton)})
     return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions, young)
 

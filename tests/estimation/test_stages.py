@@ -1,0 +1,134 @@
+"""The commands virtual-pull and estimate on a branch folder."""
+
+import json
+
+import numpy as np
+import pytest
+
+from limber.cli import call
+from limber.errors import Cancelled, InputError
+from limber.estimation.estimate import EVALUATIONS, estimate
+from limber.estimation.figures import report_figures
+from limber.estimation.follow import follow
+from limber.estimation.recording import read_pull
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+from limber.geometry.tet_mesh import TetMesh
+from limber.progress import Progress
+from limber.store import Branch
+
+QUICK = EstimateSettings(key_frames=6)
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+def test_virtual_pull_is_a_recording_with_its_truth(branch_folder):
+    """It starts at rest, costs work, comes from a finer mesh and says what was true."""
+    pull = read_pull(branch_folder / "pulls" / "pull-1")
+    assert np.allclose(pull.poses[0, :3], pull.entry.grasp.point_m, atol=1e-9)
+    travel = np.linalg.norm(pull.poses[-1, :3] - pull.poses[0, :3])
+    assert 0.25 < travel / (0.92 * 0.40) < 0.45
+    truth = pull.entry.truth
+    assert truth["young_pa"] == TRUTH.tolist()
+    assert truth["tet_count"] > 1.1 * TetMesh.read(branch_folder / "mesh.vtu").tet_count
+    again = virtual_pull(branch_folder, "again", VirtualPullSettings(
+        young=tuple(TRUTH), poisson=0.36, frames=12, seed=4, phase=0.5))
+    assert again["frame_count"] == 12
+    same = read_pull(branch_folder / "pulls" / "again")
+    assert np.allclose(same.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_estimate_from_the_command_line(branch_folder, capsys):
+    """The JSON line has the promised keys, the mesh the new modulus, a second call does nothing.
+    """
+    arguments = ["estimate", str(branch_folder), "--json", "--progress", "none",
+                 "--key-frames", "6"]
+    assert call(arguments) == 0
+    line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert line["status"] == "done" and line["converged"] and line["method"] == "gauss-newton"
+    assert {"young_pa", "young_interval_pa", "poisson", "loss_m2", "forward_count"} <= set(line)
+    young = np.array(line["young_pa"])
+    assert np.abs(young / TRUTH - 1).max() < 0.35
+    mesh = TetMesh.read(branch_folder / "mesh.vtu")
+    assert mesh.cell_data["young"].max() < 1.02 * young.max()
+    assert mesh.cell_data["young"].min() > 0.98 * young.min()
+    assert not (branch_folder / EVALUATIONS).exists()
+    assert call(arguments) == 0
+    again = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert again["young_pa"] == line["young_pa"] and again["seconds"] < 5
+    branch = Branch.open(branch_folder)
+    stored = json.loads(branch.path("estimate.json").read_text())
+    assert stored["truth"]["young_pa"] == TRUTH.tolist()
+    assert len(stored["history"]) == stored["forward_count"]
+    captions = [caption for figure, caption in report_figures(branch, stored)
+                if figure.axes and figure.axes[0].has_data()]
+    assert len(captions) == 4
+
+
+def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
+    """Cancelled in the middle: exit 130's error, estimate.json unfinished, mesh untouched; the
+    next run takes the evaluations over.
+    """
+    before = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
+
+    class StopsAfter(Progress):
+        calls = 0
+
+        def part(self, _start, _stop):
+            return self
+
+        def __call__(self, _fraction, message="", **_numbers):
+            StopsAfter.calls += message == "fitting"
+            if StopsAfter.calls >= 4:
+                raise Cancelled
+
+    with pytest.raises(Cancelled, match="resume"):
+        estimate(branch_folder, QUICK, progress=StopsAfter())
+    kept = json.loads((branch_folder / "estimate.json").read_text())
+    assert kept["stopped"] and not kept["converged"]
+    assert np.array_equal(TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"], before)
+    warnings: list[str] = []
+    result = estimate(branch_folder, QUICK, warn=warnings.append)
+    assert any("Resumed" in warning for warning in warnings)
+    assert result["converged"] and not result["stopped"]
+
+
+def test_pulls_that_are_not_there(branch_folder):
+    """A name that does not exist is answered with those that do."""
+    with pytest.raises(InputError, match="pull-1"):
+        estimate(branch_folder, EstimateSettings(pull=("pull-9",)))
+
+
+def test_without_force_the_estimate_refuses(branch_folder):
+    """Through the whole stage: positions alone are refused, and nothing is written."""
+    virtual_pull(branch_folder, "blind", VirtualPullSettings(
+        young=tuple(TRUTH), frames=5, seed=1, phase=0.5))
+    robot = branch_folder / "pulls" / "blind" / "robot.csv"
+    lines = [",".join(line.split(",")[:7]) for line in robot.read_text().splitlines()]
+    target = branch_folder.parent / "blind"
+    target.mkdir()
+    for file in (branch_folder / "pulls" / "blind").iterdir():
+        (target / file.name).write_bytes(file.read_bytes())
+    (target / "robot.csv").write_text("\n".join(lines) + "\n")
+    assert call(["import-pull", str(branch_folder), str(target), "--name", "deaf",
+                 "--progress", "none"]) == 0
+    with pytest.raises(InputError, match="soft or stiff"):
+        estimate(branch_folder, EstimateSettings(pull=("deaf",)))
+    assert not (branch_folder / "estimate.json").exists()
+
+
+@pytest.mark.slow
+def test_following_a_pull(branch_folder):
+    """Frame by frame the intervals narrow, and the truth ends within (widened) intervals."""
+    virtual_pull(branch_folder, "long", VirtualPullSettings(
+        young=tuple(TRUTH), poisson=0.36, frames=40, seed=6, phase=0.5, position_noise=5e-4))
+    result = follow(branch_folder, EstimateSettings(pull=("long",), key_frames=6), pace=0,
+                    training_count=50)
+    assert result["frame_count"] == 40 and result["method"] == "online"
+    stored = json.loads((branch_folder / "estimate-online.json").read_text())
+    widths = [np.log(np.array(state["young_interval_pa"])) @ [-1, 1]
+              for state in stored["history"]]
+    assert np.all(widths[-1] < 0.3 * widths[5])
+    half = np.log(np.array(result["young_interval_pa"])) @ [-0.5, 0.5]
+    off = np.abs(np.log(np.array(result["young_pa"]) / TRUTH))
+    assert np.all(off < 2 * half + 0.1)
