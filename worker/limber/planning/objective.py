@@ -1,6 +1,6 @@
 """What a path costs, and how two paths are compared.
 
-The paper's edge cost (its eq. 6) adds deformation and distance. Summing the energy over waypoints,
+The paper's edge cost (its eq. 5) adds deformation and distance. Summing the energy over waypoints,
 as a literal reading has it, depends on their spacing and lets a planner win by long edges; so
 
     J = a_def * integral E ds / (E0 L0) + a_dis * integral ds / L0

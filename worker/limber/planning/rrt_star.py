@@ -3,7 +3,7 @@
 ``own`` is compiled here: it runs wherever Limber runs, gives the same path on every system and
 holds no lock. ``ompl`` is the Open Motion Planning Library's, kept as the reference that others
 know; it has no wheel for Windows, and its ``solve`` keeps Python's interpreter lock, so call it
-in a worker process (each command is one). See ``plan_paths`` for which is the default and why.
+in a worker process (each command is one). ``compare.chosen_engine`` says which is taken and why.
 
 Both stop after a number of iterations, never a time, so a seed gives the same path again. Both
 end with shortcuts that lower the cost; OMPL's other simplifiers ignore it.
