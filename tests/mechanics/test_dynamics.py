@@ -1,5 +1,7 @@
 """Motion: frequency and energy of free vibration, second order in the step, damping, grasps."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from tests.mechanics.conftest import box_mesh
@@ -73,7 +75,7 @@ def test_second_order_in_the_step(mesh, damping):
             settings=NewmarkSettings(max_step=1.0, tolerance=1e-9)).require()
         ends.append(result.displacement[-1])
         largest = np.abs(result.displacement).max()
-    errors = [np.linalg.norm(a - b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    errors = [np.linalg.norm(a - b) for a, b in pairwise(ends)]
     rate = np.log2(errors[-2] / errors[-1])
     assert rate == pytest.approx(2.0, abs=0.1)
     assert largest > 0.2 * LENGTH

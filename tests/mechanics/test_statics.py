@@ -279,3 +279,17 @@ def test_young_weights_are_shepards(short_box):
     assert weights == pytest.approx(inverse / inverse.sum(axis=1, keepdims=True))
     on_point = young_weights(short_box, short_box.centroids[:1])
     assert on_point == pytest.approx(np.ones((short_box.tet_count, 1)))
+
+
+def test_a_column_that_must_buckle_first():
+    """A straight bar pressed and drawn aside: no small step leads on, it snaps, and stays."""
+    mesh = box_mesh((0.008, 0.008, 0.6), (1, 1, 60))
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.at(mesh, [0, 0, 0.4], 0.008, "pinned")
+    pose = grasp.rest_pose + np.array([0.15, 0.05, -0.05, 0, 0, 0])
+    result = solve_static(model, grasp=grasp, pose=pose).require()
+    assert result.min_det_f > 0.9
+    rng = np.random.default_rng(0)
+    pushed = result.displacement + 1e-5 * rng.standard_normal(mesh.nodes.shape)
+    again = solve_static(model, grasp=grasp, pose=pose, start=pushed).require()
+    assert again.strain_energy == pytest.approx(result.strain_energy, rel=1e-6)

@@ -132,6 +132,13 @@ class Equations:
             self._pin_solutions = self._factor.solve(self._pin_rows)
         return shift == 0.0
 
+    def raise_diagonal(self, part: float) -> float:
+        """Add ``part`` of the mean diagonal to what was assembled; return what was added [N/m]."""
+        values = self._values[:self.pattern.value_count]
+        added = part * float(np.abs(values[self.pattern.diagonal]).mean())
+        values[self.pattern.diagonal] += added
+        return added
+
     def solve(self, right: np.ndarray, pin_moves: np.ndarray | None = None) -> np.ndarray:
         """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
 

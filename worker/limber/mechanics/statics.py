@@ -23,6 +23,14 @@ from limber.mechanics.strain import Place, principal_stretch
 from limber.progress import SILENT, Progress
 
 
+_SNAP = 1 / 64
+"""Part of the way taken when the branch has to snap."""
+_FIRST_DRAG = 1e-5
+_CREEPS = 60
+_CREEP_ITERATIONS = 9
+_RESTING = 1e-2
+
+
 @dataclass(frozen=True)
 class StaticSettings:
     """How equilibrium is sought.
@@ -309,7 +317,10 @@ class _Path:
             if taken is None:
                 step = (part - self.reached) / 2
                 if step < self.settings.min_step:
-                    return self._result(False)
+                    taken = self._settle(min(1.0, self.reached + _SNAP))
+                    if taken is None:
+                        return self._result(False)
+                    self.reached, step = self.reached + taken, _SNAP
                 continue
             quick = self.iterations - before <= 6
             step = max(taken, step) * (2.0 if quick else 1.0) if taken == part - self.reached \
@@ -388,6 +399,71 @@ class _Path:
                 increment = self._searched(trial, increment, load, residual)
             trial = trial + increment
         self.trouble = f"no convergence in {settings.max_iterations} iterations"
+        return None
+
+    def _settle(self, part: float) -> float | None:
+        """Let the branch snap to where it comes to rest at ``part`` of the way.
+
+        Where a path of stable equilibria ends (a column buckles, a bow turns over) no small step
+        leads on. Here the branch creeps, as through honey: each creep is a step of implicit
+        Euler on the gradient flow of the potential, so it only ever goes down. Return the length
+        taken; None where it does not come to rest.
+        """
+        if self.problem.model.material != Material.st_venant_kirchhoff:
+            return None
+        target, pins = self.constraint_at(part)
+        load, before = self._load_at(part), (self.status, self.trouble)
+        trial, drag = self.displacement, _FIRST_DRAG
+        for _ in range(_CREEPS):
+            crept = self._creep(trial, target, pins, load, drag)
+            if crept is None:
+                drag *= 8
+                if drag > 1:
+                    break
+                continue
+            trial, quick, error, stable = crept
+            if stable and error < _RESTING:
+                taken = self._correct(trial, np.zeros_like(trial), part)
+                if taken is not None:
+                    return taken
+            drag *= 0.25 if quick else 0.7
+        self.status, self.trouble = before
+        return None
+
+    def _creep(self, start: np.ndarray, target: np.ndarray, pins: np.ndarray, load: np.ndarray,
+               drag: float) -> tuple[np.ndarray, bool, float, bool] | None:
+        """Return the state after one creep, whether it was quick, its imbalance, stability."""
+        equations, held = self.equations, self.equations.held
+        moved = np.where(held[:, None], target - start, 0.0)
+        now = np.array([g.weights @ start[g.nodes] for g in equations.pinned]).reshape(-1, 3)
+        trial, increment, honey = start, None, 0.0
+        for count in range(_CREEP_ITERATIONS):
+            state = self.model.internal(trial)
+            out = load - state.force
+            pull = equations.free_part(out - honey * (trial - start))
+            norm = float(np.linalg.norm(pull))
+            reference = float(np.linalg.norm(out - equations.free_part(out))
+                              + np.linalg.norm(load))
+            if not np.isfinite(norm):
+                return None
+            if increment is not None and norm <= 1e-4 * reference:
+                left = float(np.linalg.norm(equations.free_part(out)))
+                equations.assemble(self.model, trial)
+                return trial, count <= 4, left / reference, equations.factorise()
+            self.iterations += 1
+            try:
+                equations.assemble(self.model, trial, increment=increment)
+                honey = equations.raise_diagonal(drag)
+                if not equations.factorise():
+                    return None
+            except NotPositiveDefiniteError:
+                return None
+            if increment is None:
+                right = out - self.model.tangent_times(start, moved) if moved.any() else out
+                increment = equations.solve(right, pins - now) + moved
+            else:
+                increment = equations.solve(pull)
+            trial = trial + increment
         return None
 
     def _searched(self, trial: np.ndarray, increment: np.ndarray, load: np.ndarray,
