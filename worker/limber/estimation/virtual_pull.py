@@ -88,6 +88,7 @@ class TrueBranch:
         control_points: [m], shape [K, 3].
         fractions: Their places on the main path.
         young: [Pa], shape [K].
+        gravity: In the branch's frame [m/s^2].
     """
 
     mesh: TetMesh
@@ -95,6 +96,7 @@ class TrueBranch:
     control_points: np.ndarray
     fractions: tuple[float, ...]
     young: np.ndarray
+    gravity: tuple[float, float, float] = GRAVITY
 
 
 def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
@@ -153,7 +155,11 @@ def true_branch(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     # Reconstructed branches have sections four radii apart, of six sides.
     meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3))
     mesh = meshed.mesh.with_data(point_data={"fixed": base_nodes(meshed.mesh, skeleton)})
-    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions, young)
+    made = branch.manifest.stages.get("reconstruct")
+    # An upright turn of the scan turns gravity with it.
+    gravity = tuple((made.result.get("gravity_m_s2") if made else None) or GRAVITY)
+    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions, young,
+                      gravity)
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,
@@ -161,7 +167,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     """Pull the true branch and measure it; returns the pull and the true states."""
     rng = np.random.default_rng(settings.seed)
     entry = _entry(truth, settings)
-    gravity = GRAVITY if settings.gravity else (0.0, 0.0, 0.0)
+    gravity = truth.gravity if settings.gravity else (0.0, 0.0, 0.0)
     weights = young_weights(truth.mesh, truth.control_points)
     model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
                         density=settings.density, gravity=gravity)
@@ -199,7 +205,7 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
              "tet_count": truth.mesh.tet_count, "seed": settings.seed}
     return PullEntry(
         observation="depth" if settings.camera else "markers",
-        gravity_m_s2=GRAVITY if settings.gravity else None,
+        gravity_m_s2=truth.gravity if settings.gravity else None,
         grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
                          mode=settings.mode),
         rest_points_m=None if settings.camera else tuple(
