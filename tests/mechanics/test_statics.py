@@ -129,9 +129,11 @@ def test_force_and_pose_are_dual(beam, slender_beam):
     assert held.reaction_torque == pytest.approx(np.zeros(3), abs=1e-6)
 
 
-def test_result_does_not_depend_on_the_path(beam, slender_beam):
+def test_result_does_not_depend_on_the_path():
     """A far pose reached at once, in small steps, or with plain Newton has one energy."""
-    grasp = Grasp.at(slender_beam, [0, 0, 0.4], 0.008, "pinned")
+    mesh = box_mesh((0.012, 0.012, 0.6), (1, 1, 40))
+    beam = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.at(mesh, [0, 0, 0.4], 0.01, "pinned")
     # Farther than the axis falls when bent so far: no straight column has to buckle first.
     pose = grasp.rest_pose + np.array([0.15, 0.05, -0.035, 0, 0, 0])
     once = solve_static(beam, grasp=grasp, pose=pose,

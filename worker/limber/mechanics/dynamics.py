@@ -7,16 +7,23 @@ method is of second order and, in linear problems, keeps the energy. A step that
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from limber.errors import ConvergenceError, InputError
+from limber.errors import InputError
 from limber.mechanics.equations import Equations, Viscous
 from limber.mechanics.factor import NotPositiveDefiniteError
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.motion import (
+    DEFAULT_SETTINGS,
+    DynamicResult,
+    DynamicSensitivities,
+    MotionState,
+    NewmarkSettings,
+)
 from limber.mechanics.pose_path import PosePath
 from limber.mechanics.sensitivities import (
     ParameterSet,
@@ -33,143 +40,12 @@ from limber.progress import SILENT, Progress
 _GOOD_FACTOR = 1e-3
 
 
-@dataclass(frozen=True)
-class NewmarkSettings:
-    """How motion is computed.
-
-    Attributes:
-        beta, gamma: Newmark's numbers; gamma over 1/2 damps high frequencies.
-        max_step: Longest time step [s]; frames farther apart are divided evenly.
-        min_step: Shortest step [s] that is tried before giving up.
-        tolerance: Residual force relative to loads, reactions and inertia.
-        max_iterations: Iterations a step.
-        keep_factor: Below this relative residual the last factor is used again, and for the
-            first solve of the next step; 0 factorises each time.
-        stretch_limit: Principal stretch at which the branch is taken as torn.
-    """
-
-    beta: float = 0.25
-    gamma: float = 0.5
-    max_step: float = 1 / 60
-    min_step: float = 1 / 60 / 256
-    tolerance: float = 1e-5
-    max_iterations: int = 20
-    keep_factor: float = 0.01
-    stretch_limit: float = 2.0
-
-    def __post_init__(self) -> None:
-        if not (0 < self.beta <= 0.5 and 0.5 <= self.gamma <= 1 and 0 < self.max_step):
-            raise InputError(
-                f"Newmark beta {self.beta}, gamma {self.gamma}, step {self.max_step} s.",
-                "beta must be in (0, 1/2], gamma in [1/2, 1], the step positive.",
-                "Keep 1/4 and 1/2 unless high frequencies are to be damped.")
-
-
-@dataclass
-class MotionState:
-    """One instant.
-
-    Attributes:
-        time: [s].
-        displacement, velocity, acceleration: [m, m/s, m/s^2], shape [node_count, 3].
-        strain, strain_before: At the quadrature points now and a step before (or their
-            derivatives), shape [tet_count, q, 6]; empty where there is no viscosity.
-        step_before: That step [s]; infinite where nothing is known of before.
-    """
-
-    time: float
-    displacement: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    strain: np.ndarray
-    strain_before: np.ndarray
-    step_before: float = np.inf
-
-    def rate_formula(self, dt: float) -> tuple[float, float, float]:
-        """Return factors [1/s] of the strains next, now and before in the rate after ``dt``.
-
-        The second-order backward difference for unequal steps; of first order without a past.
-        """
-        ratio = dt / self.step_before
-        return ((1 + 2 * ratio) / ((1 + ratio) * dt), -(1 + ratio) / dt,
-                ratio**2 / ((1 + ratio) * dt))
-
-
-@dataclass(frozen=True)
-class DynamicSensitivities:
-    """Derivatives along a motion.
-
-    Attributes:
-        labels: Name of each of the p columns (limber.mechanics.sensitivities).
-        displacement: Of the followed nodes [m per parameter], shape [frames, nodes, 3, p].
-        reaction_force: [N per parameter], shape [frames, 3, p] ([frames, g, 3, p] for several).
-    """
-
-    labels: list[str]
-    displacement: np.ndarray
-    reaction_force: np.ndarray
-
-
-@dataclass(frozen=True)
-class DynamicResult:
-    """A motion.
-
-    Attributes:
-        converged: Whether all frames were reached; otherwise the arrays end with the last good
-            frame.
-        times: [s], shape [frames].
-        displacement: [m], shape [frames, node_count, 3].
-        strain_energy, kinetic_energy: [J], shape [frames].
-        load_energy: Potential [J] of gravity and nodal forces, shape [frames].
-        reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], the torque about
-            the pose's position, shape [frames, 3] ([frames, g, 3] for several grasps).
-        base_force: Of the base on the branch [N], shape [frames, 3].
-        min_det_f: Shape [frames].
-        last: The last state, to go on from.
-        step_count, iteration_count, factorisation_count: Work done.
-        sensitivities: Where asked for.
-    """
-
-    converged: bool
-    status: str
-    times: np.ndarray
-    displacement: np.ndarray
-    strain_energy: np.ndarray
-    kinetic_energy: np.ndarray
-    load_energy: np.ndarray
-    reaction_force: np.ndarray
-    reaction_torque: np.ndarray
-    base_force: np.ndarray
-    min_det_f: np.ndarray
-    last: MotionState
-    step_count: int
-    iteration_count: int
-    factorisation_count: int
-    seconds: float
-    message: str = ""
-    warnings: list[str] = field(default_factory=list)
-    sensitivities: DynamicSensitivities | None = None
-
-    def require(self) -> "DynamicResult":
-        """Return the result itself.
-
-        Raises:
-            ConvergenceError: it has not converged.
-        """
-        if not self.converged:
-            raise ConvergenceError(
-                f"The motion stopped at {self.last.time:.4g} s: {self.message}",
-                f"{len(self.times)} frames before it are good.",
-                "Move more slowly or less far, or check units and Young's modulus.", result=self)
-        return self
-
-
 def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = None,
                       poses: np.ndarray | None = None, grasp_forces: np.ndarray | None = None,
                       nodal_forces: np.ndarray | None = None, times: np.ndarray,
                       start: StaticResult | MotionState | np.ndarray
                       | Literal["equilibrium", "rest"] = "equilibrium",
-                      settings: NewmarkSettings = NewmarkSettings(),
+                      settings: NewmarkSettings = DEFAULT_SETTINGS,
                       sensitivities: ParameterSet | None = None,
                       sensitivity_nodes: np.ndarray | None = None,
                       progress: Progress = SILENT) -> DynamicResult:

@@ -9,19 +9,19 @@ slender branch take steps several times as long. A step that fails is halved.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from limber.errors import ConvergenceError, InputError
+from limber.errors import InputError
 from limber.mechanics.equations import Equations
 from limber.mechanics.factor import NotPositiveDefiniteError
 from limber.mechanics.grasp import Grasp, check_pose, pose_between
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel, InternalState
+from limber.mechanics.static_result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.strain import Place, principal_stretch
 from limber.progress import SILENT, Progress
-
 
 _SNAP = 1 / 64
 """Part of the way taken when the branch has to snap."""
@@ -29,86 +29,6 @@ _FIRST_DRAG = 1e-5
 _CREEPS = 60
 _CREEP_ITERATIONS = 9
 _RESTING = 1e-2
-
-
-@dataclass(frozen=True)
-class StaticSettings:
-    """How equilibrium is sought.
-
-    Attributes:
-        tolerance: Residual force relative to the loads and reactions. The floor that round-off
-            sets is respected.
-        max_iterations: Newton iterations a step.
-        max_step: Longest predicted motion a step, as part of the branch's extent.
-        min_step: Smallest part of the whole way that is tried before giving up.
-        stretch_limit: Principal stretch at which the branch is taken as torn.
-        mixed: Mixed-integration-point Newton (St. Venant-Kirchhoff only); else Newton with
-            line search.
-        verify: Solve again from rest in small steps and compare energies; a difference is
-            reported as a false equilibrium.
-    """
-
-    tolerance: float = 1e-7
-    max_iterations: int = 20
-    max_step: float = 0.4
-    min_step: float = 1 / 512
-    stretch_limit: float = 2.0
-    mixed: bool = True
-    verify: bool = False
-
-
-@dataclass(frozen=True)
-class StaticResult:
-    """A static state, and how it was found.
-
-    Attributes:
-        converged: Whether it is a stable equilibrium under the wanted loads, with no element
-            inverted. If not, the state is the last good one on the way.
-        status: ``converged``, ``stalled`` (step control gave up), ``torn`` (stretched over the
-            limit), ``inverted``, ``unstable``, ``false_equilibrium``.
-        displacement: [m], shape [node_count, 3].
-        pose: Pose of the grasp in this state [m, rad], shape [6] ([g, 6] for several), or None.
-        strain_energy: [J].
-        reaction_force, reaction_torque: What the gripper exerts on the branch [N, Nm], the
-            torque about the pose's position; shape [3] ([g, 3] for several grasps).
-        base_force, base_torque: What the base exerts on the branch; the torque about the origin.
-        min_det_f: Smallest determinant of the deformation gradient.
-        iterations, residual_history: Newton iterations in all, relative residuals.
-        reached: Part of the way that was covered.
-        message: What happened, where.
-        warnings: What a user should know.
-    """
-
-    converged: bool
-    status: str
-    displacement: np.ndarray
-    pose: np.ndarray | None
-    strain_energy: float
-    reaction_force: np.ndarray
-    reaction_torque: np.ndarray
-    base_force: np.ndarray
-    base_torque: np.ndarray
-    min_det_f: float
-    iterations: int
-    residual_history: list[float]
-    seconds: float
-    reached: float = 1.0
-    message: str = ""
-    warnings: list[str] = field(default_factory=list)
-
-    def require(self) -> "StaticResult":
-        """Return the result itself.
-
-        Raises:
-            ConvergenceError: it has not converged.
-        """
-        if not self.converged:
-            raise ConvergenceError(
-                f"No equilibrium: {self.message}",
-                f"The last good state is at {100 * self.reached:.0f} % of the way.",
-                "Ask for a smaller motion or load, or check units and Young's modulus.",
-                result=self)
-        return self
 
 
 @dataclass(frozen=True)
@@ -130,7 +50,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
                  pose: np.ndarray | None = None, grasp_force: np.ndarray | None = None,
                  nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
-                 settings: StaticSettings = StaticSettings(),
+                 settings: StaticSettings = DEFAULT_SETTINGS,
                  progress: Progress = SILENT) -> StaticResult:
     """Find the equilibrium of a branch; never raises for want of convergence.
 
@@ -157,7 +77,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
 def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.ndarray, *,
                  nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
-                 settings: StaticSettings = StaticSettings(),
+                 settings: StaticSettings = DEFAULT_SETTINGS,
                  progress: Progress = SILENT) -> list[StaticResult]:
     """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
 
@@ -181,7 +101,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
 
 def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
                      nodal_forces: np.ndarray | None = None,
-                     settings: StaticSettings = StaticSettings(),
+                     settings: StaticSettings = DEFAULT_SETTINGS,
                      ) -> StaticResult:
     """Find the equilibrium with the model's fixed nodes moved by ``displacement``.
 
