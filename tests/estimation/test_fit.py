@@ -189,3 +189,14 @@ def test_free_values_that_are_not_free(small_bench):
     """Fixed values stay fixed: Poisson's ratio is what was given."""
     space = ParameterSpace.separate(Values(TRUTH, 0.31, 900.0))
     assert space.unpack(np.log(TRUTH)).poisson == 0.31
+
+
+def test_held_out_pulls_are_scored(small_bench, small_pull):
+    """Fitted on one pull, another is foretold to within its noise."""
+    names = [replace(measured(small_pull, seed, points=5e-4, force=0.01), name=f"pull-{seed}")
+             for seed in (1, 2)]
+    found = small_bench.fit(names, SETTINGS.model_copy(update={"hold_out": True}))
+    assert set(found.held_out) == {"pull-1", "pull-2"}
+    for score in found.held_out.values():
+        # Three axes of 0.5 mm each.
+        assert 0.7e-3 < score["rms_m"] < 1.3e-3

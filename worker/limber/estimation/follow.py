@@ -103,11 +103,17 @@ def prepare(pull: Pull, subject: Subject, settings: EstimateSettings, progress: 
 def paced(folder: Path, pace: float) -> Iterator[tuple[OnlineFrame, float]]:
     """Yield frames of a pull as they come, each with the share of what is there that is done."""
     sent, start, last_growth, size = -np.inf, None, time.monotonic(), -1
+    frames: list[OnlineFrame] = []
     while True:
         now = sum(path.stat().st_size for path in folder.glob("*.csv"))
         if now != size:
             size, last_growth = now, time.monotonic()
-            frames = list(online_frames(clean(read_pull(folder))))
+            try:
+                frames = list(online_frames(clean(read_pull(folder))))
+            except InputError:
+                # Caught in the middle of being written, or too little yet: the next look tells.
+                if pace == 0:
+                    raise
         fresh = [frame for frame in frames if frame.time > sent]
         for frame in fresh:
             if start is None:

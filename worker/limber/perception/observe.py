@@ -1,7 +1,7 @@
 """From the images or clouds of a pull to control points over time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,7 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
     frames = list_frames(folder, pull.entry.observation)
     load = _loader(folder, pull.entry.observation)
     tracker = CurveTracker(skeleton, fractions)
-    notes, curve, correction = _Notes(), None, None
+    notes, curve, correction, sight = _Notes(), None, None, None
     count, points = len(frames), len(fractions)
     positions = np.full((count, points, 3), np.nan)
     covariance = np.broadcast_to(np.eye(3), (count, points, 3, 3)).copy()
@@ -59,10 +59,14 @@ def observe(folder: Path, pull: Pull, skeleton: Skeleton, fractions: tuple[float
                      np.clip(times + pull.entry.time_offset_s, pull.times[0], pull.times[-1]))
     for index, (_, path) in enumerate(frames):
         progress(index / count, "following the control points", frame=index)
-        cloud = _with_view(load(path), skeleton)
+        cloud = load(path)
         if len(cloud.points) < 10:
             notes.empty.append(path.stem)
             continue
+        if not np.any(cloud.view):
+            # Judged once, at rest: later the branch is elsewhere than its skeleton.
+            sight = _line_of_sight(cloud, skeleton) if sight is None else sight
+            cloud = replace(cloud, view=np.broadcast_to(sight, cloud.points.shape).copy())
         if correction is None:
             correction = _camera_correction(tracker, cloud, poses[index], poses[0], notes)
         turn, shift = correction
@@ -148,16 +152,13 @@ def _read_cloud(path: Path, camera: Camera | None) -> SeenCloud:
     return SeenCloud(points, camera.depth_sigma(distance), ray / distance[:, None])
 
 
-def _with_view(cloud: SeenCloud, skeleton: Skeleton) -> SeenCloud:
-    """Guess the line of sight where none is known: from the seen side towards the axis."""
-    if not len(cloud.points) or np.any(cloud.view):
-        return cloud
+def _line_of_sight(cloud: SeenCloud, skeleton: Skeleton) -> np.ndarray:
+    """Guess it where no camera is known: from the seen side towards the axis, shape [3]."""
     from scipy.spatial import cKDTree
 
     nearest = cKDTree(skeleton.nodes).query(cloud.points)[1]
     inward = np.median(skeleton.nodes[nearest] - cloud.points, axis=0)
-    inward /= max(np.linalg.norm(inward), 1e-12)
-    return SeenCloud(cloud.points, cloud.sigma, np.broadcast_to(inward, cloud.points.shape).copy())
+    return inward / max(np.linalg.norm(inward), 1e-12)
 
 
 def _camera_correction(tracker: CurveTracker, cloud: SeenCloud, pose: np.ndarray,

@@ -1,0 +1,49 @@
+"""Reading a pull while it is recorded."""
+
+import threading
+import time
+
+import numpy as np
+
+from limber.estimation import follow
+from limber.estimation.recording import write_pull
+
+
+def test_rows_are_taken_as_they_are_written(tmp_path, plain_pull, monkeypatch):
+    """A recorder that appends in pieces, cut inside lines: every frame comes once, in order."""
+    monkeypatch.setattr(follow, "QUIET_SECONDS", 0.6)
+    write_pull(tmp_path / "whole", plain_pull)
+    live = tmp_path / "live"
+    live.mkdir()
+    (live / "pull.toml").write_text((tmp_path / "whole" / "pull.toml").read_text())
+    texts = {name: (tmp_path / "whole" / name).read_text() for name in ("robot.csv",
+                                                                        "markers.csv")}
+
+    def record() -> None:
+        for before, share in ((0.25, 0.4), (0.4, 0.7), (0.7, 1.0)):
+            for name, text in texts.items():
+                with open(live / name, "a") as stream:
+                    stream.write(text[int(before * len(text)):int(share * len(text))])
+            time.sleep(0.25)
+
+    for name, text in texts.items():
+        (live / name).write_text(text[:int(0.25 * len(text))])
+    recorder = threading.Thread(target=record)
+    recorder.start()
+    times = [frame.time for frame, _ in follow.paced(live, 1000.0)]
+    recorder.join()
+    assert np.all(np.diff(times) > 0)
+    assert np.allclose(times, plain_pull.observations.times)
+
+
+def test_a_replay_keeps_its_pace(tmp_path, plain_pull):
+    """Four seconds of recording at 20 times the speed take a fifth of a second or more."""
+    write_pull(tmp_path / "p", plain_pull)
+    started = time.monotonic()
+    frames = []
+    for frame, share in follow.paced(tmp_path / "p", 20.0):
+        frames.append((frame.time, share))
+        if share == 1.0:
+            break
+    assert len(frames) == 60
+    assert 0.17 < time.monotonic() - started < 3.0
