@@ -1,4 +1,4 @@
-"""Other programs on the same cantilever, where their wheels are installed (extra `peers`)."""
+"""Other programs on the same cantilever, where their wheels are installed."""
 
 import time
 from importlib.util import find_spec
@@ -15,7 +15,7 @@ def rows() -> list[Row]:
 
 
 def _absent(name: str) -> Row:
-    return Row(f"peer: {name}", "-", "not installed (pip install 'limber[peers]')", None)
+    return Row(f"peer: {name}", "-", "not installed (pip install felupe scikit-fem)", None)
 
 
 def _problem() -> tuple:
@@ -44,7 +44,9 @@ def _felupe_row() -> Row:
     mesh = felupe.Mesh(beam.mesh.nodes, beam.mesh.tets, "tetra10")
     field = felupe.FieldContainer([felupe.Field(felupe.RegionQuadraticTetra(mesh), dim=3)])
     lam, mu = lame(np.array(YOUNG), np.array(0.35))
-    solid = felupe.SolidBody(felupe.SaintVenantKirchhoff(mu=float(mu), lmbda=float(lam)), field)
+    material = felupe.Material(stress=_stvk_stress, elasticity=_stvk_elasticity,
+                               lam=float(lam), mu=float(mu))
+    solid = felupe.SolidBody(material, field)
     fixed = {"base": felupe.Boundary(field[0], fz=lambda z: np.abs(z) < 1e-9)}
     dofs = felupe.dof.partition(field, fixed)
     start, count = time.process_time(), 8
@@ -52,7 +54,7 @@ def _felupe_row() -> Row:
         for part in np.arange(1, count + 1) / count:
             load = felupe.PointLoad(field, np.arange(len(loads)), part * loads)
             felupe.newtonrhapson(items=[solid, load], dof0=dofs[0], dof1=dofs[1], verbose=0,
-                                 kwargs={}, maxiter=60, tol=1e-6)
+                                 maxiter=60, tol=1e-6)
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         return Row("peer: felupe, same cantilever, alpha 2", "-", f"did not converge ({error})",
                    None)
@@ -62,6 +64,24 @@ def _felupe_row() -> Row:
                f"{seconds:.1f} s against {our_seconds:.2f} s; tip differs by"
                f" {100 * abs(moved / ours - 1):.3f} %; no tangent predictor or mixed-point Newton:"
                f" {count} load steps", None)
+
+
+def _stvk(F: np.ndarray, lam: float, mu: float) -> np.ndarray:
+    strain = 0.5 * (np.einsum("ki...,kj...->ij...", F, F) - np.eye(3)[:, :, None, None])
+    return lam * np.einsum("kk...->...", strain) * np.eye(3)[:, :, None, None] + 2 * mu * strain
+
+
+def _stvk_stress(x: list[np.ndarray], lam: float, mu: float) -> list[np.ndarray]:
+    return [np.einsum("ik...,kj...->ij...", x[0], _stvk(x[0], lam, mu)), x[-1]]
+
+
+def _stvk_elasticity(x: list[np.ndarray], lam: float, mu: float) -> list[np.ndarray]:
+    F, eye = x[0], np.eye(3)
+    square = np.einsum("ik...,jk...->ij...", F, F)
+    return [lam * np.einsum("ij...,kl...->ijkl...", F, F)
+            + mu * np.einsum("il...,kj...->ijkl...", F, F)
+            + mu * np.einsum("ik...,jl->ijkl...", square, eye)
+            + np.einsum("ik,jl...->ijkl...", eye, _stvk(F, lam, mu))]
 
 
 def _skfem_row() -> Row:
