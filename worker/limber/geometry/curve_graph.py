@@ -25,7 +25,7 @@ class CurveGraph:
         bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m].
         split_off: Each piece that was left away: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
-        point_kept: Whether each point belongs to a node that was kept, shape [m].
+        owner: The node that each point belongs to, -1 where it was left away, shape [m].
     """
 
     nodes: np.ndarray
@@ -35,7 +35,7 @@ class CurveGraph:
     bridges: list[dict] = field(default_factory=list)
     split_off: list[dict] = field(default_factory=list)
     loops: list[float] = field(default_factory=list)
-    point_kept: np.ndarray = field(default=None)
+    owner: np.ndarray = field(default=None)
 
 
 def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float,
@@ -64,7 +64,7 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     typical = float(np.median(np.linalg.norm(
         nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
     kept = _join_pieces(graph, gap_factor * typical, bridge_limit)
-    graph.point_kept = kept[owner]
+    graph.owner = np.where(kept, np.cumsum(kept) - 1, -1)[owner]
     return graph
 
 
@@ -130,14 +130,24 @@ def rooted(nodes: np.ndarray, edges: np.ndarray, root: int) -> np.ndarray:
     return parent
 
 
-def longest_path_ends(nodes: np.ndarray, edges: np.ndarray) -> tuple[int, int]:
-    """The two nodes that are farthest apart along the tree."""
-    length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
-    graph = _matrix(len(nodes), edges, length)
-    first = dijkstra(graph, directed=False, indices=int(edges[0, 0]))
-    one = int(np.argmax(np.where(np.isfinite(first), first, -1)))
-    second = dijkstra(graph, directed=False, indices=one)
-    return one, int(np.argmax(np.where(np.isfinite(second), second, -1)))
+def end_chain(edges: list[list[int]], nodes: np.ndarray, tip: int, reach: float) -> list[int]:
+    """Nodes from a tip to the first fork, or up to a length of ``reach`` [m].
+
+    Args:
+        edges: Neighbours of each node.
+        nodes: Positions [m], shape [n, 3].
+        tip: Where to start.
+        reach: How far to go.
+    """
+    chain, length, before = [tip], 0.0, -1
+    while length < reach:
+        ahead = [node for node in edges[chain[-1]] if node != before]
+        if len(ahead) != 1:
+            break
+        before = chain[-1]
+        length += float(np.linalg.norm(nodes[ahead[0]] - nodes[before]))
+        chain.append(ahead[0])
+    return chain
 
 
 def _smoothed(drawn: np.ndarray, contracted: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from limber.geometry.axis_fit import (
     tapered,
 )
 from limber.geometry.contraction import Contraction, contract
-from limber.geometry.curve_graph import CurveGraph, curve_graph, prune_spurs, rooted
+from limber.geometry.curve_graph import CurveGraph, curve_graph, end_chain, prune_spurs, rooted
 from limber.geometry.skeleton import Skeleton
 from limber.progress import SILENT, Progress
 
@@ -118,13 +118,13 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     graph = curve_graph(points[thin], contraction.points, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal)
     _check_one_plant(graph, len(thin), diagonal)
-    start = _root_node(graph, points[thin], contraction.points, root,
-                       np.array([0.0, 0.0, 1.0]) if up is None else up)
+    start = _root_node(graph, points[thin], root,
+                       np.array([0.0, 0.0, 1.0]) if up is None else up, settings.prune)
     first, pruned = _first_skeleton(graph, settings, start)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
-    if not graph.point_kept.all():
+    if (graph.owner < 0).any():
         # What was left away must not draw the rest towards it.
-        some = some[graph.point_kept[cKDTree(points[thin]).query(some)[1]]]
+        some = some[graph.owner[cKDTree(points[thin]).query(some)[1]] >= 0]
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     _check_round(fitted.skeleton, points, segment, residual)
@@ -173,24 +173,35 @@ def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, start: int,
     return Skeleton.from_edges(graph.nodes[keep], moved, radius), pruned
 
 
-def _root_node(graph: CurveGraph, points: np.ndarray, contracted: np.ndarray,
-               root: np.ndarray | None, up: np.ndarray) -> int:
+def _root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
+               prune: float) -> int:
     """The tip nearest to ``root``, or the tip of the thickest end; of several the lowest.
 
-    How thick an end is, its smallest extent tells: a leaf is wide, but flat.
+    How thick an end is, its smallest extent tells together with how far its points were drawn: a
+    leaf is wide, but flat. An end that is shorter than it is thick is a spur, not an end.
     """
     degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
     tips = np.flatnonzero(degree == 1)
     if root is not None:
         return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))])
-    tree = cKDTree(contracted)
+    # Spurs would end the walk from a tip early: pruned as from the lowest tip, for now.
+    parent = rooted(graph.nodes, graph.edges, int(tips[np.argmin(graph.nodes[tips] @ up)]))
+    keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
+    neighbours: list[list[int]] = [[] for _ in graph.nodes]
+    for node in np.flatnonzero(keep & (parent >= 0)):
+        neighbours[node].append(int(parent[node]))
+        neighbours[parent[node]].append(int(node))
+    tips = np.array([node for node, near in enumerate(neighbours) if len(near) == 1])
     reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
     thick = np.zeros(len(tips))
     for place, tip in enumerate(tips):
-        near = points[tree.query_ball_point(graph.nodes[tip], reach)]
-        if len(near) >= 4:
-            thick[place] = np.sqrt(max(np.linalg.eigvalsh(np.cov(near.T))[0], 0.0))
-    candidates = tips[thick >= 0.7 * thick.max()]
+        chain = end_chain(neighbours, graph.nodes, int(tip), reach)
+        mine = points[np.isin(graph.owner, chain)]
+        length = np.linalg.norm(graph.nodes[chain[-1]] - graph.nodes[tip])
+        if len(mine) >= 4 and length > 2 * float(np.median(graph.thickness[chain])):
+            least = np.sqrt(max(np.linalg.eigvalsh(np.cov(mine.T))[0], 0.0))
+            thick[place] = np.sqrt(least * float(np.median(graph.thickness[chain])))
+    candidates = tips[thick >= 0.45 * thick.max()]
     return int(candidates[np.argmin(graph.nodes[candidates] @ up)])
 
 

@@ -284,7 +284,7 @@ class _TreeSweep:
                 direction /= np.linalg.norm(direction)
                 found.append((wide, float(direction @ outward),
                               _Patch(at, faces, np.array(loop), direction)))
-        found = [f for f in found if f[1] > 0.2]
+        found = [f for f in found if f[1] > -0.2]
         found.sort(key=lambda f: (-f[0], -f[1]))
         return [patch for _, _, patch in found]
 
@@ -300,7 +300,7 @@ class _TreeSweep:
         _, foot = axis.nearest(known[patch.loop].mean(axis=0)[None])
         joints = []
         for start in np.linspace(foot[0], 0.75 * axis.length, 60):
-            for lean in (0.3, 0.8):
+            for lean in (0.3, 0.8, 1.6):
                 joint = self._joint(axis, float(start), lean, patch, triangles, known)
                 if joint is not None:
                     joints.append(joint)
