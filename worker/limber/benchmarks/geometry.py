@@ -163,7 +163,7 @@ def _contraction(quick: bool, progress: Progress) -> list[Row]:
     for count, asked, theirs in ((14_667, 2.5, 10.3), (58_219, 12.0, 56.5)):
         if quick and count > 20_000:
             continue
-        branch = generate_branch(7, point_spacing=0.0018 * np.sqrt(14_667 / count))
+        branch = generate_branch(7, point_spacing=0.0017 * np.sqrt(14_667 / count))
         rng = np.random.default_rng(0)
         points = branch.cloud.points
         points = points[rng.permutation(len(points))[:count]]

@@ -51,9 +51,11 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
         command = [sys.executable, "-m", "limber.geometry.tetwild_process", str(source),
                    str(target)]
         # fTetWild uses TBB and OpenMP: one thread each, since a second one gains nothing.
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        environment = os.environ | {"OMP_NUM_THREADS": "1",
+                                    "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        # It also writes a file of its own (__tracked_surface.stl) where it runs.
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                                   stderr=subprocess.PIPE, env=environment)
+                                   stderr=subprocess.PIPE, env=environment, cwd=folder)
         try:
             _watch(process, time_limit, memory_limit_mb, progress)
             message = process.stderr.read().decode(errors="replace").strip()
