@@ -1,0 +1,89 @@
+"""The command simulate on a small branch folder: frames, keys, failure, the VTU series."""
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from tests.mechanics.conftest import box_mesh
+
+from limber.cli import call
+from limber.errors import ConvergenceError, InputError
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics.frames import read_pc2
+from limber.mechanics.simulate import SimulateSettings, simulate
+from limber.store import Branch
+
+KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m",
+        "min_det_f"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A branch folder with the mesh of a short beam."""
+    mesh = box_mesh((0.01, 0.01, 0.3), (1, 1, 20))
+    count = mesh.tet_count
+    mesh = mesh.with_data(
+        cell_data={"young": np.full(count, 1e9), "poisson": np.full(count, 0.35),
+                   "density": np.full(count, 900.0)},
+        point_data={"grasp": (np.abs(mesh.nodes[:, 2] - 0.2) < 0.011).astype(np.int64)})
+    branch = Branch.create(tmp_path / "beam.branch")
+    with branch.stage("reconstruct") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+    return branch.folder
+
+
+def test_motion_writes_what_the_design_says(folder):
+    """A pull in time: keys, PC2 of the surface, first frame the scan, skipped when current."""
+    settings = SimulateSettings(move=(0.02, 0, -0.001), duration=0.2, hold=0.1,
+                                grasp_mode="pinned")
+    result = simulate(folder, settings)
+    assert result.keys() >= KEYS
+    assert result["converged"]
+    positions, _, _ = read_pc2(folder / "frames" / "simulate.pc2")
+    mesh = TetMesh.read(folder / "mesh.vtu")
+    surface = np.unique(mesh.surface_faces())
+    assert positions.shape == (result["frame_count"], len(surface), 3)
+    assert np.abs(positions[0] - mesh.nodes[surface]).max() < 1e-4
+    frames = json.loads((folder / "frames" / "simulate.json").read_text())
+    assert len(frames["energies_j"]) == frames["frame_count"] == result["frame_count"]
+    changed = (folder / "branch.json").stat().st_mtime_ns
+    assert simulate(folder, settings) == result
+    assert (folder / "branch.json").stat().st_mtime_ns == changed
+
+
+def test_static_force_and_vtu_series(folder):
+    """A force in balance: energy grows, the series has each frame with strain and stress."""
+    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), frame_rate=4, vtu=True,
+                                gravity=False, name="pull")
+    result = simulate(folder, settings)
+    frames = json.loads((folder / "frames" / "pull.json").read_text())
+    assert np.all(np.diff(frames["energies_j"]) > 0)
+    assert result["grasp_force_n"] == pytest.approx([1, 0, 0])
+    series = folder / "frames" / "pull" / "pull.pvd"
+    entries = list(ElementTree.parse(series).iter("DataSet"))
+    assert len(entries) == result["frame_count"]
+    last = TetMesh.read(series.parent / entries[-1].get("file"))
+    assert last.cell_data["energy_density"].max() > 0
+    assert last.cell_data["principal_stress"].shape == (last.tet_count, 3)
+
+
+def test_torn_branch_exits_with_3_and_keeps_good_frames(folder):
+    """A pose that tears the branch: exit code 3, place and reason, frames up to there."""
+    settings = SimulateSettings(kind="static", move=(3.0, 0, 0), frame_rate=5, gravity=False)
+    with pytest.raises(ConvergenceError, match=r"at \("):
+        simulate(folder, settings)
+    branch = Branch.open(folder)
+    stored = branch.manifest.stages["simulate"].result
+    assert not stored["converged"]
+    assert stored["frame_count"] >= 2
+    assert branch.has("frames/simulate.pc2")
+    assert call(["simulate", str(folder), "--kind", "static", "--move", "3", "0", "0",
+                 "--frame-rate", "5", "--no-gravity", "--progress", "none"]) == 3
+
+
+def test_motion_and_force_at_once_are_refused(folder):
+    """Both a motion and a force: exit code 2, nothing written."""
+    with pytest.raises(InputError, match="force"):
+        simulate(folder, SimulateSettings(move=(0.1, 0, 0), grasp_force=(1.0, 0, 0)))
+    assert not (folder / "frames").exists()
