@@ -31,8 +31,8 @@ from limber.store import Branch
 LENGTH = 0.6
 YOUNG = 5e7
 KNOWN = ReducedSettings(size=56, vibration_count=6, field_count=100)
-CHANGED = ReducedSettings(size=70, vibration_count=6, field_count=125)
-CLAMPED = ReducedSettings(size=90, vibration_count=6, field_count=140)
+CHANGED = ReducedSettings(size=64, vibration_count=0, field_count=105)
+CLAMPED = ReducedSettings(size=90, vibration_count=0, field_count=140)
 SESSION = ("--mode", "pinned", "--grasps", "2", "--size", "56", "--fields", "100")
 
 
@@ -94,12 +94,12 @@ def rows(quick: bool, progress: Progress = SILENT, out: Path | None = None) -> l
     """Measure the rows; ``out`` gets the raw numbers as JSON."""
     branch = bench_branch()
     bench = _Bench(branch, "pinned", quick)
-    count = 60 if quick else 120
+    count, varied = (50, 100) if quick else (120, 160)
     known = bench.train(count, 1.0, None, progress.part(0.0, 0.25))
     held_out = bench.test(10 if quick else 40, False, known, progress.part(0.25, 0.32))
     reduced = bench.reduce(known.for_known_young(), KNOWN)
     exact = measure(reduced, held_out)
-    both = known.joined(bench.train(count, 4.0, known, progress.part(0.35, 0.6)))
+    both = known.joined(bench.train(varied, 4.0, known, progress.part(0.35, 0.6)))
     changed_test = bench.test(10 if quick else 30, True, both, progress.part(0.6, 0.66))
     wide = bench.reduce(both, CHANGED)
     changed = measure(wide, changed_test)
@@ -294,7 +294,7 @@ def _watch(session: InteractiveSession, until: float, sent: dict[int, float], se
 
 def _clamped_row(branch: Branching, progress: Progress) -> Row:
     bench = _Bench(branch, "clamped", False)
-    known = bench.train(160, 1.0, None, progress.part(0.0, 0.7))
+    known = bench.train(200, 1.0, None, progress.part(0.0, 0.7))
     errors = measure(bench.reduce(known.for_known_young(), CLAMPED),
                      bench.test(30, False, known, progress.part(0.8, 0.95)))
     return Row("the same, clamped grasps (position and rotation given), known E",

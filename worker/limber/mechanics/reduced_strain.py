@@ -33,11 +33,8 @@ _SMALLEST = 1e-11
 """Eigenvalue of the strain fields, relative to the largest, below which they are round-off."""
 
 
-_SOFT = 0.5
-"""Part of the true lowest stiffness under which a motion counts as spuriously soft."""
-_SOFT_ROUNDS = 2
-_ALIKE = 1e-3
-"""Eigenvalue, of at least 1 each on the diagonal, under which fields count as alike."""
+_ALIKE = 1e-6
+"""Eigenvalue of the normalised fields' products under which they count as alike."""
 
 
 @dataclass(frozen=True)
@@ -185,81 +182,13 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
     else:
         sources = _strain_sources(model, snapshots)
         transform = _leading_fields(points, sources, field_count)
-    polynomial = _projected(points, basis, sources, transform)
-    if sources is None:
-        return polynomial
-    floors = _lowest_stiffness(model, weights, snapshots)
-    for _ in range(_SOFT_ROUNDS):
-        soft = _soft_directions(model, basis, snapshots, polynomial, floors)
-        if not len(soft[0]):
-            break
-        sources = _Sources(sources.states, [*sources.changes, soft])
-        transform = _bordered(transform, len(soft[0]))
-        polynomial = _projected(points, basis, sources, transform)
-    return polynomial
-
-
-def _lowest_stiffness(model: BranchModel, weights: np.ndarray,
-                      snapshots: Snapshots) -> np.ndarray:
-    """Return a lower bound of the true lowest stiffness per mass [1/s^2] at each state.
-
-    From the vibrations of some states; other states of a softer branch by as much less.
-    """
-    floor = np.inf
-    mean = (weights * model.weights.sum(axis=1)[:, None]).sum(axis=0)
-    level = (snapshots.young @ mean) / mean.sum()
-    for field, state in zip(snapshots.vibrations.astype(float), snapshots.vibration_states,
-                            strict=True):
-        full = model.with_young(weights @ snapshots.young[state])
-        stiffness = (field * full.tangent_times(snapshots.displacement[state], field)).sum()
-        quotient = float(stiffness / (field * (full.mass_matrix @ field)).sum())
-        floor = min(floor, quotient / level[state])
-    return floor * level if np.isfinite(floor) else np.zeros(len(snapshots))
-
-
-def _soft_directions(model: BranchModel, basis: Basis, snapshots: Snapshots,
-                     polynomial: StrainPolynomial, floors: np.ndarray,
-                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return motions that the projected strains resist less than any true motion is resisted.
-
-    A part without strain in the states, such as a free end, has no strain field of its own, and
-    would be free to stretch. No motion in a subspace can be softer than the lowest vibration of
-    the whole branch; those that are, are named here: fields, their states, scales.
-    """
-    from scipy.linalg import eigh
-
-    free = slice(basis.lift_count, None)
-    mass = reduced_mass(model, basis)[free, free]
-    fields, owners = [], []
-    for state, floor in enumerate(floors):
-        linear, quadratic, _ = polynomial.whitened(polynomial.moduli(snapshots.young[state]))
-        count, size = linear.shape
-        tangent = np.empty((size, size))
-        evaluate_strain(linear, quadratic, basis.states[state], np.empty(0), np.empty(count),
-                        np.empty((count, size)), np.empty(size), tangent)
-        values, vectors = eigh(tangent[free, free], mass, lower=True)
-        for vector in vectors[:, values < _SOFT * floor].T:
-            field = np.tensordot(vector, basis.columns[free], 1)
-            fields.append(field / np.abs(field).max())
-            owners.append(state)
-    shape = (-1, model.mesh.node_count, 3)
-    return (np.array(fields).reshape(shape), np.array(owners, np.int64),
-            np.full(len(fields), VIBRATION_STEP * model.extent))
+    return _projected(points, basis, sources, transform)
 
 
 def reduced_mass(model: BranchModel, basis: Basis) -> np.ndarray:
     """Return the mass matrix of the coordinates, shape [size, size]."""
     heavy = np.array([model.mass_matrix @ column for column in basis.columns])
     return basis.columns.reshape(basis.size, -1) @ heavy.reshape(basis.size, -1).T
-
-
-def _bordered(transform: np.ndarray, count: int) -> np.ndarray:
-    """Return the transform with ``count`` more sources that are fields as they are."""
-    rows, columns = transform.shape
-    result = np.zeros((rows + count, columns + count))
-    result[:rows, :columns] = transform
-    result[rows:, columns:] = np.eye(count)
-    return result
 
 
 class _Points:
@@ -431,7 +360,6 @@ def _normalised(points: _Points, basis: Basis, coupling: np.ndarray, own: np.nda
     """Make the fields orthonormal, so that coefficients are what the functionals measure."""
     scale = 1 / np.sqrt(np.diag(own))
     values, vectors = np.linalg.eigh((own + own.T) / 2 * scale * scale[:, None])
-    # Soft directions of neighbouring states are nearly alike.
     keep = values > _ALIKE
     inverse = (vectors[:, keep] / np.sqrt(values[keep])).T * scale
     coupling = inverse @ coupling

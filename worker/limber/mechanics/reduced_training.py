@@ -104,6 +104,11 @@ class Snapshots:
         """Return the same without the derivatives to Young's modulus."""
         return replace(self, young_tangents=self.young_tangents[:, :0])
 
+    def without_vibrations(self) -> "Snapshots":
+        """Return the same for statics alone."""
+        return replace(self, vibrations=self.vibrations[:0],
+                       vibration_states=self.vibration_states[:0])
+
     def joined(self, other: "Snapshots") -> "Snapshots":
         """Return these snapshots and those of ``other``."""
         parts = {name: np.concatenate([getattr(self, name), getattr(other, name)])

@@ -278,8 +278,8 @@ class Session:
         # Out of reach the branch stays where it was last: a false state would flicker.
         shown = self.state or state
         self._publish(shown.coordinates, received, id=move_id, is_trusted=state.trusted,
-                      is_converged=state.converged, energy_j=state.strain_energy,
-                      wrench=(state.reaction_force, state.reaction_torque))
+                      is_converged=state.converged, energy_j=shown.strain_energy,
+                      wrench=(shown.reaction_force, shown.reaction_torque))
         if self.trainer is not None and state.converged:
             self.trainer.check(state, move_id)
 
