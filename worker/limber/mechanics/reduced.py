@@ -273,6 +273,8 @@ class ReducedModel:
         for at_pose, q in self._starts(pose, start)[:settings.start_count]:
             found = self._follow(at_pose, q, pose, load, settings)
             iterations += found.iterations
+            if best is not None and found.agrees(best):
+                break  # the same from two starts: unusual, but no accident of the way there
             if best is None or (found.ranking(settings) < best.ranking(settings)):
                 best = found
             if best.converged and best.novelty < settings.novelty_limit:
@@ -436,6 +438,11 @@ class _Found:
     novelty: float
     iterations: int
     potential: float
+
+    def agrees(self, other: "_Found") -> bool:
+        """Whether both are the same equilibrium."""
+        return (self.converged and other.converged
+                and abs(self.potential - other.potential) <= 1e-6 * abs(other.potential))
 
     def ranking(self, settings: ReducedStaticSettings) -> tuple[bool, bool, float]:
         """Sort key: converged, then within the training, then the lower potential energy."""
