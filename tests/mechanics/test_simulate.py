@@ -9,7 +9,9 @@ from tests.mechanics.conftest import box_mesh
 
 from limber.cli import call
 from limber.errors import ConvergenceError, InputError
+from limber.geometry.cylinder_mesh import straight_beam
 from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics import BranchModel, solve_static
 from limber.mechanics.frames import read_pc2
 from limber.mechanics.simulate import SimulateSettings, simulate
 from limber.store import Branch
@@ -87,3 +89,16 @@ def test_motion_and_force_at_once_are_refused(folder):
     with pytest.raises(InputError, match="force"):
         simulate(folder, SimulateSettings(move=(0.1, 0, 0), grasp_force=(1.0, 0, 0)))
     assert not (folder / "frames").exists()
+
+
+def test_left_out_twigs_hang_on_the_branch(tmp_path):
+    """Masses that reconstruct writes for twigs it leaves out weigh on the model of the folder."""
+    branch = Branch.create(tmp_path / "twigs.branch")
+    with branch.stage("mesh") as stage:
+        straight_beam(0.3, 0.006, 0.004).write(stage.path("mesh.vtu"))
+        stage.path("point_masses.json").write_text(json.dumps(
+            [{"mass_kg": 0.25, "centre_m": [0.1, 0, 0.2], "attached_m": [0, 0, 0.2]}]))
+    model = BranchModel.from_branch(branch)
+    bare = BranchModel.from_branch(branch, point_masses=())
+    weights = [solve_static(m).require().base_force[2] for m in (model, bare)]
+    assert weights[0] - weights[1] == pytest.approx(0.25 * 9.80665, rel=1e-6)

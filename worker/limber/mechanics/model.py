@@ -1,6 +1,7 @@
 """The branch model: a mesh with its material, loads and constraints, ready for the solvers."""
 
 import copy
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,11 +28,7 @@ from limber.mechanics.materials import (
     lame,
     per_tet,
 )
-from limber.store import Branch
-
-GRAVITY = (0.0, 0.0, -9.80665)
-"""Standard gravity [m/s^2] along -z."""
-
+from limber.store import GRAVITY, Branch
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
@@ -48,6 +45,14 @@ class PointMass:
 
     position: tuple[float, float, float]
     mass: float
+
+
+def point_masses(branch: Branch) -> tuple[PointMass, ...]:
+    """Return the twigs that a folder's mesh leaves out, as masses where they were attached."""
+    if not branch.has("point_masses.json"):
+        return ()
+    masses = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
+    return tuple(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses)
 
 
 @dataclass(frozen=True)
@@ -140,7 +145,8 @@ class BranchModel:
     def from_branch(cls, branch: Branch, **overrides: object) -> "BranchModel":
         """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for the class.
 
-        Gravity acts as it did on the scan, which the upright turn has turned with the branch.
+        Gravity acts as it did on the scan, which the upright turn has turned with the branch;
+        twigs that the mesh leaves out hang on it as masses.
 
         Raises:
             BranchFolderError: there is no mesh. InputError: it lacks material data.
@@ -153,7 +159,8 @@ class BranchModel:
                 raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
                                  "The material is not known.", "Reconstruct again.")
             values[name] = mesh.cell_data[name] if value is None else value
-        return cls(mesh, **values, **{"gravity": branch.gravity, **overrides})
+        known = {"gravity": branch.gravity, "point_masses": point_masses(branch)}
+        return cls(mesh, **values, **{**known, **overrides})
 
     @property
     def mesh(self) -> TetMesh:

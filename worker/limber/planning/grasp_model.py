@@ -7,7 +7,6 @@ by turning as the branch would, so each pose carries that natural rotation for t
 gripper that turns otherwise bends the branch more than planned here.
 """
 
-import json
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -26,6 +25,7 @@ from limber.mechanics import (
     follow_poses,
     solve_static,
 )
+from limber.mechanics.model import point_masses
 from limber.mechanics.strain import strain_state
 from limber.store import Branch
 
@@ -176,12 +176,5 @@ def read_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
         return GraspModel(mesh, reach, None)
     from limber.mechanics.rest_shape import unloaded_rest_shape
 
-    hanging = GraspModel(mesh, reach, branch.gravity, _point_masses(branch))
+    hanging = GraspModel(mesh, reach, branch.gravity, point_masses(branch))
     return replace(hanging, mesh=unloaded_rest_shape(hanging.model))
-
-
-def _point_masses(branch: Branch) -> tuple[PointMass, ...]:
-    if not branch.has("point_masses.json"):
-        return ()
-    masses = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
-    return tuple(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses)
