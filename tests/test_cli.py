@@ -109,7 +109,8 @@ def test_every_listed_command_exists():
         assert command.help
 
 
-@pytest.mark.parametrize("arguments", [["nosuch"], ["record"], ["reconstruct"], ["reconstruct", "--nosuch"]])
+@pytest.mark.parametrize("arguments", [
+    ["nosuch"], ["record"], ["reconstruct"], ["reconstruct", "--nosuch"]])
 def test_wrong_usage_is_exit_code_2(arguments):
     """Unknown commands and options, and missing arguments, end with 2."""
     assert cli.call(arguments) == 2
