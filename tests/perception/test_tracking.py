@@ -103,7 +103,7 @@ def test_a_wrong_camera_pose_is_found(scene):
     off = back @ rotation.T + shift - tracker.rest.nodes
     # A slide along the branch, 5 mm here, can hardly be seen; it must not grow.
     assert np.abs(off[:, 2]).max() < 1e-2
-    beside = cKDTree(tracker.rest.at(np.linspace(0, tracker.rest.length, 2000))).query(
+    beside = cKDTree(tracker.rest.start().at(np.linspace(0, tracker.rest.length, 2000))).query(
         tracker.rest.nodes + off)[0]
     assert beside[:-3].max() < 8e-4
 

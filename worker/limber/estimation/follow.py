@@ -15,6 +15,7 @@ from limber.estimation.checks import clean
 from limber.estimation.grasping import grasp_on
 from limber.estimation.objective import Objective
 from limber.estimation.online import OnlineEstimator, OnlineFrame, OnlineState
+from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.preparation import Subject, forwards_of, pull_names, subject_of
 from limber.estimation.recording import Observations, Pull, read_pull
@@ -81,15 +82,29 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
 
 def prepare(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Progress,
             training_count: int) -> OnlineEstimator:
-    """Make the reduced model around the moduli that the pull's first frames suggest."""
+    """Make the reduced model around what is known: an earlier estimate, or a rough fit.
+
+    A basis knows moduli within its training's spread; around a uniform guess that spread would
+    have to be so wide that the basis is good nowhere.
+    """
     cleaned = clean(pull)
-    forwards = forwards_of([cleaned], subject, settings, lambda _message: None)
-    objective = Objective(forwards, ParameterSpace.separate(subject.start))
-    start = scaled_start(objective, subject.start)
+    few = settings.model_copy(update={"key_frames": 4})
+    forwards = forwards_of([cleaned], subject, few, lambda _message: None)
+    objective = Objective(forwards, ParameterSpace.separate(subject.start),
+                          force_sigma=[pull.entry.sensor.force_sigma_n])
+    field = subject.mesh.cell_data["young"]
+    if np.ptp(field) > 0.02 * field.mean():
+        known = np.linalg.lstsq(subject.weights, field, rcond=None)[0]
+        start = replace(subject.start, young=np.maximum(known, 0.05 * field.min()))
+    else:
+        start = scaled_start(objective, subject.start)
+        rough = gauss_newton(objective, objective.space.pack(start), evaluation_limit=8,
+                             tolerance=1e-2)
+        start = objective.space.unpack(rough.evaluation.free)
     gravity = pull.entry.gravity_m_s2 or (0.0, 0.0, 0.0)
     model = subject.model.with_parameters(young=subject.weights @ start.young, gravity=gravity)
     grasp = grasp_on(subject.mesh, pull.entry.grasp)
-    training = TrainingSettings(grasp_count=training_count, young_spread=6.0)
+    training = TrainingSettings(grasp_count=training_count, young_spread=2.0)
     reduced, _ = build_reduced(model, grasp, subject.weights, start.young,
                                ReducedSettings(training=training), progress)
     rest = subject.control_points if pull.entry.rest_points_m is None else np.array(
