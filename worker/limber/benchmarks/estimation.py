@@ -224,7 +224,7 @@ def _reduced(bench: Bench, earlier: Pull) -> tuple[ReducedModel, float]:
     started = time.perf_counter()
     rough = bench.fit([earlier], EstimateSettings(hold_out=False, key_frames=4)).values.young
     model = bench.model.with_parameters(young=bench.weights @ rough)
-    training = TrainingSettings(grasp_count=100, young_spread=1.5)
+    training = TrainingSettings(grasp_count=120, young_spread=2.0)
     reduced, _ = build_reduced(model, grasp_on(bench.mesh, earlier.entry.grasp), bench.weights,
                                rough, ReducedSettings(training=training))
     return reduced, time.perf_counter() - started
@@ -235,7 +235,7 @@ def _online(bench: Bench, reduced: ReducedModel, pull: Pull, found: Estimate,
     estimator = OnlineEstimator(
         reduced, pull.entry.grasp, bench.mesh, np.array(pull.entry.rest_points_m),
         position_sigma=pull.entry.sensor.position_sigma_m,
-        force_sigma=pull.entry.sensor.force_sigma_n)
+        force_sigma=pull.entry.sensor.force_sigma_n, prior_deviation=0.3)
     frames, seconds = frames_of(pull), []
     for index in range(len(frames)):
         frame = OnlineFrame(float(frames.times[index]), frames.poses[index],

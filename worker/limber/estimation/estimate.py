@@ -145,7 +145,8 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
                 tell(suspicion)
     first = _evaluated(objective, start)
     judged = identifiability(first, objective.space)
-    require_scale(judged)
+    if not _force_is_measured(objective):
+        require_scale(judged)
     space, ties = tie_unresolved(first, objective.space)
     for message in ties:
         tell(message)
@@ -163,6 +164,18 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     if settings.hold_out and len(objective.forwards) > 1 and not stopped:
         found.held_out = _held_out(found, settings)
     return found
+
+
+def _force_is_measured(objective: Objective) -> bool:
+    """Whether a force well over its noise was measured: it gives the scale, wherever a fit starts.
+
+    Sensitivities at a start that is far too soft would deny that.
+    """
+    for forward, sigma in zip(objective.forwards, objective.force_sigma, strict=True):
+        force = forward.frames.wrenches[:, :3]
+        if forward.uses_force and np.nanmax(np.abs(force), initial=0.0) > 5 * sigma:
+            return True
+    return False
 
 
 def _extra(settings: EstimateSettings) -> tuple[str, ...]:

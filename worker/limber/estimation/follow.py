@@ -28,6 +28,8 @@ from limber.store import Branch, plain
 
 QUIET_SECONDS = 3.0
 """A recording that has not grown for so long has ended."""
+PRIOR_DEVIATION = 0.4
+"""Of log E around what the reduced model was built for: it knows no more than twice or half."""
 
 
 def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
@@ -112,7 +114,7 @@ def prepare(pull: Pull, subject: Subject, settings: EstimateSettings, progress: 
     sensor = pull.entry.sensor
     return OnlineEstimator(reduced, pull.entry.grasp, subject.mesh, rest,
                            position_sigma=sensor.position_sigma_m,
-                           force_sigma=sensor.force_sigma_n)
+                           force_sigma=sensor.force_sigma_n, prior_deviation=PRIOR_DEVIATION)
 
 
 def paced(folder: Path, pace: float) -> Iterator[tuple[OnlineFrame, float]]:

@@ -50,7 +50,7 @@ def pulled(model: BranchModel, grasp: Grasp, directions: np.ndarray,
     Raises:
         WorkError: no force moves the grasp as far.
     """
-    size = _size(model, grasp, directions[-1], travel)
+    size = force_for_travel(model, grasp, directions[-1], travel)
     results: list[StaticResult] = []
     start = None
     for index, direction in enumerate(directions):
@@ -62,7 +62,13 @@ def pulled(model: BranchModel, grasp: Grasp, directions: np.ndarray,
     return results, size * directions
 
 
-def _size(model: BranchModel, grasp: Grasp, direction: np.ndarray, travel: float) -> float:
+def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, travel: float,
+                     ) -> float:
+    """Return the factor of ``direction`` [N] that moves the grasp by ``travel`` [m], to 3 %.
+
+    Raises:
+        WorkError: none does.
+    """
     def moved(size: float, start: StaticResult | None) -> tuple[float, StaticResult]:
         result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=start)
         if not result.converged:

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.errors import InputError, WorkError
 from limber.estimation.alignment import Frames
 from limber.estimation.grasping import grasp_on, pose_on
+from limber.estimation.gripper_path import force_for_travel
 from limber.estimation.key_frames import key_frames, smoothed, travel
 from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
@@ -128,6 +129,27 @@ class QuasiStaticForward:
             states.append(_Memory(result, slope))
         self._memory, self._values = states, values
         return self._at_all_frames(points, forces, d_points, d_forces)
+
+    def force_ratio(self, values: Values) -> float | None:
+        """Measured force over the one that moves a branch of these ``values`` as far.
+
+        The force is let go where the branch wants: at the recorded poses a branch of other
+        ratios of E would be stretched, and a slender branch answers that with thousandfold force.
+        """
+        frames = self.frames
+        known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
+        travel = np.linalg.norm(frames.poses[:, :3] - frames.poses[0, :3], axis=1)[known]
+        row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
+        force = frames.wrenches[row, :3]
+        size = float(np.linalg.norm(force))
+        way = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
+        if size <= 0 or way <= 0:
+            return None
+        try:
+            return float(size / force_for_travel(self.model_with(values), self.grasp,
+                                                 force / size, way))
+        except WorkError:
+            return None
 
     def displacements(self) -> list[np.ndarray]:
         """Nodal displacements [m] of the key frames under the last parameters."""

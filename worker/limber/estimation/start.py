@@ -11,8 +11,8 @@ from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 def scaled_start(objective: Objective, values: Values) -> Values:
     """Return ``values`` with all moduli scaled to the measurements.
 
-    At given poses the reaction is proportional to the scale of Young's modulus: one simulation
-    gives it. Where a force or gravity drives, a few decades are tried instead.
+    How far a force moves a branch depends on force over modulus alone: a few solutions give the
+    scale. Where a force or gravity drives, a few decades are tried instead.
     """
     factors = [factor for forward in objective.forwards
                if (factor := _force_ratio(forward, values)) is not None]
@@ -23,22 +23,8 @@ def scaled_start(objective: Objective, values: Values) -> Values:
 
 
 def _force_ratio(forward: Forward, values: Values) -> float | None:
-    if not forward.uses_force or forward.entry.motion == "dynamic":
-        return None
-    simulated = forward.simulate(values, (), False)
-    if simulated is None:
-        return None
-    measured = forward.frames.wrenches[:, :3]
-    known = np.isfinite(measured).all(axis=1)
-    # A uniform branch would not go where this one went: far out it is stretched, and its force
-    # says nothing. Near rest both only bend.
-    travel = np.linalg.norm(forward.frames.poses[:, :3] - forward.frames.poses[0, :3], axis=1)
-    near = known & (travel > 0.05 * travel.max()) & (travel < 0.4 * travel.max())
-    chosen = near if near.sum() >= 3 else known
-    # Along the measured force: what stretches points across it.
-    own = float(np.sum(measured[chosen]**2))
-    across = float(np.sum(measured[chosen] * simulated.forces[chosen]))
-    return own / across if own > 0 and across > 0 else None
+    usable = forward.uses_force and hasattr(forward, "force_ratio")
+    return forward.force_ratio(values) if usable else None
 
 
 def _scanned(objective: Objective, values: Values) -> Values:
