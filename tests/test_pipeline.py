@@ -15,7 +15,8 @@ import pytest
 from limber.jobs.process import run_stage
 from limber.store import Branch
 
-pytestmark = pytest.mark.slow
+# The fixture runs the whole pipeline within the first test, so the usual limit is too short.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 KEYS = {
     "reconstruct": {"point_count", "node_count", "branch_count", "length_m", "radius_min_m",
