@@ -5,6 +5,8 @@ import pytest
 
 from limber.errors import MeshingError
 from limber.geometry.cylinder_mesh import curved_beam, split_wedges, straight_beam
+from limber.geometry.forks import crease_angles, smooth_forks
+from limber.geometry.generated import generate_branch
 from limber.geometry.marks import mark
 from limber.geometry.mesh_quality import dihedral_angles, measure_quality, radius_ratios
 from limber.geometry.skeleton import Skeleton
@@ -25,6 +27,29 @@ def test_branch_surface_is_closed_and_of_the_right_volume(y_skeleton):
     twig = np.pi * 0.006**2 * (0.2 - 0.01 / 0.8)  # from the stem's side on
     round_volume = stem + twig + 2 / 3 * np.pi * (0.008**3 + 0.006**3)
     assert surface.volume == pytest.approx(round_volume, rel=0.03)
+
+
+@pytest.mark.parametrize("fork_count", [1, 10])
+def test_smoothed_forks_are_less_sharp_and_sound(fork_count):
+    """Fillets: creases less sharp, and shorter where sharp; valid; volume within 1 %, not less."""
+    skeleton = generate_branch(3, fork_count=fork_count, point_spacing=0.01).skeleton
+    plain = branch_surface(skeleton)
+    smooth, check, warnings = smooth_forks(plain, skeleton)
+    assert check.valid and check.piece_count == 1 and not warnings
+    assert 1 < smooth.volume / plain.volume < 1.01
+    (before, length), (after, length_after) = crease_angles(plain), crease_angles(smooth)
+    assert after.max() < 0.9 * before.max()
+    sharp = np.deg2rad(75)
+    assert length_after[after > sharp].sum() < 0.7 * length[before > sharp].sum()
+
+
+def test_forks_stay_sharp_where_a_fillet_fails(y_skeleton, monkeypatch):
+    """A fillet that adds too much volume is given up, with a warning."""
+    monkeypatch.setattr("limber.geometry.forks.VOLUME_CHANGE", 1e-5)
+    plain = branch_surface(y_skeleton)
+    smooth, check, warnings = smooth_forks(plain, y_skeleton)
+    assert smooth is plain and check.valid
+    assert len(warnings) == 1 and "1 of 1 forks stay sharp" in warnings[0]
 
 
 def test_sharp_bend_does_not_cross_itself():

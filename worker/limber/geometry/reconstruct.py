@@ -13,6 +13,7 @@ from limber.geometry.cloud import Cloud
 from limber.geometry.cloud_files import read_points
 from limber.geometry.control_points import FRACTIONS
 from limber.geometry.depth_files import read_depth
+from limber.geometry.forks import smooth_forks
 from limber.geometry.marks import GRASP_FRACTION, mark
 from limber.geometry.mesh_quality import measure_quality
 from limber.geometry.preparation import PreparationSettings, Prepared, prepare
@@ -20,7 +21,6 @@ from limber.geometry.skeleton import CLAMPED, INTERPOLATED, Skeleton
 from limber.geometry.skeleton_files import UNIT_METRES, read_skeleton, write_cylinders
 from limber.geometry.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
 from limber.geometry.surface import Surface
-from limber.geometry.surface_checks import check_surface
 from limber.geometry.tetrahedra import MeshResult, MeshSettings, mesh_branch
 from limber.geometry.tubes import branch_surface
 from limber.geometry.upright import upright_rotation
@@ -122,9 +122,10 @@ def write_geometry(stage: Any, skeleton: Skeleton, settings: ReconstructSettings
                    warn: Callable[[str], None], progress: Progress) -> dict[str, Any]:
     """Write skeleton, surface and mesh of an aligned skeleton; return their numbers."""
     kept, masses = leave_out_twigs(skeleton, settings)
-    surface = branch_surface(kept)
-    check = check_surface(surface)
+    surface, check, sharp = smooth_forks(branch_surface(kept), kept)
     check.require()
+    for text in sharp:
+        warn(text)
     progress(0.1, "surface", faces=len(surface.faces))
     meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
     for text in meshed.warnings:
