@@ -6,6 +6,8 @@ CHOLMOD (through cvxopt) on the given order of elimination; SuperLU where cvxopt
 import numpy as np
 import scipy.sparse as sp
 
+from limber.threads import one_thread
+
 
 class NotPositiveDefiniteError(ArithmeticError):
     """The matrix has a pivot that is not positive: the state is not a stable one."""
@@ -22,6 +24,7 @@ class CholmodFactor:
     def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int):
         from cvxopt import matrix, spmatrix
 
+        one_thread()
         self._matrix = spmatrix(1.0, matrix(rows.astype(np.int64)),
                                 matrix(columns.astype(np.int64)), (size, size))
         # A numpy view on cvxopt's own memory: one copy less for each factorisation.
