@@ -114,6 +114,11 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     found = fit_pulls(objective, subject.start, settings, tell)
     found.warnings = messages
     result = _summary(found, settings)
+    earlier = branch.manifest.stages.get("estimate")
+    if found.stopped and earlier is not None and not earlier.result.get("stopped"):
+        raise Cancelled("The estimate was stopped.",
+                        "The finished estimate of an earlier run is kept.",
+                        "Run it again without --force to resume.")
     with branch.stage("estimate", settings, digests=digests) as stage:
         full = result | _details(found, subject, pulls)
         stage.path("estimate.json").write_text(
