@@ -118,7 +118,7 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     if found.stopped and earlier is not None and not earlier.result.get("stopped"):
         raise Cancelled("The estimate was stopped.",
                         "The finished estimate of an earlier run is kept.",
-                        "Run it again without --force to resume.")
+                        "Run it again when there is time for it.")
     with branch.stage("estimate", settings, digests=digests) as stage:
         full = result | _details(found, subject, pulls)
         stage.path("estimate.json").write_text(
