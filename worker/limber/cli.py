@@ -238,7 +238,8 @@ def _option(name: str, field: Any) -> Callable:
         items = typing.get_args(kind)
         if items[-1] is Ellipsis:
             return click.option(flag, name, callback=_number_list, metavar="A,B,...", **common)
-        return click.option(flag, name, nargs=len(items), type=items[0], **common)
+        metavar = "X Y Z" if len(items) == 3 else None
+        return click.option(flag, name, nargs=len(items), type=items[0], metavar=metavar, **common)
     return click.option(flag, name, type=kind, **common)
 
 
@@ -257,8 +258,15 @@ def _help(description: str | None, default: Any) -> str:
     text = description or ""
     if default is None or default == ():
         return text
-    shown = " ".join(map(str, default)) if isinstance(default, tuple) else default
-    return f"{text}  [default: {shown}]"
+    if isinstance(default, tuple):
+        # As it is typed: lists of any length with commas, vectors with spaces.
+        between = " " if len(default) == 3 else ","
+        return f"{text}  [default: {between.join(map(_shown, default))}]"
+    return f"{text}  [default: {_shown(default)}]"
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _terminate_like_interrupt() -> None:
