@@ -11,7 +11,7 @@ from limber.mechanics.factor import NotPositiveDefiniteError, make_factor
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import Material
 from limber.mechanics.pattern import LaneLayout, Pattern
-from limber.mechanics.stiffness import general_stiffness, strain_stiffness
+from limber.mechanics.stiffness import tangent_stiffness
 
 if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel
@@ -95,16 +95,10 @@ class Equations:
         growth, memory = 1.0, _NO_MEMORY
         if viscous is not None:
             growth, memory = viscous.growth, layout.per_point(viscous.memory)
-        if model.material == Material.stable_neo_hookean:
-            general_stiffness(displacement, layout.gradients, layout.weights, lam, mu,
-                              layout.nodes, int(model.material), growth, memory,
-                              layout.slots, layout.lengths, self._values)
-        else:
-            mixed = increment is not None and model.material == Material.st_venant_kirchhoff
-            strain_stiffness(displacement, increment if mixed else _NO_INCREMENT,
-                             layout.gradients, layout.weights, lam, mu, layout.nodes,
-                             int(model.material), growth, memory, layout.slots, layout.lengths,
-                             self._values)
+        mixed = increment is not None and model.material == Material.st_venant_kirchhoff
+        tangent_stiffness(displacement, increment if mixed else _NO_INCREMENT, layout.gradients,
+                          layout.weights, lam, mu, layout.nodes, int(model.material), growth,
+                          memory, layout.slots, layout.lengths, self._values)
         self._add_pins()
 
     def factorise(self) -> bool:

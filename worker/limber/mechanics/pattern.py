@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.mechanics.factor import elimination_order
-from limber.mechanics.stiffness import LANES
+from limber.mechanics.stiffness_pairs import LANES
 
 _SCRATCH = 9
 """Numbers behind the values into which entries of constrained nodes go."""
@@ -92,8 +92,8 @@ class LaneLayout:
     """Elements of a pattern in batches, the element the last axis, earlier eliminated nodes first.
 
     Attributes:
-        nodes [batch, n, LANES], gradients [batch, q, 3, n, LANES], weights [batch, q, LANES],
-        slots and lengths [batch, pairs, LANES]: what the stiffness kernels take.
+        nodes [batch, n, LANES], gradients [batch, q, n, 3, LANES], weights [batch, q, LANES],
+        slots and lengths [batch, pairs, LANES]: what the stiffness kernel takes.
     """
 
     def __init__(self, pattern: Pattern, tets: np.ndarray, gradients: np.ndarray,
@@ -111,8 +111,8 @@ class LaneLayout:
         weights = weights[self._order].copy()
         weights[self._real:] = 0.0
         self.weights = _lanes(weights)
-        self.gradients = _lanes(np.take_along_axis(
-            gradients[self._order], turn[:, None, None, :], axis=3))
+        self.gradients = _lanes(np.swapaxes(np.take_along_axis(
+            gradients[self._order], turn[:, None, None, :], axis=3), 2, 3))
         later, earlier = np.tril_indices(tets.shape[1])
         slots, lengths = pattern.slots(nodes[:, later], nodes[:, earlier])
         self.slots, self.lengths = _lanes(slots.astype(np.int32)), _lanes(lengths.astype(np.int32))
