@@ -33,7 +33,9 @@ from limber.mechanics.sensitivities import (
     static_sensitivities,
     viscous_force,
 )
-from limber.mechanics.statics import StaticResult, checked_forces, solve_static, strain_warnings
+from limber.mechanics.static_problem import checked_forces, strain_warnings
+from limber.mechanics.static_result import StaticResult
+from limber.mechanics.statics import solve_static
 from limber.mechanics.strain import principal_stretch
 from limber.progress import SILENT, Progress
 

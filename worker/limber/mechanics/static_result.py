@@ -54,6 +54,8 @@ class StaticResult:
         min_det_f: Smallest determinant of the deformation gradient.
         iterations, residual_history: Newton iterations in all, relative residuals.
         reached: Part of the way that was covered.
+        snapped_at: Parts of the way at which no stable equilibrium was near and the branch
+            snapped to another one.
         message: What happened, where.
         warnings: What a user should know.
     """
@@ -74,6 +76,7 @@ class StaticResult:
     reached: float = 1.0
     message: str = ""
     warnings: list[str] = field(default_factory=list)
+    snapped_at: list[float] = field(default_factory=list)
 
     def require(self) -> "StaticResult":
         """Return the result itself.
