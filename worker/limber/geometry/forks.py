@@ -1,59 +1,81 @@
 """Fillets where twigs leave their parents, in place of the sharp creases of a plain union.
 
-Around each twig's first part goes a collar whose surface is that of a rounded union: with a and b
-the distances from twig and parent, and rho the fillet's radius,
+Around each crease goes a solid whose surface is that of a rounded union of twig and parent: with
+a and b the distances from the two and rho the fillet's radius,
 
     max(rho, min(a, b)) = sqrt(max(rho - a, 0)^2 + max(rho - b, 0)^2).
 
-A collar is a solid and is joined as one, so that the result is closed whatever the angle of the
-fork; moving the vertices of the union instead folded its slivers.
+It reaches about a twig's radius beyond the crease, lies a little over the cylinders near it and
+dips under them at its rim, and is joined to them as a solid: the result is closed whatever the
+angle of the fork and however many twigs meet there.
 """
 
-import numpy as np
-from scipy.spatial import cKDTree
+from dataclasses import dataclass
 
+import numpy as np
+
+from limber.errors import MeshingError
+from limber.geometry.implicit_surface import level_surface
+from limber.geometry.rounded_union import distances, fillet_level, near_box, segments
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.surface import Surface
 from limber.geometry.surface_checks import SurfaceCheck, check_surface
-from limber.geometry.sweep import frames, resample, rings, tangents
+from limber.geometry.sweep import polygon_factor, tangents
+from limber.geometry.tubes import SPACING, largest_piece, run_axis, sides_of_runs, solid
 
 ROUNDING = 0.5
-"""Radius of a fillet, in radii of its twig; larger ones meet flat parents at ragged edges."""
+"""Radius of a fillet, in radii of its twig or of its parent, whichever is thinner."""
 
-VOLUME_CHANGE = 0.01
-_STEP = 0.25  # between cross-sections of a collar, in radii of the twig
-_BELOW = 0.02  # how far a collar's end lies below the twig's surface, so that the two cross well
+VOLUME_CHANGE = 0.02
+_STEP = 0.7  # of the lattice, in radii of the fillet
+_COARSENED = 0.06  # by how much a fillet's triangles may then be off, in radii of the fillet
+_REACH = 2.5  # how far from the crease a fillet's solid goes, in radii of the fillet
+_RIM = 2.2  # where it lies lowest under the cylinders
+_MARGIN = 0.02  # how far it lies over them near the crease and under them at the rim, in fillets
+_LONGEST = 8.0  # crease of a twig along its parent, in radii of both together
+_TRIES = (1.0, 0.83, 1.21)  # steps of the lattice, in turn, where the first one's solid will not do
 
 
-def smooth_forks(surface: Surface, skeleton: Skeleton, sides: int = 16,
+def smooth_forks(surface: Surface, skeleton: Skeleton, *, spacing: float = SPACING,
                  ) -> tuple[Surface, SurfaceCheck, list[str]]:
     """Round the creases between twigs and their parents.
 
     Args:
-        surface: The union of the cylinders: closed, oriented, not crossing itself.
+        surface: The union of the cylinders, :func:`branch_surface`: closed, oriented, not
+            crossing itself.
         skeleton: The axes and radii it was made of.
-        sides: Sides of a collar.
+        spacing: The spacing it was made with.
 
     Returns:
-        The surface, within 1 % of the volume; its check; and warnings about forks that had to
+        The surface, within 2 % of the volume; its check; and warnings about forks that had to
         stay sharp.
     """
-    made = [(run, _collar(skeleton, run, sides)) for run in range(1, skeleton.branch_count)]
-    collars = [collar for _, collar in made if collar is not None]
-    plain = len(made) - len(collars)
-    for _ in range(3):
-        if not collars:
+    forks = _forks(skeleton, spacing)
+    fillets = {fork.run: fork.fillet(_TRIES[0]) for fork in forks}
+    by_run = {fork.run: fork for fork in forks}
+    tolerance = 0.02 * float(skeleton.radius.min())
+    for scale in (*_TRIES[1:], None):
+        solids = [fillet for fillet in fillets.values() if fillet is not None]
+        joined = _joined(surface, solids, tolerance)
+        if joined is not None and abs(joined.volume / surface.volume - 1) > VOLUME_CHANGE:
             break
-        joined = _joined(surface, collars, 0.02 * float(skeleton.radius.min()))
-        check = check_surface(joined)
-        if check.valid and abs(check.volume_m3 / surface.volume - 1) <= VOLUME_CHANGE:
-            return joined, check, _warnings(plain, len(made))
-        keep = [c for c in collars if not _reaches(c[0], check.crossings)]
-        if len(keep) == len(collars):
+        check = None if joined is None else check_surface(joined)
+        if check is not None and check.valid:
+            sharp = sum(fillet is None for fillet in fillets.values())
+            return joined, check, _warnings(sharp, len(forks))
+        wrong = [run for run, fillet in fillets.items() if fillet is not None
+                 and (check is None or _holds(fillet, check.crossings))]
+        if not wrong:
             break
-        plain += len(collars) - len(keep)
-        collars = keep
-    return surface, check_surface(surface), _warnings(len(made), len(made))
+        for run in wrong:
+            fillets[run] = None if scale is None else by_run[run].fillet(scale)
+    else:
+        joined = _joined(surface, [f for f in fillets.values() if f is not None], tolerance)
+        check = None if joined is None else check_surface(joined)
+        if check is not None and check.valid:
+            sharp = sum(fillet is None for fillet in fillets.values())
+            return joined, check, _warnings(sharp, len(forks))
+    return surface, check_surface(surface), _warnings(len(forks), len(forks))
 
 
 def crease_angles(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
@@ -83,100 +105,115 @@ def _warnings(plain: int, count: int) -> list[str]:
             "it or change its volume."] if plain else []
 
 
-def _reaches(vertices: np.ndarray, places: np.ndarray) -> bool:
-    if len(places) == 0:
-        return False
-    centre = vertices.mean(axis=0)
-    reach = np.linalg.norm(vertices - centre, axis=1).max()
-    return bool((np.linalg.norm(places - centre, axis=1) < 1.5 * reach).any())
+def _holds(fillet: Surface, places: np.ndarray) -> bool:
+    """Whether any of the places [m], shape [n, 3], lies in the box around a fillet."""
+    low, high = fillet.vertices.min(axis=0), fillet.vertices.max(axis=0)
+    margin = 0.1 * (high - low)
+    return bool(((places > low - margin) & (places < high + margin)).all(axis=1).any())
 
 
-def _collar(skeleton: Skeleton, run: int, sides: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices and faces of the collar of a twig; None if the twig ends within its parent."""
-    nodes = skeleton.runs()[run]
-    if len(nodes) < 2:
+@dataclass(frozen=True)
+class _Fork:
+    """A twig, what it grows out of, and the stretch of it where the two meet."""
+
+    run: int
+    twig: np.ndarray
+    others: tuple[np.ndarray, ...]
+    excess: np.ndarray
+    base: np.ndarray
+    rounding: float
+    axis: np.ndarray  # the stretch's points [m] and radii [m], shape [k, 4]
+    end: float  # where along the twig the fillet fades out, if the two do not part
+
+    def fillet(self, scale: float) -> Surface | None:
+        """The solid of the rounded union around the crease; None if there is no crease."""
+        step = scale * _STEP * self.rounding
+        reach = (self.axis[:, 3] + _REACH * self.rounding + 2 * step)[:, None]
+        # An odd shift: a lattice that lies in line with the axes meets the cylinders in edges.
+        low = (self.axis[:, :3] - reach).min(axis=0) - np.array([0.31, 0.17, 0.43]) * step
+        high = (self.axis[:, :3] + reach).max(axis=0)
+        near = 2 * _REACH * self.rounding
+        twig = near_box(self.twig, low, high, near)
+        others = [near_box(other, low, high, near) for other in self.others]
+        first = np.concatenate([[0], np.cumsum([len(other) for other in others])])
+        shape = np.array([self.rounding, _REACH, _RIM, _MARGIN, self.end])
+        stacked = np.vstack(others)
+
+        def level(points: np.ndarray) -> np.ndarray:
+            return fillet_level(np.ascontiguousarray(points), twig, stacked, first, self.excess,
+                                self.base, shape)
+
+        made = level_surface(level, low, high, step)
+        if len(made.faces) == 0:
+            return None
+        return largest_piece(solid(made.vertices, made.faces).simplify(
+            _COARSENED * self.rounding))
+
+
+def _forks(skeleton: Skeleton, spacing: float) -> list[_Fork]:
+    """Twigs that come out of their parents."""
+    excess = np.array([polygon_factor(sides) - 1 for sides in sides_of_runs(skeleton)])
+    runs = skeleton.runs()
+    axes = [run_axis(skeleton, run, spacing) for run in range(skeleton.branch_count)]
+    cones = [segments(*axis) for axis in axes]
+    points, radius = axes[0]
+    upwards = tangents(points)[0]
+    # A little over the root's flat cut, so that a fillet's end lies within the solid.
+    base = np.stack([points[0] + 0.05 * radius[0] * upwards, upwards])
+    carrier = [-1] + [int(skeleton.branch[members[0]]) for members in runs[1:]]
+    starts = np.array([axis[0][0] for axis in axes])
+    forks = []
+    for run in range(1, skeleton.branch_count):
+        parent = carrier[run]
+        reach = 4 * skeleton.radius[runs[run][0]]
+        near = [other for other in range(1, skeleton.branch_count)
+                if other != run and carrier[other] == parent
+                and np.linalg.norm(starts[other] - starts[run]) < reach]
+        others = [parent, *near, *([carrier[parent]] if carrier[parent] >= 0 else [])]
+        fork = _fork(run, axes[run], cones[run], tuple(cones[other] for other in others),
+                     excess[[run, *others]], base)
+        if fork is not None:
+            forks.append(fork)
+    return forks
+
+
+def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
+          others: tuple[np.ndarray, ...], excess: np.ndarray, base: np.ndarray) -> _Fork | None:
+    """Where a twig comes out of what it grows from; None if it stays within."""
+    along = np.append(twig[:, 8], twig[-1, 8] + twig[-1, 9])
+    count = max(int(4 * along[-1] / axis[1].mean()), 8)
+    place = np.linspace(0, along[-1], count + 1)
+    points = np.stack([np.interp(place, along, axis[0][:, k]) for k in range(3)], axis=1)
+    radius = np.interp(place, along, axis[1])
+    found = [distances(other, points) for other in others]
+    which = np.argmin([distance for distance, _ in found], axis=0)
+    outside = np.min([distance for distance, _ in found], axis=0)
+    if (outside + radius < 0).all():
         return None
-    points, radius = skeleton.nodes[nodes], skeleton.radius[nodes].copy()
-    radius[0] = min(radius[1], 0.95 * radius[0])
-    rounding = ROUNDING * radius[0]
-    points, radius = resample(points, radius, np.full(len(points), _STEP * radius[0]))
-    parent = _Tube(skeleton, int(skeleton.branch[nodes[0]]), _STEP * float(radius[0]))
-    tangent = tangents(points)
-    ring = rings(points, radius, *frames(points, tangent), sides)
-    to_parent = parent.distance(ring.reshape(-1, 3)).reshape(ring.shape[:2])
-    out = to_parent.min(axis=1) > 1.05 * rounding
-    count = int(np.argmax(out)) + 1
-    if not out.any() or count < 3:
-        return None
-    points, radius, ring = points[:count], radius[:count], ring[:count]
-    outwards = ring - points[:, None]
-    outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
-    lift = _lift(ring, outwards, parent, float(rounding)) - _BELOW * radius[0]
-    ring = ring + lift[:, :, None] * outwards
-    return _closed(ring, points)
+    leaving = np.flatnonzero(outside > 0)
+    at = leaving[0] if len(leaving) else count
+    thick = float(found[which[at]][1][at])
+    rounding = ROUNDING * min(float(radius[at]), thick)
+    reach = radius + _REACH * rounding
+    begin = np.flatnonzero(outside > -reach)[0]
+    clear = np.flatnonzero(outside[begin:] > reach[begin:])
+    end = begin + clear[0] if len(clear) else count
+    longest = place[begin] + _LONGEST * (radius[at] + thick)
+    fades = place[end] > longest
+    stretch = np.column_stack([points, radius])[begin:end + 1]
+    if fades:
+        stretch = stretch[place[begin:end + 1] <= longest + 2 * radius[at]]
+    return _Fork(run, twig, others, excess, base, rounding, stretch,
+                 float(longest) if fades else np.inf)
 
 
-def _lift(ring: np.ndarray, outwards: np.ndarray, parent: "_Tube", rounding: float) -> np.ndarray:
-    """Height [m] of the rounded union over the twig: where each ray leaves it first.
-
-    Rays that run on into the parent end there, a fillet's radius above the twig.
-    """
-    heights = np.linspace(0, rounding, 9)
-    points = ring + heights[:, None, None, None] * outwards
-    to_parent = parent.distance(points.reshape(-1, 3)).reshape(points.shape[:3])
-    depth = np.hypot((rounding - heights)[:, None, None],
-                     np.maximum(rounding - to_parent, 0)) - rounding
-    after = np.maximum((depth < 0).argmax(axis=0), 1)
-    high = np.take_along_axis(depth, after[None], axis=0)[0]
-    low = np.take_along_axis(depth, after[None] - 1, axis=0)[0]
-    share = np.clip(low / np.maximum(low - high, 1e-300), 0, 1)
-    leaves = (depth < 0).any(axis=0)
-    return np.where(leaves, heights[after - 1] + share * heights[1], rounding)
-
-
-class _Tube:
-    """Distances from a run's round cylinders."""
-
-    def __init__(self, skeleton: Skeleton, run: int, step: float):
-        nodes = skeleton.runs()[run]
-        radius = skeleton.radius[nodes].copy()
-        if run > 0 and len(radius) > 1:
-            radius[0] = radius[1]
-        points, self._radius = resample(skeleton.nodes[nodes], radius, np.full(len(nodes), step))
-        self._tree = cKDTree(points)
-
-    def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [m] of points from the surface, negative inside, shape [n]."""
-        distance, near = self._tree.query(points)
-        return distance - self._radius[near]
-
-
-def _closed(ring: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    count, sides = ring.shape[:2]
-    vertices = np.vstack([ring.reshape(-1, 3), centres[:1], centres[-1:]])
-    k = np.arange(sides)
-    after = (k + 1) % sides
-    start, end = count * sides, count * sides + 1
-    last = (count - 1) * sides
-    faces = [np.stack([np.full(sides, start), after, k], axis=1),
-             np.stack([last + k, last + after, np.full(sides, end)], axis=1)]
-    for low in range(0, last, sides):
-        high = low + sides
-        faces.append(np.stack([low + k, low + after, high + after], axis=1))
-        faces.append(np.stack([low + k, high + after, high + k], axis=1))
-    return vertices, np.vstack(faces)
-
-
-def _joined(surface: Surface, collars: list[tuple[np.ndarray, np.ndarray]], tolerance: float,
-            ) -> Surface:
+def _joined(surface: Surface, fillets: list[Surface], tolerance: float) -> Surface | None:
+    """The union of the cylinders and the fillets; None if that is empty."""
     import manifold3d
 
-    solids = [manifold3d.Manifold(manifold3d.Mesh64(
-        vert_properties=np.ascontiguousarray(vertices, np.float64),
-        tri_verts=np.ascontiguousarray(faces, np.uint64)))
-        for vertices, faces in [(surface.vertices, surface.faces), *collars]]
+    solids = [solid(part.vertices, part.faces) for part in (surface, *fillets)]
     joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).simplify(tolerance)
-    # Cavities between crossing twigs come out as pieces of negative volume: they are filled.
-    mesh = max(joined.decompose(), key=lambda piece: piece.volume()).to_mesh64()
-    return Surface(np.array(mesh.vert_properties, float)[:, :3].copy(),
-                   np.array(mesh.tri_verts, np.int64))
+    try:
+        return largest_piece(joined)
+    except MeshingError:
+        return None

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.surface import Surface
@@ -91,68 +90,23 @@ def crossings(surface: Surface) -> np.ndarray:
     Faces that share an edge are not compared; of faces that share a corner only the edges
     opposite to it are.
     """
-    pairs = _near_pairs(surface)
-    if len(pairs) == 0:
+    from limber.geometry.face_crossings import by_cell, pierced
+
+    if len(surface.faces) == 0:
         return np.empty((0, 3))
-    shared = (surface.faces[pairs[:, 0]][:, :, None] == surface.faces[pairs[:, 1]][:, None, :])
-    number = shared.sum(axis=(1, 2))
-    pairs, shared, number = pairs[number < 2], shared[number < 2], number[number < 2]
-    found = []
-    for one, other, common in ((0, 1, shared.any(axis=2)), (1, 0, shared.any(axis=1))):
-        for k in range(3):
-            # Edge k runs from corner k to the next; a corner in common lies on both faces.
-            touches = common[:, k] | common[:, (k + 1) % 3]
-            use = pairs[~touches]
-            start = surface.vertices[surface.faces[use[:, one], k]]
-            end = surface.vertices[surface.faces[use[:, one], (k + 1) % 3]]
-            corner = surface.vertices[surface.faces[use[:, other]]]
-            found.append(_pierced(start, end, corner))
-    return np.vstack(found)
-
-
-def _near_pairs(surface: Surface) -> np.ndarray:
-    """Pairs of faces whose boxes overlap, shape [p, 2]; faces are grouped by size."""
-    corner = surface.vertices[surface.faces]
+    faces = np.ascontiguousarray(surface.faces, np.int64)
+    corner = surface.vertices[faces]
     low, high = corner.min(axis=1), corner.max(axis=1)
-    centre, reach = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
-    level = np.floor(np.log2(np.maximum(reach, 1e-12))).astype(int)
-    groups = [np.flatnonzero(level == value) for value in np.unique(level)]
-    trees = [cKDTree(centre[group]) for group in groups]
-    found = []
-    for a, small in enumerate(groups):
-        for b in range(a, len(groups)):
-            large = groups[b]
-            near = trees[b].query_ball_point(
-                centre[small], reach[small] + reach[large].max())
-            sizes = np.array([len(hits) for hits in near])
-            if sizes.sum() == 0:
-                continue
-            first = np.repeat(small, sizes)
-            second = large[np.concatenate([np.asarray(h, np.int64) for h in near if len(h)])]
-            keep = (first < second) if a == b else np.ones(len(first), bool)
-            keep &= ((low[first] <= high[second]) & (low[second] <= high[first])).all(axis=1)
-            found.append(np.stack([first[keep], second[keep]], axis=1))
-    return np.vstack(found) if found else np.empty((0, 2), np.int64)
-
-
-def _pierced(start: np.ndarray, end: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """Points where segments go properly through triangles (Moeller and Trumbore 1997)."""
-    direction = end - start
-    first, second = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    across = np.cross(direction, second)
-    det = np.einsum("ij,ij->i", first, across)
-    size = np.linalg.norm(direction, axis=1) * np.linalg.norm(np.cross(first, second), axis=1)
-    slanted = np.abs(det) > 1e-9 * size
-    safe = np.where(slanted, det, 1.0)
-    offset = start - corner[:, 0]
-    u = np.einsum("ij,ij->i", offset, across) / safe
-    turned = np.cross(offset, first)
-    v = np.einsum("ij,ij->i", direction, turned) / safe
-    t = np.einsum("ij,ij->i", second, turned) / safe
-    # Touching is not crossing: the union's faces meet at rounding distance.
-    edge = 1e-7
-    inside = (u > edge) & (v > edge) & (u + v < 1 - edge) & (t > edge) & (t < 1 - edge) & slanted
-    return start[inside] + t[inside, None] * direction[inside]
+    extent = (high - low).max(axis=1)
+    # A cell holds a few faces, and a face lies in few cells.
+    cell = max(1.5 * float(np.median(extent)), float(extent.max()) / 24, 1e-12)
+    first = np.floor((low - low.min(axis=0)) / cell).astype(np.int64)
+    last = np.floor((high - low.min(axis=0)) / cell).astype(np.int64)
+    counts = last.max(axis=0) + 1
+    keys, owner = by_cell(first, last, counts)
+    order = np.argsort(keys, kind="stable")
+    return pierced(np.ascontiguousarray(surface.vertices, np.float64), faces, low, high, first,
+                   counts, keys[order], owner[order])
 
 
 def _place(point: np.ndarray) -> str:

@@ -1,5 +1,6 @@
 """Radius-adaptive generalised cylinders along a skeleton, joined at forks into one surface."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +20,20 @@ class Tube:
     centres: np.ndarray
     radius: np.ndarray
     tangent: np.ndarray
+    flat_start: bool
 
 
-def branch_surface(skeleton: Skeleton, *, sides: int = 12, spacing: float = 1.5) -> Surface:
+SPACING = 1.5
+"""Distance of cross-sections in local radii."""
+
+_SIDES, _MOST_SIDES = 12, 48
+_CAP = np.deg2rad([35.0, 65.0])  # where the rings of a rounded end lie on its half sphere
+_CORNER = np.deg2rad(30.0)
+_FACET = 0.025  # how far a carrier's facets may be off its circle, in radii of its thinnest twig
+
+
+def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: float = SPACING,
+                   ) -> Surface:
     """Sweep a tube along each run and join them: watertight, rounded tips, a flat base.
 
     Circular cross-sections orthogonal to the tangent, as in the paper's section on the
@@ -29,16 +41,18 @@ def branch_surface(skeleton: Skeleton, *, sides: int = 12, spacing: float = 1.5)
 
     Args:
         skeleton: Axes and radii.
-        sides: Sides of a cross-section; the polygon has the circle's area.
+        sides: Sides of a cross-section; the polygon has the circle's area. None: 12, and more
+            on thick runs that carry thin twigs.
         spacing: Distance of cross-sections in local radii.
 
     Raises:
         MeshingError: the union is empty or in several pieces.
     """
     tubes = {run: tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
+    count = sides_of_runs(skeleton) if sides is None else [sides] * skeleton.branch_count
     in_pieces: set[int] = set()
     for _ in range(4):
-        surface = _union(tubes, in_pieces, sides, 0.02 * float(skeleton.radius.min()))
+        surface = _union(tubes, in_pieces, count, 0.02 * float(skeleton.radius.min()))
         places = crossings(surface)
         more = _runs_near(tubes, places) - in_pieces
         if not more:
@@ -49,19 +63,39 @@ def branch_surface(skeleton: Skeleton, *, sides: int = 12, spacing: float = 1.5)
     return surface
 
 
-def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: int, tolerance: float,
+def sides_of_runs(skeleton: Skeleton) -> list[int]:
+    """Sides of each run's cross-section, so many that the facets do not show beside a twig."""
+    sides = [_SIDES] * skeleton.branch_count
+    for members in skeleton.runs()[1:]:
+        carrier = int(skeleton.branch[members[0]])
+        ratio = skeleton.radius[members[0]] / max(skeleton.radius[members[1]], 1e-300)
+        # polygon_factor(n) is about 1 + pi^2 / (3 n^2).
+        wanted = 2 * int(np.ceil(np.pi * np.sqrt(ratio / (3 * _FACET)) / 2))
+        sides[carrier] = min(max(sides[carrier], wanted), _MOST_SIDES)
+    return sides
+
+
+def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: list[int], tolerance: float,
            ) -> Surface:
     import manifold3d
 
     solids = []
     for run, parts in tubes.items():
         for tube in parts:
-            vertices, faces = tube_triangles(tube, sides)
-            solids += _pieces(tube, vertices, sides) if run in in_pieces else [
-                _solid(vertices, faces)]
+            vertices, faces = tube_triangles(tube, sides[run])
+            solids += _pieces(tube, vertices, sides[run]) if run in in_pieces else [
+                solid(vertices, faces)]
     joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add)
     # Where tubes cross, the union leaves slivers far below any size that matters.
-    joined = joined.simplify(tolerance)
+    return largest_piece(joined.simplify(tolerance))
+
+
+def largest_piece(joined) -> Surface:
+    """The surface of a union's largest piece.
+
+    Raises:
+        MeshingError: it is empty.
+    """
     pieces = joined.decompose()
     if not pieces:
         raise MeshingError("The union of the cylinders is empty.", "Radii may be zero.",
@@ -77,11 +111,12 @@ def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: int, tolera
 def _pieces(tube: Tube, vertices: np.ndarray, sides: int) -> list:
     import manifold3d
 
-    ring_count = (len(vertices) - 2) // sides
-    ring = vertices[:-2].reshape(ring_count, sides, 3)
-    ends = len(tube.centres) - 1
-    hulls = [np.vstack([ring[i], ring[i + 1]]) for i in range(ends - 1)]
-    hulls.append(np.vstack([ring[ends - 1:].reshape(-1, 3), vertices[-1:]]))
+    ring = vertices[:-2].reshape(-1, sides, 3)
+    begin = 0 if tube.flat_start else len(_CAP)
+    end = len(ring) - 1 - len(_CAP)
+    hulls = [np.vstack([ring[i], ring[i + 1]]) for i in range(begin, end)]
+    hulls[0] = np.vstack([*ring[:begin], hulls[0], vertices[-2:-1]])
+    hulls[-1] = np.vstack([hulls[-1], *ring[end + 1:], vertices[-1:]])
     return [manifold3d.Manifold.hull_points(np.ascontiguousarray(hull)) for hull in hulls]
 
 
@@ -98,7 +133,16 @@ def _runs_near(tubes: dict[int, list[Tube]], places: np.ndarray) -> set[int]:
 
 
 def tubes_of_run(skeleton: Skeleton, run: int, spacing: float) -> list[Tube]:
-    """Return run ``run`` as a tube, or as several overlapping ones where it bends too sharply.
+    """Return run ``run`` as a tube, or as several overlapping ones where it bends too sharply."""
+    points, radius = run_axis(skeleton, run, spacing)
+    # A round start there would bulge out of the flat cut at the root.
+    at_root = np.linalg.norm(points[0] - skeleton.nodes[0]) < 1.2 * skeleton.radius[0]
+    return [Tube(p, r, tangents(p), flat_start=bool(at_root and part == 0))
+            for part, (p, r) in enumerate(_split_at_bends(points, radius))]
+
+
+def run_axis(skeleton: Skeleton, run: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Axis [m], shape [k, 3], and radii [m] of a run, ``spacing`` radii from point to point.
 
     A side run starts on its parent's axis, with a radius that stays inside the parent.
     """
@@ -112,21 +156,24 @@ def tubes_of_run(skeleton: Skeleton, run: int, spacing: float) -> list[Tube]:
         middle = np.linspace(0, 1, 3)[:, None]
         points = points[0] + middle * (points[-1] - points[0])
         radius = np.linspace(radius[0], radius[-1], 3)
-    return [Tube(p, r, tangents(p)) for p, r in _split_at_folds(points, radius)]
+    return points, radius
 
 
 def tube_triangles(tube: Tube, sides: int) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of a tube with a flat start and a rounded end: vertices [m], faces."""
+    """Triangles of a tube with a rounded end and start, or a flat start: vertices [m], faces."""
     normals, binormals = frames(tube.centres, tube.tangent)
-    tip_centres, tip_radius = _tip(tube)
-    tip_count = len(tip_radius)
-    centres = np.vstack([tube.centres, tip_centres])
-    radius = np.concatenate([tube.radius, tip_radius])
-    normals = np.vstack([normals, np.repeat(normals[-1:], tip_count, axis=0)])
-    binormals = np.vstack([binormals, np.repeat(binormals[-1:], tip_count, axis=0)])
-    ring = rings(centres, radius, normals, binormals, sides).reshape(-1, 3)
-    apex = tube.centres[-1] + tube.tangent[-1] * tube.radius[-1]
-    vertices = np.vstack([ring, tube.centres[:1], apex[None]])
+    centres, radius = tube.centres, tube.radius
+    before = 0 if tube.flat_start else len(_CAP)
+    over, under = np.sin(_CAP), np.cos(_CAP)
+    ahead, back = (tube.radius[k] * tube.tangent[k] for k in (-1, 0))
+    centres = np.vstack([centres[0] - over[::-1][:before, None] * back, centres,
+                         centres[-1] + over[:, None] * ahead])
+    radius = np.concatenate([radius[0] * under[::-1][:before], radius, radius[-1] * under])
+    ends = ((before, len(_CAP)), (0, 0))
+    ring = rings(centres, radius, np.pad(normals, ends, "edge"), np.pad(binormals, ends, "edge"),
+                 sides).reshape(-1, 3)
+    start_point = tube.centres[0] - (0 if tube.flat_start else 1) * back
+    vertices = np.vstack([ring, start_point, tube.centres[-1] + ahead])
     start, end = len(ring), len(ring) + 1
     k = np.arange(sides)
     after = (k + 1) % sides
@@ -140,11 +187,15 @@ def tube_triangles(tube: Tube, sides: int) -> tuple[np.ndarray, np.ndarray]:
     return vertices, np.vstack(faces)
 
 
-def _tip(tube: Tube) -> tuple[np.ndarray, np.ndarray]:
-    """Rings of the rounded end, between the last cross-section and the apex."""
-    angle = np.deg2rad([35.0, 65.0])
-    centres = tube.centres[-1] + tube.radius[-1] * np.sin(angle)[:, None] * tube.tangent[-1]
-    return centres, tube.radius[-1] * np.cos(angle)
+def _split_at_bends(points: np.ndarray, radius: np.ndarray,
+                    ) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Cut a run at its corners, where a mitre would lie inside the round cylinders' ball."""
+    step = np.diff(points, axis=0)
+    step /= np.maximum(np.linalg.norm(step, axis=1), 1e-300)[:, None]
+    corners = 1 + np.flatnonzero(np.einsum("ij,ij->i", step[1:], step[:-1]) < np.cos(_CORNER))
+    ends = [0, *corners.tolist(), len(points) - 1]
+    return [part for low, high in itertools.pairwise(ends)
+            for part in _split_at_folds(points[low:high + 1], radius[low:high + 1])]
 
 
 def _split_at_folds(points: np.ndarray, radius: np.ndarray,
@@ -170,7 +221,12 @@ def _split_at_folds(points: np.ndarray, radius: np.ndarray,
     return [part for part in parts if len(part[0]) > 1]
 
 
-def _solid(vertices: np.ndarray, faces: np.ndarray):
+def solid(vertices: np.ndarray, faces: np.ndarray):
+    """A solid of manifold3d.
+
+    Raises:
+        MeshingError: the triangles do not close one.
+    """
     import manifold3d
 
     solid = manifold3d.Manifold(manifold3d.Mesh64(
