@@ -63,7 +63,7 @@ def test_incomplete_rows_are_dropped_with_a_word(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("force (N),displacement (mm)\n" + rows + "0.9")
     way, _, warnings = read_force_displacement(path)
-    assert len(way) == 8 and "incomplete" in warnings[0]
+    assert len(way) == 8 and "unfinished" in warnings[0]
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the recorded cane pushes are not here")

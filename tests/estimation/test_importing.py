@@ -12,9 +12,9 @@ from limber.estimation.importing import (
     ImportSettings,
     import_pull,
     markers_from_c3d,
-    rigid_fit,
 )
 from limber.estimation.recording import read_pull, write_pull
+from limber.estimation.registration import rigid_fit
 from limber.estimation.streams import Stream, read_stream, write_stream
 from limber.perception.camera import D455, read_camera, write_camera
 from limber.perception.observe import list_frames, read_depth, write_depth

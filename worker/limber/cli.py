@@ -35,6 +35,7 @@ COMMANDS = {
     "import-pull": "Bring a recording of a pull into the branch folder.",
     "virtual-pull": "Simulate a pull with a known Young's modulus and sensor noise.",
     "estimate": "Young's modulus along the branch, from pulls.",
+    "predict": "Where a branch rests under another load, with its estimated modulus.",
     "energy": "Energy field over grasp poses.",
     "plan": "Paths to a goal: RRT* and deformation-aware D-RRT*, compared.",
     "report": "One self-contained HTML page with figures and tables of all results.",

@@ -11,11 +11,11 @@ import numpy as np
 
 from limber.estimation.alignment import Frames
 from limber.estimation.estimate import fit_pulls
-from limber.estimation.importing import rigid_fit
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.quasi_static import QuasiStaticForward
 from limber.estimation.recording import GraspEntry, PullEntry, SensorEntry
+from limber.estimation.registration import rigid_fit
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.streams import read_stream
 from limber.geometry.tet_mesh import TetMesh

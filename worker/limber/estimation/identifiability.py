@@ -70,15 +70,14 @@ def tie_unresolved(evaluation: Evaluation, space: ParameterSpace,
     Returns the space, with a sentence for each tie.
     """
     messages = []
-    full = _per_point(evaluation.jacobian, space)
+    columns, others = np.split(evaluation.jacobian.copy(), [space.group_count], axis=1)
     while space.group_count > 1:
-        count = space.group_count
-        jacobian = np.hstack([full[0] @ space.membership, full[1]])
-        deviations = _deviations(jacobian)[:count]
+        deviations = _deviations(np.hstack([columns, others]))[:space.group_count]
         worst = int(np.argmax(deviations))
         if deviations[worst] <= TIE_DEVIATION:
             break
-        partner = worst - 1 if worst == count - 1 or (
+        last = space.group_count - 1
+        partner = worst - 1 if worst == last or (
             worst > 0 and deviations[worst - 1] >= deviations[worst + 1]) else worst + 1
         low, high = sorted((worst, partner))
         names = space.names
@@ -86,14 +85,11 @@ def tie_unresolved(evaluation: Evaluation, space: ParameterSpace,
             f"{names[worst]} cannot be told from these pulls (its logarithm only to within "
             f"{deviations[worst]:.1f}); it was tied to {names[partner]}. Pull at a point farther "
             "out, or let gravity bend the tip, to tell them apart.")
+        # A common change of two logarithms acts as the sum of both.
+        columns[:, low] += columns[:, high]
+        columns = np.delete(columns, high, axis=1)
         space = space.tied(tuple(low if group == high else group for group in space.groups))
     return space, messages
-
-
-def _per_point(jacobian: np.ndarray, space: ParameterSpace) -> tuple[np.ndarray, np.ndarray]:
-    if space.group_count != len(space.groups):
-        raise ValueError("ties are decided on a space without ties")
-    return jacobian[:, :space.group_count], jacobian[:, space.group_count:]
 
 
 def _deviations(jacobian: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Recordings of other programs into ``pulls/NAME``: marker tables, C3D, clouds, RGB-D folders."""
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -7,12 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
 from limber.estimation.alignment import estimate_offset
-from limber.estimation.checks import FORCE_UNITS_N, clean
+from limber.estimation.checks import clean
 from limber.estimation.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
+from limber.estimation.hung_load import settled
+from limber.estimation.importing_frames import copy_clouds, copy_rgbd
 from limber.estimation.recording import (
     POSE_COLUMNS,
     WRENCH_COLUMNS,
@@ -25,12 +27,19 @@ from limber.estimation.recording import (
     write_entry,
     write_pull,
 )
-from limber.estimation.streams import Stream, read_stream
-from limber.perception.camera import Camera, read_camera, write_camera
+from limber.estimation.registration import Registration, read_nominal, register
+from limber.estimation.streams import Stream
+from limber.estimation.tables import (
+    LENGTH_UNITS_M,
+    marker_stream,
+    read_table,
+    robot_stream,
+    split_title,
+    with_columns,
+)
 from limber.progress import SILENT, Progress
 from limber.store import Branch, file_digest
 
-LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement"]
 
 
@@ -40,28 +49,50 @@ class ImportSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Kind = Field("auto", description="What SOURCE is; auto goes by its name and content.")
-    robot: str | None = Field(None, description="CSV of the gripper: t_s, pose and wrench.")
-    unit: Literal["m", "cm", "mm"] = Field("m", description="Unit of positions in SOURCE.")
-    force_unit: Literal["N", "gf", "mN", "lbf", "kgf", "kN"] = Field(
-        "N", description="Unit of forces in the robot's table.")
+    robot: str | None = Field(None, description="CSV of the gripper: time, pose and wrench.")
+    unit: Literal["m", "cm", "mm"] | None = Field(
+        None, description="Unit of positions in SOURCE; without it that of the columns' names, "
+        "else metres.")
+    force_unit: Literal["N", "gf", "mN", "lbf", "kgf", "kN"] | None = Field(
+        None, description="Unit of forces; without it that of the columns' names, else newtons.")
     rate_hz: float | None = Field(
-        None, gt=0, description="Frames a second, where file names are mere numbers.")
+        None, gt=0, description="Frames a second, where SOURCE has no time stamps.")
     nominal: str | None = Field(
-        None, description="CSV label,x_m,y_m,z_m: the markers at rest in the branch's frame; the "
-        "recording's first frame is fitted to it.")
+        None, description="CSV label,x_m,y_m,z_m: the markers' places on the branch at rest; the "
+        "recording's first frames are fitted to it rigidly.")
+    coordinates: Literal["branch", "scan"] = Field(
+        "branch", description="Frame of --nominal, --grasp-point and --load: the branch folder's, "
+        "or that of the file it was made from.")
     grasp_point: tuple[float, float, float] | None = Field(
-        None, description="Where the gripper holds, at rest [m]; else the robot's first pose.")
+        None, description="Where the gripper holds or the load hangs, at rest [m]; else the "
+        "robot's first pose.")
     grasp_radius: float = Field(0.01, gt=0, description="Radius of the grasp patch [m].")
     grasp_mode: Literal["clamped", "pinned"] = Field(
         "clamped", description="clamped: the gripper also turns the branch.")
+    weight: float | None = Field(
+        None, ge=0, description="No robot, but a weight of so many newtons that hangs at "
+        "--grasp-point: SOURCE shows the branch without it first, at rest under it last.")
+    load: tuple[float, float, float] | None = Field(
+        None, description="The same for a steady force in any direction [N].")
+    own_weight: bool = Field(
+        False, description="The branch's own weight is not in its shape at rest (it was held up, "
+        "or scanned lying): it acts as well.")
     drive: Literal["pose", "force"] = Field(
         "pose", description="What drives the simulation; the other is compared with it.")
     motion: Literal["quasi_static", "dynamic"] = Field(
         "quasi_static", description="dynamic where inertia matters.")
     time_offset: float | None = Field(
         None, description="Added to SOURCE's time stamps [s]; without it, it is estimated.")
-    position_sigma: float = Field(1e-3, gt=0, description="Noise of positions [m].")
+    position_sigma: float | None = Field(
+        None, gt=0, description="Noise of positions [m]; without it 1 mm, under a steady load "
+        "what the recording shows.")
     force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
+    yolo_weights: str | None = Field(
+        None, description="Weights file of a YOLO segmentation model of your own, for masks of "
+        "an RGB-D folder's colour images (needs ultralytics).")
+    yolo_prompt: str | None = Field(
+        None, description="What it shall look for, for open-vocabulary models.")
+    yolo_class: str | None = Field(None, description="Which of its classes is the branch.")
 
 
 def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
@@ -70,7 +101,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     """Bring a recording into ``pulls/NAME`` of a branch folder.
 
     Returns:
-        ``pull``, ``kind``, ``frame_count``, ``point_count``, ``time_offset_s``; of a force table
+        ``pull``, ``kind``, ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
+        load ``displacement_m``, ``settled_s`` and ``registration_rms_m``; of a force table
         ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
     Raises:
@@ -82,8 +114,10 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     kind = _guess(source) if settings.kind == "auto" else settings.kind
     branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
     key, digests = f"pull:{name}", {"source": _digest(source)}
-    if settings.robot:
-        digests["robot"] = _digest(Path(settings.robot))
+    for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
+                          ("yolo", settings.yolo_weights)):
+        if named and Path(named).is_file():
+            digests[key_of] = _digest(Path(named))
     if not force and branch.is_current(key, settings, digests=digests):
         return branch.manifest.stages[key].result
     with branch.stage(key, settings, digests=digests) as stage:
@@ -93,9 +127,12 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
         folder = stage.path(prefix + "pull.toml").parent
         progress(0.1, f"reading {kind}")
         if kind == "force-displacement":
-            stage.result.update(_import_force_table(source, folder, warn))
+            stage.result.update(_import_force_table(source, folder, settings, warn))
+        elif settings.weight is not None or settings.load is not None:
+            stage.result.update(_import_load(kind, source, folder, name, settings, branch, warn))
         else:
-            stage.result.update(_import_motion(kind, source, folder, name, settings, warn))
+            stage.result.update(_import_motion(kind, source, folder, name, settings, branch,
+                                               warn, progress.part(0.1, 1.0)))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
 
@@ -129,15 +166,6 @@ def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
     return Stream(times, positions.reshape(len(times), -1), names), labels[:positions.shape[1]]
 
 
-def rigid_fit(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] that take ``points`` onto ``target`` (Kabsch), [n, 3]."""
-    centre, goal = points.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((points - centre).T @ (target - goal))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
-    turn = right.T @ flip @ left.T
-    return turn, goal - turn @ centre
-
-
 def _guess(source: Path) -> str:
     if source.is_dir():
         if (source / "pull.toml").exists():
@@ -147,9 +175,13 @@ def _guess(source: Path) -> str:
         return "clouds"
     if source.suffix.lower() == ".c3d":
         return "c3d"
-    header = source.read_text(encoding="utf-8-sig", errors="replace").split("\n", 1)[0].lower()
-    by_force = "displacement" in header and ("force" in header or "load" in header)
-    return "force-displacement" if by_force else "markers"
+    try:
+        names = [split_title(title).name.lower() for title in read_table(source).titles]
+    except InputError:
+        return "markers"
+    moved = any(re.search(r"displacement|travel|stroke|deflection", name) for name in names)
+    forced = any(re.search(r"force|load", name) for name in names)
+    return "force-displacement" if moved and forced else "markers"
 
 
 def _digest(path: Path) -> str:
@@ -164,8 +196,10 @@ def _digest(path: Path) -> str:
     return joined.hexdigest()
 
 
-def _import_force_table(source: Path, folder: Path, warn: Any) -> dict[str, Any]:
-    displacement, force, warnings = read_force_displacement(source)
+def _import_force_table(source: Path, folder: Path, settings: ImportSettings, warn: Any,
+                        ) -> dict[str, Any]:
+    displacement, force, warnings = read_force_displacement(
+        source, unit=settings.unit, force_unit=settings.force_unit)
     found = force_slope(displacement, force, warnings=warnings)
     for message in found.warnings:
         warn(message)
@@ -174,172 +208,161 @@ def _import_force_table(source: Path, folder: Path, warn: Any) -> dict[str, Any]
     np.savetxt(folder / "force.csv", table, "%.9g", ",", header="displacement_m,force_n",
                comments="")
     return {"slope_n_per_m": found.slope, "slope_interval_n_per_m": list(found.interval),
-            "contact_m": found.contact, "baseline_n": found.baseline,
-            "stiffening": found.stiffening, "frame_count": len(force),
-            "why_no_modulus": WHY_NO_MODULUS}
+            "contact_m": found.contact, "contact_seen": found.contact_seen,
+            "baseline_n": found.baseline, "stiffening": found.stiffening,
+            "slips_m": list(found.slips), "slope_before_slip_n_per_m": found.slope_before_slip,
+            "return_slope_n_per_m": found.return_slope, "energy_lost": found.energy_lost,
+            "frame_count": len(force), "why_no_modulus": WHY_NO_MODULUS}
 
 
 def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                   warn: Any) -> dict[str, Any]:
+                   branch: Branch, warn: Any, progress: Progress) -> dict[str, Any]:
     if kind == "pull":
         shutil.copytree(source, folder, dirs_exist_ok=True)
         pull = read_pull(folder)
     else:
-        pull = _assembled(kind, source, folder, name, settings)
+        pull = _assembled(kind, source, folder, name, settings, branch, progress)
         write_pull(folder, pull)
     cleaned = clean(pull)
     for message in cleaned.warnings:
         warn(message)
     entry = pull.entry
     if kind != "pull" and settings.time_offset is None and cleaned.observations is not None:
-        offset, sigma = estimate_offset(cleaned)
-        if sigma < 0.02:
-            entry = entry.model_copy(update={"time_offset_s": offset})
-            write_entry(folder / "pull.toml", entry)
-        else:
-            warn(f"{name}: the clocks' offset cannot be told from this pull; 0 was taken.")
+        entry = _with_offset(cleaned, warn)
+        write_entry(folder / "pull.toml", entry)
     seen = cleaned.observations
     return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
             "point_count": seen.point_count if seen is not None else 0,
             "time_offset_s": entry.time_offset_s}
 
 
-def _assembled(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings) -> Pull:
-    observations, rest, labels = None, None, None
+def _with_offset(pull: Pull, warn: Any) -> PullEntry:
+    """The pull's entry with the clocks' offset, as far as the recording tells it."""
+    seen, offset = pull.observations.times, 0.0
+    if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
+        offset = float(pull.times[0] - seen[0])
+        warn(f"{pull.name}: the two clocks have no moment in common; the recordings were taken to "
+             "start together, and the offset was estimated from there.")
+    entry = pull.entry.model_copy(update={"time_offset_s": offset})
+    found, sigma = estimate_offset(replace(pull, entry=entry))
+    if sigma < 0.02:
+        return entry.model_copy(update={"time_offset_s": found})
+    warn(f"{pull.name}: the clocks' offset cannot be told from this pull; {offset:g} s was taken.")
+    return entry
+
+
+def _import_load(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
+                 branch: Branch, warn: Any) -> dict[str, Any]:
+    """A pull of a few frames from a recording of a branch that a steady load bends."""
+    if kind not in ("markers", "c3d"):
+        raise InputError(f"A steady load was given, but {source.name} is {kind}.",
+                         "Its rest is found in marker tracks.", "Give a CSV or C3D of markers.")
+    if settings.weight is not None and settings.load is not None:
+        raise InputError("Both --weight and --load were given.", "One load hangs on the branch.",
+                         "Give one of them.")
+    if settings.grasp_point is None:
+        raise InputError("A load was given, but not where it hangs.",
+                         "How far it bends the branch depends on that.", "Give --grasp-point.")
+    seen, labels = _markers(kind, source, settings)
+    for message in seen.warnings:
+        warn(message)
+    still = settled(Observations(seen.times, seen.values.reshape(len(seen), -1, 3)), name)
+    placed = _registered(still.rest, labels, name, settings, branch)
+    used = placed.used if placed else np.flatnonzero(np.isfinite(still.rest).all(axis=1))
+    rest, positions = still.rest[used], still.positions[:, used]
+    if placed:
+        rest, positions = placed.apply(rest), placed.apply(positions)
+    for message in (*still.warnings, *(placed.warnings if placed else ())):
+        warn(message)
+    sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
+    load = _load(settings, branch)
+    entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
+                   grasp=_place(settings.grasp_point, settings, branch), sigma=sigma)
+    poses = np.zeros((2, 6))
+    poses[:, :3] = entry.grasp.point_m
+    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
+    write_pull(folder, Pull(name, entry, still.times[[0, -1]], poses, wrenches,
+                            Observations(still.times, positions)))
+    moved = positions[-1] - rest
+    return {"frame_count": len(still.times), "point_count": len(used), "time_offset_s": 0.0,
+            "labels": [labels[k] for k in used], "load_n": load.tolist(),
+            "displacement_m": moved.tolist(), "settled_s": still.duration,
+            "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
+
+
+def _load(settings: ImportSettings, branch: Branch) -> np.ndarray:
+    """Force on the branch [N] in the branch's frame, shape [3]."""
+    if settings.load is None:
+        down = np.array(branch.gravity)
+        return settings.weight * down / np.linalg.norm(down)
+    turn = np.array(branch.manifest.alignment.rotation)
+    return turn @ settings.load if settings.coordinates == "scan" else np.array(settings.load)
+
+
+def _place(point: tuple[float, float, float], settings: ImportSettings, branch: Branch,
+           ) -> tuple[float, float, float]:
+    """A point [m] of the user's frame in the branch's."""
+    x, y, z = _in_branch(np.array([point]), settings, branch)[0]
+    return float(x), float(y), float(z)
+
+
+def _in_branch(points: np.ndarray, settings: ImportSettings, branch: Branch) -> np.ndarray:
+    alignment = branch.manifest.alignment
+    return alignment.apply(points / alignment.scale) if settings.coordinates == "scan" else points
+
+
+def _markers(kind: str, source: Path, settings: ImportSettings) -> tuple[Stream, list[str]]:
+    if kind == "c3d":
+        return markers_from_c3d(source)
+    return marker_stream(source, settings.unit, settings.rate_hz)
+
+
+def _registered(rest: np.ndarray, labels: list[str], name: str, settings: ImportSettings,
+                branch: Branch) -> Registration | None:
+    if settings.nominal is None:
+        return None
+    known, nominal = read_nominal(Path(settings.nominal))
+    return register(rest, labels, known, _in_branch(nominal, settings, branch), name)
+
+
+def _assembled(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
+               branch: Branch, progress: Progress) -> Pull:
+    observations, rest, messages = None, None, []
     if kind in ("markers", "c3d"):
-        stream, labels = (markers_from_c3d(source) if kind == "c3d" else
-                          (read_stream(source), None))
-        scale = 1.0 if kind == "c3d" else LENGTH_UNITS_M[settings.unit]
-        labels = labels or [column.rsplit("_x", 1)[0] for column in stream.columns[::3]]
-        observations = Observations(stream.times,
-                                    stream.values.reshape(len(stream), -1, 3) * scale)
-        if settings.nominal:
-            observations, rest = _onto_nominal(observations, labels, Path(settings.nominal))
+        stream, labels = _markers(kind, source, settings)
+        messages += stream.warnings
+        observations = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
+        placed = _registered(observations.positions[0], labels, name, settings, branch)
+        if placed:
+            moved = placed.apply(observations.positions[:, placed.used])
+            observations, rest = replace(observations, positions=moved), moved[0]
+            messages += placed.warnings
     else:
-        copy = _copy_rgbd if kind == "rgbd" else _copy_clouds
-        copy(source, folder, settings)
-    times, poses, wrenches, warnings = _robot(settings, observations, rest)
-    grasp = settings.grasp_point or tuple(float(x) for x in poses[0, :3])
-    entry = PullEntry(
-        observation={"rgbd": "depth", "clouds": "clouds"}.get(kind, "markers"),
-        drive=settings.drive, motion=settings.motion,
-        time_offset_s=settings.time_offset or 0.0, source=source.name,
-        grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=settings.grasp_mode),
-        sensor=SensorEntry(position_sigma_m=settings.position_sigma,
-                           force_sigma_n=settings.force_sigma),
-        rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))
-    return Pull(name, entry, times, poses, wrenches, observations, warnings)
-
-
-def _robot(settings: ImportSettings, observations: Observations | None, rest: np.ndarray | None,
-           ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
+        copy = copy_rgbd if kind == "rgbd" else copy_clouds
+        messages += copy(source, folder, settings, progress)
     if settings.robot is None:
         raise InputError("No robot table was given.",
                          "A pull needs what the gripper did: pose, and force where measured.",
-                         "Give it with --robot ROBOT.csv.")
-    stream = read_stream(settings.robot)
-    missing = [column for column in POSE_COLUMNS if column not in stream.columns]
-    if missing:
-        raise InputError(f"{settings.robot} lacks {', '.join(missing)}.",
-                         "The gripper's pose in the branch's frame is needed.",
-                         f"Columns: t_s, {', '.join(POSE_COLUMNS + WRENCH_COLUMNS)}.")
-    scale = 1.0 if settings.force_unit == "N" else FORCE_UNITS_N[settings.force_unit]
-    values = {column: stream.values[:, stream.columns.index(column)] for column in stream.columns}
-    poses = np.column_stack([values[column] for column in POSE_COLUMNS])
-    empty = np.full(len(stream), np.nan)
-    wrenches = scale * np.column_stack([values.get(column, empty) for column in WRENCH_COLUMNS])
-    return stream.times, poses, wrenches, stream.warnings
+                         "Give it with --robot ROBOT.csv; a hung weight with --weight.")
+    robot = robot_stream(settings.robot, settings.force_unit, settings.rate_hz)
+    messages += robot.warnings
+    poses = with_columns(robot, POSE_COLUMNS).values
+    wrenches = with_columns(robot, WRENCH_COLUMNS).values
+    grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
+             else tuple(float(x) for x in poses[np.isfinite(poses).all(axis=1)][0, :3]))
+    observation = {"rgbd": "depth", "clouds": "clouds"}.get(kind, "markers")
+    entry = _entry(observation, source, settings, branch, rest, drive=settings.drive,
+                   mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
+    return Pull(name, entry, robot.times, poses, wrenches, observations, tuple(messages))
 
 
-def _onto_nominal(observations: Observations, labels: list[str], path: Path,
-                  ) -> tuple[Observations, np.ndarray]:
-    rows = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()[1:] if line]
-    nominal = {row[0].strip(): [float(x) for x in row[1:4]] for row in rows}
-    shared = [k for k, label in enumerate(labels) if label in nominal]
-    if len(shared) < 3:
-        raise InputError(f"{path} names {', '.join(nominal)}; the recording {', '.join(labels)}.",
-                         "Three markers in common are needed for a rigid fit.",
-                         "Use the recording's labels.")
-    first = observations.positions[0, shared]
-    turn, shift = rigid_fit(first, np.array([nominal[labels[k]] for k in shared]))
-    moved = observations.positions[:, shared] @ turn.T + shift
-    return replace(observations, positions=moved), moved[0]
-
-
-def _copy_clouds(source: Path, folder: Path, settings: ImportSettings) -> None:
-    from plyfile import PlyData, PlyElement
-
-    files = sorted(source.glob("*.ply"))
-    if len(files) < 2:
-        raise InputError(f"{source} has {len(files)} PLY files.",
-                         "A folder of frames was expected.", "Name the folder that holds them.")
-    scale = LENGTH_UNITS_M[settings.unit]
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    for index, file in enumerate(files):
-        vertex = PlyData.read(str(file))["vertex"]
-        points = np.zeros(len(vertex), [("x", "f4"), ("y", "f4"), ("z", "f4")])
-        for axis in "xyz":
-            points[axis] = np.asarray(vertex[axis]) * scale
-        target = folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply"
-        PlyData([PlyElement.describe(points, "vertex")], byte_order="<").write(str(target))
-    if (source / "camera.toml").exists():
-        write_camera(folder / "camera.toml", read_camera(source / "camera.toml"))
-
-
-def _copy_rgbd(source: Path, folder: Path, settings: ImportSettings) -> None:
-    camera = read_camera(source / "camera.toml")
-    listed = _tum_list(source / "depth.txt") or [
-        (_stamp(file, index, settings), file)
-        for index, file in enumerate(sorted((source / "depth").glob("*.png")))]
-    poses = _tum_list(source / "groundtruth.txt")
-    if poses:
-        camera = _posed(camera, poses[0][1])
-    write_camera(folder / "camera.toml", camera)
-    (folder / "depth").mkdir(parents=True, exist_ok=True)
-    masks = dict(_tum_list(source / "mask.txt"))
-    for stamp, file in listed:
-        path = source / file if isinstance(file, str) else file
-        if not path.is_file():
-            raise InputError(f"{source / 'depth.txt'} names {file}, which is not there.",
-                             "The recording is incomplete.", "Copy the whole folder.")
-        shutil.copyfile(path, folder / "depth" / f"{stamp:.6f}.png")
-        mask = source / masks[_nearest(masks, stamp)] if masks else source / "mask" / path.name
-        if mask.is_file():
-            (folder / "mask").mkdir(exist_ok=True)
-            shutil.copyfile(mask, folder / "mask" / f"{stamp:.6f}.png")
-    if (source / "background.png").is_file():
-        shutil.copyfile(source / "background.png", folder / "background.png")
-
-
-def _nearest(stamps: dict[float, Any], wanted: float) -> float:
-    return min(stamps, key=lambda stamp: abs(stamp - wanted))
-
-
-def _tum_list(path: Path) -> list[tuple[float, str]]:
-    """Read TUM's ``timestamp value...`` lists; lines with # are comments."""
-    if not path.is_file():
-        return []
-    lines = [line.split(None, 1) for line in path.read_text(encoding="utf-8").splitlines()
-             if line.strip() and not line.startswith("#")]
-    try:
-        return [(float(stamp), rest.strip()) for stamp, rest in lines]
-    except ValueError as error:
-        raise InputError(f"{path} is not a list of time stamps ({error}).",
-                         "Each line is `timestamp file` or `timestamp tx ty tz qx qy qz qw`.",
-                         "Correct the file.") from error
-
-
-def _posed(camera: Camera, text: str) -> Camera:
-    numbers = [float(part) for part in text.split()]
-    turn = Rotation.from_quat(numbers[3:7]).as_rotvec()
-    return camera.model_copy(update={"pose": (*numbers[:3], *map(float, turn))})
-
-
-def _stamp(file: Path, index: int, settings: ImportSettings) -> float:
-    if settings.rate_hz is not None:
-        return index / settings.rate_hz
-    try:
-        return float(file.stem)
-    except ValueError as error:
-        raise InputError(f"The file name {file.name} is no time stamp.",
-                         "Frames need times.", "Give --rate-hz.") from error
+def _entry(observation: Any, source: Path, settings: ImportSettings, branch: Branch,
+           rest: np.ndarray | None, *, drive: Any, mode: Any, sigma: float,
+           grasp: tuple[float, float, float]) -> PullEntry:
+    return PullEntry(
+        observation=observation, drive=drive, motion=settings.motion,
+        gravity_m_s2=branch.gravity if settings.own_weight else None,
+        time_offset_s=settings.time_offset or 0.0, source=source.name,
+        grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=mode),
+        sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma),
+        rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))

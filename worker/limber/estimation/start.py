@@ -19,12 +19,42 @@ def scaled_start(objective: Objective, values: Values) -> Values:
     if factors:
         young = values.young * float(np.exp(np.mean(np.log(factors))))
         return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
+    if all(getattr(forward, "drive", "") == "force" and hasattr(forward, "rest_points")
+           for forward in objective.forwards):
+        return _from_the_stiff_side(objective, values)
     return _scanned(objective, values)
 
 
 def _force_ratio(forward: Forward, values: Values) -> float | None:
     usable = forward.uses_force and hasattr(forward, "force_ratio")
     return forward.force_ratio(values) if usable else None
+
+
+def _from_the_stiff_side(objective: Objective, values: Values) -> Values:
+    """Scale the moduli by how far a known force moves the points: simulated over observed.
+
+    It starts where the branch hardly moves and displacements go with force over modulus; a branch
+    that is far too soft folds up, and its equilibrium takes minutes to be found, or is none.
+    """
+    young = values.young
+    for _ in range(12):
+        trial = replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
+        found = objective.evaluate(objective.space.pack(trial))
+        if found is None:
+            young = 10 * young
+            continue
+        moved, seen = [], []
+        for forward, pull in zip(objective.forwards, found.pulls, strict=True):
+            known = np.isfinite(forward.frames.positions)
+            moved.append((pull.positions - forward.rest_points)[known])
+            seen.append((forward.frames.positions - forward.rest_points)[known])
+        ratio = float(np.linalg.norm(np.concatenate(moved))
+                      / max(np.linalg.norm(np.concatenate(seen)), 1e-12))
+        # A small step to the soft side: a bent branch stiffens, so that the ratio overshoots.
+        young = young * np.clip(ratio, 0.2, 1e4)
+        if abs(ratio - 1) < 0.05 or ratio <= 0:
+            break
+    return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
 
 
 def _scanned(objective: Objective, values: Values) -> Values:

@@ -62,7 +62,7 @@ def read_stream(path: str | Path, time_column: str = "t_s") -> Stream:
     at = rows.header.index(time_column)
     times, values = table[:, at], np.delete(table, at, axis=1)
     columns = tuple(name for name in rows.header if name != time_column)
-    times, values = _in_order(path, times, values, rows.warnings)
+    times, values = in_order(path, times, values, rows.warnings)
     if len(times) < 2:
         raise InputError(f"{path} has {len(times)} complete rows.",
                          "A pull needs at least two samples.", "Record it again.")
@@ -174,8 +174,15 @@ def _read_rows(path: Path) -> _Rows:
     return rows
 
 
-def _in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str],
-              ) -> tuple[np.ndarray, np.ndarray]:
+def in_order(path: Path, times: np.ndarray, values: np.ndarray, warnings: list[str],
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Sort rows by time and drop those without a stamp or with one that was there before.
+
+    Each repair adds a sentence to ``warnings``.
+
+    Raises:
+        InputError: a tenth or more of the stamps run backwards.
+    """
     finite = np.isfinite(times)
     if not finite.all():
         warnings.append(f"{path.name}: {np.sum(~finite)} rows without a time stamp were dropped.")

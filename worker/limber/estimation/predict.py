@@ -1,0 +1,129 @@
+"""What a branch of an estimated modulus does under another load: where its points come to rest."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.errors import InputError, WorkError
+from limber.estimation.alignment import Frames
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.preparation import subject_of
+from limber.estimation.quasi_static import QuasiStaticForward
+from limber.estimation.recording import PullEntry, read_entry
+from limber.estimation.settings import EstimateSettings
+from limber.progress import SILENT, Progress
+from limber.store import Branch, plain
+
+
+class PredictSettings(BaseModel):
+    """A load on a branch whose Young's modulus has been estimated."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    pull: str | None = Field(
+        None, description="The pull whose points, grasp and gravity are taken; without it the "
+        "first one.")
+    weight: float | None = Field(None, ge=0, description="A hung weight [N].")
+    load: tuple[float, float, float] | None = Field(
+        None, description="A steady force in any direction, branch frame [N].")
+
+
+def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progress = SILENT,
+            ) -> dict[str, Any]:
+    """Simulate the branch at rest under another load than the recorded one.
+
+    Returns:
+        ``load_n`` [3], ``points_m`` and ``displacement_m`` [m][3] of the pull's points,
+        ``displacement_sigma_m`` [m] (of its size, from Young's modulus' covariance),
+        ``drop_m`` (mean along gravity) with ``drop_interval_m`` (95 %),
+        ``grasp_displacement_m`` [3], ``young_pa``.
+
+    Raises:
+        InputError: no load, nothing estimated yet, or no such pull.
+        WorkError: the branch finds no equilibrium under the load.
+    """
+    if (settings.weight is None) == (settings.load is None):
+        raise InputError("One load is needed.", "It is what differs from the recording.",
+                         "Give --weight NEWTONS or --load X Y Z.")
+    branch = Branch.open(branch_folder)
+    known = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
+    entry = _entry(branch, settings.pull)
+    down = np.array(branch.gravity) / np.linalg.norm(branch.gravity)
+    load = np.array(settings.load) if settings.load else settings.weight * down
+    forward, values = _forward(branch, known, entry, load)
+    progress(0.1, "finding the branch's rest under the load")
+    space = _space(known, values)
+    found = forward.simulate(values, space.extra, True)
+    if found is None:
+        raise WorkError(f"The branch finds no rest under {np.linalg.norm(load):.3g} N.",
+                        "It may be far more than it can carry.", "Check the load's unit.")
+    moved = found.positions[0] - forward.rest_points
+    drop, sigma, drop_sigma = _uncertain(moved, found.d_positions[0], down, space, known)
+    grasp = forward.grasp
+    held = grasp.weights @ forward.displacements()[0][grasp.nodes]
+    return plain({
+        "load_n": load, "points_m": forward.rest_points, "displacement_m": moved,
+        "displacement_sigma_m": sigma, "drop_m": drop,
+        "drop_interval_m": [drop - 1.96 * drop_sigma, drop + 1.96 * drop_sigma],
+        "grasp_displacement_m": held, "young_pa": values.young})
+
+
+def _entry(branch: Branch, name: str | None) -> PullEntry:
+    names = [pull for pull in branch.names("pulls") if branch.has(f"pulls/{pull}/pull.toml")]
+    if not names or (name is not None and name not in names):
+        raise InputError(f"{branch.folder} has no pull {name or ''}.",
+                         f"It has {', '.join(names)}." if names else "It has none.",
+                         "Bring one in with `limber import-pull`.")
+    return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
+
+
+def _forward(branch: Branch, known: dict[str, Any], entry: PullEntry, load: np.ndarray,
+             ) -> tuple[QuasiStaticForward, Values]:
+    settings = EstimateSettings(fractions=tuple(known["fractions"]))
+    subject = subject_of(branch, settings)
+    values = Values(np.array(known["young_pa"]), float(known["poisson"]),
+                    float(known.get("density", subject.start.density)))
+    points = np.array(subject.control_points if entry.rest_points_m is None
+                      else entry.rest_points_m)
+    wrenches = np.full((2, 6), np.nan)
+    wrenches[:, :3] = load
+    frames = Frames(np.array([0.0, 1.0]), np.zeros((2, 6)), wrenches, np.ones(2, int),
+                    np.broadcast_to(points, (2, *points.shape)),
+                    np.broadcast_to(np.eye(3), (2, len(points), 3, 3)))
+    driven = entry.model_copy(update={"drive": "force", "motion": "quasi_static"})
+    if entry.grasp.mode == "clamped":
+        # A force alone does not hold a hand's rotation.
+        driven = driven.model_copy(update={
+            "grasp": entry.grasp.model_copy(update={"mode": "pinned"})})
+    return QuasiStaticForward("prediction", subject.model, subject.weights, driven, frames,
+                              points, key_count=1), values
+
+
+def _space(known: dict[str, Any], values: Values) -> ParameterSpace:
+    """The parameters that the estimate's covariance is about."""
+    groups = tuple(known.get("groups") or range(len(values.young)))
+    extra = tuple(name for name in known.get("parameters", ())
+                  if name in ("poisson", "density"))
+    return ParameterSpace(replace(values), groups, extra)
+
+
+def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: ParameterSpace,
+               known: dict[str, Any]) -> tuple[float, np.ndarray, float]:
+    """Mean drop [m], standard deviations of each point's displacement and of the drop [m].
+
+    Of the modulus only what the data leave open: an error of radius or mesh is in the modulus
+    and in this prediction with opposite signs.
+    """
+    count = len(space.groups)
+    free = np.concatenate([slope[..., :count] @ space.membership, slope[..., count:]], axis=-1)
+    covariance = np.array(known["covariance"])[:space.size, :space.size]
+    each = np.einsum("mip,pq,miq->mi", free, covariance, free)
+    size = np.linalg.norm(moved, axis=1)
+    along = moved / np.maximum(size, 1e-12)[:, None]
+    sigma = np.sqrt(np.maximum(np.einsum("mi,mi->m", along**2, each), 0.0))
+    mean = np.einsum("mip,i->p", free, down) / len(moved)
+    return float(np.mean(moved @ down)), sigma, float(np.sqrt(max(mean @ covariance @ mean, 0.0)))
