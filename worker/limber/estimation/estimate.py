@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from limber.estimation.preparation import (
     require_scale_in_principle,
     subject_of,
 )
+from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import scaled_start
 from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
@@ -111,7 +112,8 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     objective = Objective(forwards, ParameterSpace.separate(subject.start, _extra(settings)),
                           log=log, force_sigma=sigma, progress=progress.part(0.2, 0.95),
                           expected_count=20 if settings.method == "gauss-newton" else 200)
-    found = fit_pulls(objective, subject.start, settings, tell)
+    found = fit_pulls(objective, subject.start, settings, tell, cache=branch.folder,
+                      digest=json.dumps(digests, sort_keys=True))
     found.warnings = messages
     result = _summary(found, settings)
     earlier = branch.manifest.stages.get("estimate")
@@ -139,16 +141,29 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
-              tell: Callable[[str], None]) -> Estimate:
-    """Judge what the data can tell, fit it, and say how sure the result is."""
+              tell: Callable[[str], None], *, cache: Path | None = None, digest: str = "",
+              ) -> Estimate:
+    """Judge what the data can tell, fit it, and say how sure the result is.
+
+    Args:
+        cache, digest: Where bases of reduced models are kept, and what they depend on; see
+            :class:`limber.estimation.reduced_fit.Reduction`.
+    """
     require_scale_in_principle(objective.forwards)
-    if settings.young is None:
+    reduction = None
+    if settings.forward == "reduced":
+        reduction = Reduction(objective.forwards, cache, digest)
+    judged_on = objective
+    if reduction is not None and reduction.is_built:
+        start = reduction.around(start)
+        judged_on = reduction.objective(objective, start)
+    elif settings.young is None:
         start = scaled_start(objective, start)
         if any(forward.uses_force for forward in objective.forwards):
             suspicion = force_unit_suspicion(float(np.mean(start.young)))
             if suspicion:
                 tell(suspicion)
-    first = _evaluated(objective, start)
+    first = _evaluated(judged_on, start)
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
@@ -157,7 +172,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
         tell(message)
     objective = objective.with_space(space)
     try:
-        fit = _fitted(objective, space.pack(start), settings, tell)
+        fit, objective = _fitted(objective, space.pack(start), settings, tell, reduction)
         stopped = False
     except Stopped:
         fit, stopped = _best_so_far(objective), True
@@ -191,8 +206,6 @@ def _extra(settings: EstimateSettings) -> tuple[str, ...]:
 
 def _evaluated(objective: Objective, values: Values) -> Evaluation:
     """Evaluate with derivatives; softer or stiffer where there is no equilibrium."""
-    from dataclasses import replace
-
     from limber.errors import WorkError
 
     for factor in (1.0, 3.0, 0.3, 10.0, 0.1):
@@ -206,14 +219,24 @@ def _evaluated(objective: Objective, values: Values) -> Evaluation:
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
-            tell: Callable[[str], None]) -> Fit:
-    if settings.method == "nelder-mead":
-        fit = nelder_mead(objective, start, evaluation_limit=settings.evaluations,
-                          delta_m2=settings.delta_m2)
-    else:
-        fit = gauss_newton(objective, _resumed(objective, start), robust=settings.robust,
-                           evaluation_limit=settings.evaluations)
-    return _refined(fit, objective, settings, tell)
+            tell: Callable[[str], None], reduction: Reduction | None,
+            ) -> tuple[Fit, Objective]:
+    def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
+        if settings.method == "nelder-mead":
+            return nelder_mead(chosen, free, evaluation_limit=settings.evaluations,
+                               delta_m2=settings.delta_m2)
+        return gauss_newton(chosen, free, robust=settings.robust, is_near=is_near,
+                            evaluation_limit=settings.evaluations)
+
+    if settings.method == "gauss-newton":
+        start = _resumed(objective, start)
+    if reduction is not None:
+        return fit_reduced(objective, start, optimise, _rough, reduction, tell)
+    return _refined(optimise(objective, start), objective, settings, tell), objective
+
+
+def _rough(objective: Objective, free: np.ndarray) -> Fit:
+    return gauss_newton(objective, free, evaluation_limit=8, tolerance=1e-2)
 
 
 def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
@@ -261,18 +284,23 @@ def _best_so_far(objective: Objective) -> Fit:
 
 def _tied_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
                      tell: Callable[[str], None]) -> tuple[Fit, Objective]:
-    """Tie what turns out to be unresolved at the solution, and fit once more."""
-    if objective.space.group_count != len(objective.space.groups):
-        return fit, objective
-    space, ties = tie_unresolved(fit.evaluation, objective.space)
-    if not ties:
-        return fit, objective
-    for message in ties:
-        tell(message)
-    values = objective.space.unpack(fit.evaluation.free)
-    tied = objective.with_space(space)
-    return gauss_newton(tied, space.pack(values), robust=settings.robust,
-                        evaluation_limit=settings.evaluations), tied
+    """Tie what turns out to be unresolved at the solution, and fit again, until all is resolved."""
+    start = fit.evaluation.free
+    while True:
+        space, ties = tie_unresolved(fit.evaluation, objective.space)
+        if not ties:
+            return fit, objective
+        for message in ties:
+            tell(message)
+        # What was unresolved has run anywhere: the scale of all of them together has not.
+        young = objective.space.unpack(start).young
+        level = np.exp(np.mean(np.log(young))) * np.ones(len(young))
+        values = replace(objective.space.unpack(start), young=level)
+        objective = objective.with_space(space)
+        start = space.pack(scaled_start(objective, values))
+        fit = gauss_newton(objective, start, robust=settings.robust,
+                           evaluation_limit=settings.evaluations)
+        start = fit.evaluation.free
 
 
 def _judge(found: Estimate, tell: Callable[[str], None]) -> None:

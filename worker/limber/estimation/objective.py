@@ -95,6 +95,17 @@ class Objective:
         other.forward_count = self.forward_count
         return other
 
+    def with_forwards(self, forwards: list[Forward]) -> "Objective":
+        """Return an objective of other models of the same pulls; log and count go on."""
+        other = Objective(forwards, self.space, log=self.log, force_sigma=self.force_sigma,
+                          progress=self._progress, expected_count=self._expected)
+        other.forward_count = self.forward_count
+        return other
+
+    def forget(self) -> None:
+        """Evaluate anew what was evaluated last: a forward has changed."""
+        self._last = None
+
     def evaluate(self, free: np.ndarray, *, jacobian: bool = False) -> Evaluation | None:
         """Simulate all pulls; None where one finds no equilibrium.
 

@@ -28,7 +28,8 @@ class Fit:
 
 
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
-                 evaluation_limit: int = 40, tolerance: float = 3e-5) -> Fit:
+                 evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
+                 ) -> Fit:
     """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
 
     Args:
@@ -38,6 +39,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
             outlier cannot pull the fit.
         evaluation_limit: At most so many forward simulations.
         tolerance: Relative change of cost that ends it.
+        is_near: Whether the start is next to the solution already.
 
     Raises:
         WorkError: no equilibrium at the start.
@@ -61,6 +63,8 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
 
     # Far from the solution all residuals are large, and a robust loss would only slow the way.
     phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
+    if robust and is_near:
+        phases = phases[1:]
     moved = start - shift
     for loss, ending in phases:
         found = least_squares(

@@ -13,6 +13,7 @@ from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.estimation.points import point_operator
 from limber.estimation.recording import PullEntry
+from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
@@ -76,11 +77,16 @@ class QuasiStaticForward:
         if self.drive == "pose":
             along = travel(frames.poses)
         else:
-            # A noisy force is not a path; time orders the frames.
+            # A noisy force is not a path; time orders the frames. One that does not change is one
+            # state.
+            force = frames.wrenches[:, :3]
             along = frames.times - frames.times[0]
-        self.keys, self._spread = key_frames(along, count)
+            along = np.zeros(len(frames)) if np.array_equal(force, force[:1] + 0 * force
+                                                            ) else along
+        self.keys, self.spread = key_frames(along, count)
         self._memory: list[_Memory | None] = [None] * len(self.keys)
         self._values: Values | None = None
+        self._hints: list[np.ndarray] | None = None
         if self.drive == "pose":
             self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
                             for pose in frames.poses[self.keys]]
@@ -91,6 +97,10 @@ class QuasiStaticForward:
     @property
     def key_count(self) -> int:
         return len(self.keys)
+
+    @property
+    def mesh(self) -> TetMesh:
+        return self._model.mesh
 
     def model_with(self, values: Values) -> BranchModel:
         """Return the branch with these parameters."""
@@ -114,7 +124,9 @@ class QuasiStaticForward:
         for key, drive in enumerate(self._drives):
             memory = self._memory[key]
             same = memory is not None and _equal(self._values, values)
-            result = memory.result if same else self._solved(model, drive, memory, jump, before)
+            hint = None if self._hints is None else self._hints[key]
+            result = memory.result if same else self._solved(model, drive, memory, jump, before,
+                                                             hint)
             if result is None:
                 return None
             before = result.displacement
@@ -127,8 +139,12 @@ class QuasiStaticForward:
                 for column in range(count):
                     d_points[key, ..., column] = self._observed(slope[..., column])
             states.append(_Memory(result, slope))
-        self._memory, self._values = states, values
+        self._memory, self._values, self._hints = states, values, None
         return self._at_all_frames(points, forces, d_points, d_forces)
+
+    def hint(self, displacements: list[np.ndarray]) -> None:
+        """Start the next simulation from these displacements [m] of the key frames."""
+        self._hints = displacements
 
     def force_ratio(self, values: Values) -> float | None:
         """Measured force over the one that moves a branch of these ``values`` as far.
@@ -184,8 +200,9 @@ class QuasiStaticForward:
         return result if result.converged else None
 
     def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
-                jump: np.ndarray | None, before: np.ndarray | None) -> StaticResult | None:
-        starts = []
+                jump: np.ndarray | None, before: np.ndarray | None,
+                hint: np.ndarray | None) -> StaticResult | None:
+        starts = [] if hint is None else [hint]
         if memory is not None:
             start = memory.displacement
             near = jump is not None and np.abs(jump).max() < YOUNG_STEP_LIMIT
@@ -213,7 +230,7 @@ class QuasiStaticForward:
     def _at_all_frames(self, points: np.ndarray, forces: np.ndarray, d_points: np.ndarray | None,
                        d_forces: np.ndarray | None) -> Simulated:
         def spread(values: np.ndarray) -> np.ndarray:
-            return np.tensordot(self._spread, values, axes=1)
+            return np.tensordot(self.spread, values, axes=1)
         return Simulated(spread(points), spread(forces),
                          None if d_points is None else spread(d_points),
                          None if d_forces is None else spread(d_forces))

@@ -1,16 +1,22 @@
-"""A slow pull on the reduced model: a millisecond or so a frame, every frame simulated."""
+"""A slow pull on the reduced model: a few milliseconds a frame."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from limber.errors import InputError
 from limber.estimation.alignment import Frames
 from limber.estimation.grasping import pose_on
+from limber.estimation.key_frames import key_frames, travel
 from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.estimation.points import point_operator
 from limber.estimation.recording import PullEntry
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.reduced import ReducedModel, ReducedState
+
+STEPS = {"poisson": 2e-3, "density": 2e-2}
+"""Steps of the central differences for what the reduced model has no derivatives to."""
 
 
 class ReducedForward:
@@ -23,39 +29,43 @@ class ReducedForward:
         entry: The pull's settings.
         frames: Aligned frames.
         rest_points: Observed points at rest [m], shape [m, 3].
+        density: Of the branch that the model was made from [kg/m^3].
+        key_count: Frames that are simulated at most; a spline gives the others.
 
     Raises:
         InputError: the pull is driven by force; a reduced model is held at poses.
     """
 
     def __init__(self, name: str, reduced: ReducedModel, mesh: TetMesh, entry: PullEntry,
-                 frames: Frames, rest_points: np.ndarray):
+                 frames: Frames, rest_points: np.ndarray, *, density: float = 900.0,
+                 key_count: int = 100):
         if entry.drive != "pose" or entry.motion != "quasi_static":
             raise InputError(f"{name} is {entry.drive}-driven and {entry.motion}.",
                              "The reduced model is held at poses, slowly.",
-                             "Use the full model for this pull.")
+                             "Use the full model for this pull (--forward full).")
         self.name, self.frames, self.entry = name, frames, entry
         self.uses_force = bool(np.isfinite(frames.wrenches[:, :3]).all(axis=1).any())
         self.rest_points = np.asarray(rest_points, float)
-        self._reduced = reduced
+        self.keys, self.spread = key_frames(travel(frames.poses), key_count)
+        self._reduced, self._density = reduced, density
         columns = reduced.basis.columns.reshape(reduced.size, -1)
         self._observe = np.asarray(point_operator(mesh, self.rest_points) @ columns.T)
-        self._poses = [pose_on(reduced.grasp, entry.grasp, pose) for pose in frames.poses]
+        self._poses = [pose_on(reduced.grasp, entry.grasp, pose)
+                       for pose in frames.poses[self.keys]]
         self._states: list[ReducedState | None] = [None] * len(self._poses)
         self.untrusted_count = 0
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
         """Return the pull under ``values``; None where a frame finds no equilibrium."""
-        if extra:
-            raise InputError(f"{', '.join(extra)} cannot be fitted on the reduced model.",
-                             "It knows derivatives to Young's modulus alone.",
-                             "Use the full model.")
-        model = self._reduced.with_young(values.young)
-        shape, count = (len(self._poses), len(self.rest_points), 3), len(values.young)
+        model = self._model(values)
+        moved = {name: [self._model(_shifted(values, name, sign * STEPS[name]))
+                        for sign in (1, -1)] for name in extra if name in STEPS}
+        count = len(values.young)
+        shape = (len(self._poses), len(self.rest_points), 3)
         positions, forces = np.empty(shape), np.empty((len(self._poses), 3))
-        d_positions = np.empty((*shape, count)) if sensitivities else None
-        d_forces = np.empty((len(self._poses), 3, count)) if sensitivities else None
+        d_positions = np.zeros((*shape, count + len(extra))) if sensitivities else None
+        d_forces = np.zeros((len(self._poses), 3, count + len(extra))) if sensitivities else None
         before, untrusted = None, 0
         for index, pose in enumerate(self._poses):
             state = model.solve_static(pose, start=self._states[index] or before)
@@ -63,13 +73,43 @@ class ReducedForward:
                 return None
             untrusted += not state.trusted
             self._states[index] = before = state
-            positions[index] = self.rest_points + (self._observe @ state.coordinates
-                                                   ).reshape(-1, 3)
+            positions[index] = self._seen(state)
             forces[index] = state.reaction_force
-            if sensitivities:
-                slopes = model.sensitivities(state)
-                d_positions[index] = (self._observe @ slopes.coordinates).reshape(*shape[1:],
-                                                                                  count)
-                d_forces[index] = slopes.reaction_force
+            if not sensitivities:
+                continue
+            slopes = model.sensitivities(state)
+            d_positions[index, ..., :count] = (self._observe @ slopes.coordinates).reshape(
+                *shape[1:], count)
+            d_forces[index, :, :count] = slopes.reaction_force
+            for name, pair in moved.items():
+                column, step = count + extra.index(name), 2 * STEPS[name]
+                ahead, behind = (beside.solve_static(pose, start=state) for beside in pair)
+                if not (ahead.converged and behind.converged):
+                    return None
+                d_positions[index, ..., column] = (self._seen(ahead) - self._seen(behind)) / step
+                d_forces[index, :, column] = (ahead.reaction_force - behind.reaction_force) / step
         self.untrusted_count = untrusted
-        return Simulated(positions, forces, d_positions, d_forces)
+        return Simulated(*(None if value is None else np.tensordot(self.spread, value, axes=1)
+                           for value in (positions, forces, d_positions, d_forces)))
+
+    def displacements(self, frames: np.ndarray) -> list[np.ndarray]:
+        """Nodal displacements [m] at the simulated frames nearest to ``frames``, as of the last
+        simulation.
+        """
+        nearest = [int(np.argmin(np.abs(self.keys - frame))) for frame in frames]
+        return [self._reduced.displacement(self._states[index]) for index in nearest]
+
+    def _seen(self, state: ReducedState) -> np.ndarray:
+        return self.rest_points + (self._observe @ state.coordinates).reshape(-1, 3)
+
+    def _model(self, values: Values) -> ReducedModel:
+        model = self._reduced.with_young(values.young, values.poisson)
+        # The load of the coordinates is weight alone; with_young has made a copy.
+        model.load = self._reduced.load * (values.density / self._density)
+        return model
+
+
+def _shifted(values: Values, name: str, step: float) -> Values:
+    if name == "poisson":
+        return replace(values, poisson=values.poisson + step)
+    return replace(values, density=values.density * float(np.exp(step)))

@@ -13,6 +13,9 @@ class EstimateSettings(BaseModel):
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use; without it all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
         "gauss-newton", description="nelder-mead is the paper's.")
+    forward: Literal["full", "reduced"] = Field(
+        "full", description="reduced: a reduced model of slow pose-driven pulls, corrected by the "
+        "full one; its basis is kept in the branch folder, and another estimate is quick.")
     drive: Literal["pose", "force"] | None = Field(
         None, description="pose: the gripper's pose moves the branch and its force is compared; "
         "force: the force pulls (the paper's). Without it as each pull says.")

@@ -1,0 +1,133 @@
+"""The fit on a reduced model, corrected by the full one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import Bench, measured
+from limber.errors import InputError
+from limber.estimation import reduced_fit
+from limber.estimation.estimate import fit_pulls
+from limber.estimation.optimise import gauss_newton
+from limber.estimation.reduced_fit import CorrectedForward, Reduction
+from limber.estimation.settings import EstimateSettings
+
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=16)
+REDUCED = SETTINGS.model_copy(update={"forward": "reduced"})
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+@pytest.fixture(scope="module")
+def thick(small):
+    """A coarse mesh: what is shown here does not depend on how fine it is."""
+    return Bench(small, slice_length=3.0, sides=6)
+
+
+@pytest.fixture(scope="module")
+def noisy(small_pull):
+    return measured(small_pull, 3, points=5e-4, force=0.01)
+
+
+def fit(bench, pulls, settings, **kept):
+    objective, messages = bench.objective(pulls, settings), []
+    found = fit_pulls(objective, objective.space.base, settings, messages.append, **kept)
+    found.warnings = messages
+    return found
+
+
+def test_it_ends_where_the_full_model_ends(thick, noisy, tmp_path):
+    """Moduli to 0.3 %, intervals to a few percent; the second time the basis is there, and no
+    rough fit of the full model is needed: a few simulations are enough.
+    """
+    full = fit(thick, [noisy], SETTINGS)
+    first = fit(thick, [noisy], REDUCED, cache=tmp_path)
+    again = fit(thick, [noisy], REDUCED, cache=tmp_path)
+    for found in (first, again):
+        assert found.fit.converged
+        assert np.abs(found.values.young / full.values.young - 1).max() < 3e-3
+        ratio = (np.log(found.uncertainty.young_interval) @ [-1, 1]) / (
+            np.log(full.uncertainty.young_interval) @ [-1, 1])
+        assert np.abs(ratio - 1).max() < 0.1
+        assert any("reduced model" in message for message in found.warnings)
+    assert again.objective.forward_count < first.objective.forward_count
+    # Another pull makes another basis, and the old file goes.
+    fit(thick, [replace(noisy, name="pull-2")], REDUCED, cache=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_basis_around_wrong_moduli_is_made_again(thick, small_pull):
+    """Started from a basis a factor of 4 off, the fit still ends at the full model's."""
+    pull = measured(small_pull, 0, points=0, force=0)
+    full = fit(thick, [pull], SETTINGS)
+    objective = thick.objective([pull], SETTINGS)
+    reduction = Reduction(objective.forwards)
+    values = replace(objective.space.base, young=4.0 * TRUTH)
+    reduction.build(values)
+    before = reduction.bases[0]
+    found, _ = reduced_fit.fit_reduced(objective, np.log(values.young), gauss_newton,
+                                       gauss_newton, reduction, lambda _message: None)
+    assert reduction.bases[0] is not before
+    assert np.abs(np.exp(found.evaluation.free) / full.values.young - 1).max() < 2e-3
+
+
+def test_poisson_and_density_by_differences(thick, noisy):
+    """Derivatives to what the reduced model has none of, against the full model's."""
+    entry = noisy.entry.model_copy(update={"gravity_m_s2": (0.0, 0.0, -9.81)})
+    objective = thick.objective([replace(noisy, entry=entry)], SETTINGS)
+    reduction = Reduction(objective.forwards)
+    values = replace(objective.space.base, young=TRUTH)
+    reduction.build(values)
+    corrected = reduction.objective(objective, values).forwards[0]
+    assert isinstance(corrected, CorrectedForward)
+    extra = ("poisson", "density")
+    full = objective.forwards[0].simulate(values, extra, True)
+    rough = corrected.simulate(values, extra, True)
+    keys = objective.forwards[0].keys
+    for column in (4, 5):
+        # Points hardly move with Poisson's ratio, and the basis knows nothing of it.
+        for name, part in (("d_positions", 0.3 if column == 4 else 0.05), ("d_forces", 0.05)):
+            exact = getattr(full, name)[keys][..., column]
+            assert np.linalg.norm(getattr(rough, name)[keys][..., column] - exact) < (
+                part * np.linalg.norm(exact)), (column, name)
+
+
+def test_a_correction_makes_up_for_a_poor_basis(thick, noisy, monkeypatch):
+    """26 coordinates around other moduli are too few; after a correction positions and forces
+    are the full model's there, and to second order near there.
+    """
+    monkeypatch.setattr(reduced_fit, "SIZE", 10)
+    objective = thick.objective([noisy], SETTINGS)
+    reduction = Reduction(objective.forwards)
+    values = replace(objective.space.base, young=TRUTH * [1.4, 0.8, 1.3, 0.8])
+    reduction.build(values)
+    corrected = reduction.objective(objective, values).forwards[0]
+    here = replace(values, young=TRUTH)
+    assert corrected.correct(here, ())
+    keys = objective.forwards[0].keys
+    near = replace(values, young=1.05 * TRUTH)
+    full = objective.forwards[0].simulate(near, (), False)
+    bare = corrected.reduced.simulate(near, (), False)
+    better = corrected.simulate(near, (), False)
+    for name in ("positions", "forces"):
+        exact = getattr(full, name)[keys]
+        before, after = (np.abs(getattr(found, name)[keys] - exact).max()
+                         for found in (bare, better))
+        assert after < 0.1 * before
+
+
+def test_a_pull_of_three_frames_is_enough_for_a_basis(thick, small_pull):
+    """Fewer poses than a basis has coordinates: they are taken at several moduli."""
+    seen = small_pull.observations
+    few = replace(measured(small_pull, 0, points=0, force=0), observations=replace(
+        seen, times=seen.times[::7], positions=seen.positions[::7]))
+    reduction = Reduction(thick.objective([few], SETTINGS).forwards)
+    reduction.build(replace(thick.objective([few], SETTINGS).space.base, young=TRUTH))
+    assert reduction.bases[0].size == 64
+
+
+def test_pulls_it_cannot_hold_are_refused(thick, noisy):
+    """A pull driven by force has no pose to hold the reduced model at."""
+    pull = replace(noisy, entry=noisy.entry.model_copy(update={"drive": "force"}))
+    with pytest.raises(InputError, match="--forward full"):
+        Reduction(thick.objective([pull], SETTINGS).forwards)
