@@ -7,6 +7,7 @@ from limber.errors import MeshingError
 from limber.geometry.cylinder_mesh import curved_beam, split_wedges, straight_beam
 from limber.geometry.forks import crease_angles, smooth_forks
 from limber.geometry.generated import generate_branch
+from limber.geometry.implicit_surface import level_surface
 from limber.geometry.marks import mark
 from limber.geometry.mesh_quality import dihedral_angles, measure_quality, radius_ratios
 from limber.geometry.skeleton import Skeleton
@@ -31,16 +32,74 @@ def test_branch_surface_is_closed_and_of_the_right_volume(y_skeleton):
 
 @pytest.mark.parametrize("fork_count", [1, 10])
 def test_smoothed_forks_are_less_sharp_and_sound(fork_count):
-    """Fillets: creases less sharp, and shorter where sharp; valid; volume within 1 %, not less."""
+    """Fillets: few creases are left; the surface is valid; volume within 2 %, not less."""
     skeleton = generate_branch(3, fork_count=fork_count, point_spacing=0.01).skeleton
     plain = branch_surface(skeleton)
     smooth, check, warnings = smooth_forks(plain, skeleton)
     assert check.valid and check.piece_count == 1 and not warnings
-    assert 1 < smooth.volume / plain.volume < 1.01
+    assert 1 < smooth.volume / plain.volume < 1.02
     (before, length), (after, length_after) = crease_angles(plain), crease_angles(smooth)
-    assert after.max() < 0.9 * before.max()
-    sharp = np.deg2rad(75)
-    assert length_after[after > sharp].sum() < 0.7 * length[before > sharp].sum()
+    for angle in np.deg2rad([45, 75]):
+        assert length_after[after > angle].sum() < 0.4 * length[before > angle].sum()
+
+
+def _forked(*twigs: tuple[float, float, float, float]) -> Skeleton:
+    """A stem of radius 10 mm with twigs: height [m], lean and turn [degrees], radius [m]."""
+    stem = np.column_stack([np.zeros(41), np.zeros(41), np.linspace(0, 0.6, 41)])
+    nodes, parent, radius, count = [stem], [np.arange(41) - 1], [np.full(41, 0.01)], 41
+    for height, lean, turn, thick in twigs:
+        lean, turn = np.deg2rad([lean, turn])
+        way = [np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)]
+        at = int(np.argmin(np.abs(stem[:, 2] - height)))
+        nodes.append(stem[at] + np.linspace(0.015, 0.2, 10)[:, None] * way)
+        parent.append(np.concatenate([[at], count + np.arange(9)]))
+        radius.append(np.full(10, thick))
+        count += 10
+    return Skeleton.from_edges(np.vstack(nodes), np.concatenate(parent), np.concatenate(radius))
+
+
+@pytest.mark.parametrize(("name", "twigs"), [
+    ("acute", [(0.2, 12, 30, 0.006)]),
+    ("equally thick", [(0.2, 40, 0, 0.01)]),
+    ("thicker than the stem", [(0.2, 60, 10, 0.013)]),
+    ("far thinner than the stem", [(0.2, 70, 10, 0.0012)]),
+    ("opposite", [(0.2, 50, 0, 0.006), (0.2, 50, 180, 0.006)]),
+    ("crowded", [(0.2 + 0.015 * k, 35 + 8 * k, 100 * k, 0.004 + 0.001 * k) for k in range(5)]),
+    ("at the root", [(0.0, 60, 20, 0.006)]),
+    ("hanging", [(0.3, 150, 40, 0.006)]),
+])
+def test_every_fork_is_rounded(name, twigs):
+    """Fillets hold at any angle, thickness and company; nothing comes out of the flat base."""
+    skeleton = _forked(*twigs)
+    plain = branch_surface(skeleton)
+    smooth, check, warnings = smooth_forks(plain, skeleton)
+    assert check.valid and check.piece_count == 1 and not warnings, name
+    assert 1 < smooth.volume / plain.volume < 1.02
+    (before, length), (after, length_after) = crease_angles(plain), crease_angles(smooth)
+    if name != "at the root":  # there the flat cut goes through the fork
+        sharp = np.deg2rad(60 if name != "acute" else 100)
+        assert length_after[after > sharp].sum() < 0.5 * length[before > sharp].sum()
+        assert smooth.vertices[:, 2].min() > -1e-9
+
+
+def test_level_surface_closes_a_ball():
+    """Marching tetrahedra give a closed, oriented sphere, closer to it on a finer lattice."""
+    errors = []
+    for step in (0.2, 0.1):
+        ball = level_surface(lambda points: np.linalg.norm(points - 0.01, axis=1) - 1,
+                             np.full(3, -1.4), np.full(3, 1.4), step)
+        check = check_surface(ball)
+        assert check.valid and check.piece_count == 1
+        errors.append(abs(ball.volume / (4 / 3 * np.pi) - 1))
+    assert errors[0] < 0.01 and errors[1] < 0.3 * errors[0]
+
+
+def test_an_empty_union_of_fillets_leaves_the_surface(y_skeleton, monkeypatch):
+    """Where the union fails, the surface without fillets comes back with a warning."""
+    monkeypatch.setattr("limber.geometry.forks._joined", lambda *_: None)
+    plain = branch_surface(y_skeleton)
+    smooth, check, warnings = smooth_forks(plain, y_skeleton)
+    assert smooth is plain and check.valid and "1 of 1 forks" in warnings[0]
 
 
 def test_forks_stay_sharp_where_a_fillet_fails(y_skeleton, monkeypatch):
