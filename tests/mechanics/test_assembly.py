@@ -1,13 +1,16 @@
 """Forces and stiffness against rigid motion, patch test and finite differences."""
 
+import sys
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from tests.mechanics.conftest import box_mesh
 
 from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics import BranchModel, Grasp
+from limber.mechanics import BranchModel, Grasp, factor
 from limber.mechanics.equations import Viscous
+from limber.mechanics.fronts import make_fronts, postordered
 from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.statics import solve_prescribed
 
@@ -29,7 +32,7 @@ def curved_box():
 def full_stiffness(model, equations):
     pattern = equations.pattern
     lower = sp.csc_matrix((equations._values[:pattern.value_count],
-                           (pattern.rows, pattern.columns)), shape=(pattern.size,) * 2)
+                           pattern.entries()), shape=(pattern.size,) * 2)
     return lower + sp.tril(lower, -1).T
 
 
@@ -132,23 +135,69 @@ def test_pinned_solution_keeps_the_mean_and_balances(short_box):
     assert np.linalg.norm(left) < 1e-9 * np.linalg.norm(model.tangent_times(zero, solution))
 
 
-def test_superlu_gives_what_cholmod_gives(short_box, monkeypatch):
-    """The fallback without cvxopt solves the same equations and refuses an indefinite matrix."""
-    from limber.mechanics import factor
+FACTORS = ("SupernodalFactor", "CholmodFactor", "SuperLuFactor")
 
-    model = make_model(short_box)
-    force = np.zeros_like(short_box.nodes)
-    force[-1] = [1.0, 2.0, 3.0]
-    first = model.equations()
-    first.assemble(model, np.zeros_like(force))
-    first.factorise()
-    pattern = first.pattern
-    other = factor.SuperLuFactor(pattern.rows, pattern.columns, pattern.size)
-    values = first._values[:pattern.value_count].copy()
-    other.factorise(values)
-    right = force[pattern.order].ravel()
-    assert other.solve(right) == pytest.approx(first.solve(force)[pattern.order].ravel())
-    values[pattern.diagonal] -= 0.5 * values[pattern.diagonal].mean()
-    for candidate in (other, factor.CholmodFactor(pattern.rows, pattern.columns, pattern.size)):
+
+def factor_of(name, pattern):
+    if name == "SupernodalFactor":
+        return factor.SupernodalFactor(make_fronts(pattern.node_starts, pattern.node_rows))
+    return getattr(factor, name)(*pattern.entries(), pattern.size)
+
+
+@pytest.mark.parametrize("name", FACTORS)
+@pytest.mark.parametrize("quadratic", [True, False])
+def test_every_factor_solves_and_refuses(name, quadratic):
+    """Each factor solves to round-off, for one and several right sides, refuses an indefinite
+    matrix, and is as good as before when it gets a definite one again."""
+    mesh = box_mesh((0.03, 0.02, 0.05), (3, 2, 5), quadratic=quadratic)
+    model = make_model(mesh)
+    equations = model.equations()
+    pattern = equations.pattern
+    equations.assemble(model, np.zeros_like(mesh.nodes))
+    values = equations._values[:pattern.value_count].copy()
+    matrix = full_stiffness(model, equations)
+    right = np.random.default_rng(0).standard_normal((pattern.size, 4))
+    candidate = factor_of(name, pattern)
+    for _ in range(2):
+        candidate.factorise(values)
+        for sides in (right, right[:, 1]):
+            solution = candidate.solve(sides)
+            assert solution.shape == sides.shape
+            scale = abs(matrix).sum(axis=1).max() * np.abs(solution).max()
+            assert np.abs(matrix @ solution - sides).max() < 1e-14 * scale
+        raised = values.copy()
+        raised[pattern.diagonal] -= 0.5 * values[pattern.diagonal].mean()
         with pytest.raises(factor.NotPositiveDefiniteError):
-            candidate.factorise(values)
+            candidate.factorise(raised)
+
+
+def test_fronts_hold_all_that_fills_in():
+    """No fill of a random matrix is missed: the factor's columns are those of dense Cholesky."""
+    rng = np.random.default_rng(6)
+    for count, density in ((1, 0.5), (7, 0.3), (60, 0.03), (60, 0.2)):
+        graph = sp.random(count, count, density, random_state=7) + sp.eye(count)
+        graph = ((graph + graph.T) != 0).tocsr()
+        order = postordered(graph, rng.permutation(count))
+        lower = sp.tril(graph[order][:, order]).tocsc()
+        lower.sort_indices()
+        block = sp.kron(lower, np.ones((3, 3))).tocsc()
+        part = sp.tril(block).tocsc()
+        part.data = rng.uniform(-1, 1, len(part.data))
+        whole = (part + sp.tril(part, -1).T + 3 * part.shape[0] * sp.eye(part.shape[0])).tocsc()
+        values = sp.tril(whole).tocsc()
+        values.sort_indices()
+        own = factor.SupernodalFactor(make_fronts(lower.indptr, lower.indices))
+        own.factorise(values.data)
+        right = rng.standard_normal(part.shape[0])
+        assert own.solve(right) == pytest.approx(np.linalg.solve(whole.toarray(), right),
+                                                 rel=1e-10)
+
+
+def test_bulky_meshes_go_to_a_general_library(short_box, monkeypatch):
+    """Above a number of operations CHOLMOD takes over, without cvxopt SuperLU."""
+    pattern = make_model(short_box).equations().pattern
+    assert isinstance(factor.make_factor(pattern), factor.SupernodalFactor)
+    monkeypatch.setattr(factor, "_MOST_FLOPS", 1.0)
+    assert isinstance(factor.make_factor(pattern), factor.CholmodFactor)
+    monkeypatch.setitem(sys.modules, "cvxopt.cholmod", None)
+    assert isinstance(factor.make_factor(pattern), factor.SuperLuFactor)

@@ -59,7 +59,7 @@ class Equations:
         self.pattern = Pattern(tets, len(fixed), ~self.held, [g.nodes for g in self.pinned])
         self.layout = LaneLayout(self.pattern, tets, gradients, weights)
         self.factorisation_count = 0
-        self._factor = make_factor(self.pattern.rows, self.pattern.columns, self.pattern.size)
+        self._factor = make_factor(self.pattern)
         self._values = self.pattern.scratch_values()
         self._mass: tuple[object, np.ndarray] | None = None
         self._pin_entries = [self._entries_of(grasp) for grasp in self.pinned]

@@ -23,7 +23,7 @@ class Pattern:
 
     Attributes:
         order: Free nodes in elimination order; position: its inverse, -1 where constrained.
-        rows, columns: Entries, shape [value_count].
+        node_starts, node_rows: The same triangle on nodes, by columns.
         diagonal: Where the diagonal is, shape [3 free nodes].
     """
 
@@ -37,7 +37,7 @@ class Pattern:
         lower = sp.tril(graph[self.order][:, self.order]).tocsc()
         lower.sort_indices()
         count = np.diff(lower.indptr)
-        self._first = lower.indptr
+        self.node_starts, self.node_rows = lower.indptr, lower.indices
         self._keys = np.repeat(np.arange(len(count)), count) * node_count + lower.indices
         self.length = 3 * count
         self.start = np.concatenate([[0], np.cumsum(9 * count - 3)])
@@ -45,7 +45,6 @@ class Pattern:
         begin = self.start[:-1]
         self.diagonal = np.stack([begin, begin + self.length, begin + 2 * self.length - 1],
                                  axis=1).ravel()
-        self.rows, self.columns = self._entries(lower)
 
     @property
     def size(self) -> int:
@@ -64,7 +63,7 @@ class Pattern:
         key = np.where(inside, column * len(self.position) + row, self._keys[0])
         found = np.searchsorted(self._keys, key)
         safe = np.where(inside, column, 0)
-        slot = self.start[safe] + 3 * (found - self._first[safe])
+        slot = self.start[safe] + 3 * (found - self.node_starts[safe])
         return (np.where(inside, slot, self.value_count),
                 np.where(inside, self.length[safe], 4))
 
@@ -73,17 +72,18 @@ class Pattern:
         slot, length = self.slots(first, second)
         return np.stack([slot, slot + length, slot + 2 * length - 1], axis=-1)
 
-    def _entries(self, lower: sp.csc_matrix) -> tuple[np.ndarray, np.ndarray]:
+    def entries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return row and column of each value."""
         rows = np.empty(self.value_count, np.int64)
         columns = np.empty(self.value_count, np.int64)
-        block_column = np.repeat(np.arange(len(self.length)), np.diff(lower.indptr))
-        rank = np.arange(len(lower.indices)) - lower.indptr[block_column]
+        block_column = np.repeat(np.arange(len(self.length)), np.diff(self.node_starts))
+        rank = np.arange(len(self.node_rows)) - self.node_starts[block_column]
         for j in range(3):
             base = (self.start[block_column] + j * self.length[block_column]
                     - (1 if j == 2 else 0) + 3 * rank - j)
             for i in range(3):
                 keep = (rank > 0) | (i >= j)
-                rows[base[keep] + i] = 3 * lower.indices[keep] + i
+                rows[base[keep] + i] = 3 * self.node_rows[keep] + i
                 columns[base[keep] + i] = 3 * block_column[keep] + j
         return rows, columns
 
