@@ -11,15 +11,23 @@ import numpy as np
 from limber.errors import Cancelled
 from limber.estimation.checks import force_unit_suspicion
 from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.grasping import grasp_on
 from limber.estimation.identifiability import (
     Identifiability,
     identifiability,
     require_scale,
     tie_unresolved,
 )
+from limber.estimation.model_error import (
+    ModelError,
+    geometry_error,
+    mesh_error,
+    total_interval,
+)
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, gauss_newton, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.points import point_operator
 from limber.estimation.preparation import (
     Subject,
     forwards_of,
@@ -29,6 +37,7 @@ from limber.estimation.preparation import (
     require_scale_in_principle,
     subject_of,
 )
+from limber.estimation.recording import GraspEntry
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import scaled_start
@@ -54,6 +63,7 @@ class Estimate:
         warnings: What the user should know.
         held_out: Per pull, RMS distance [m] and RMS force error [N] of a fit that did not see it.
         stopped: Whether it was stopped before its end.
+        model_error: What residuals cannot show: of the branch's radii and of its mesh.
     """
 
     fit: Fit
@@ -63,6 +73,7 @@ class Estimate:
     warnings: list[str] = field(default_factory=list)
     held_out: dict[str, dict[str, float]] = field(default_factory=dict)
     stopped: bool = False
+    model_error: ModelError = field(default_factory=ModelError)
 
     @property
     def values(self) -> Values:
@@ -115,6 +126,9 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     found = fit_pulls(objective, subject.start, settings, tell, cache=branch.folder,
                       digest=json.dumps(digests, sort_keys=True))
     found.warnings = messages
+    if not found.stopped:
+        progress(0.96, "how much the mesh is too stiff")
+        found.model_error = _model_error(branch, subject, found, pulls[0].entry.grasp, settings)
     result = _summary(found, settings)
     earlier = branch.manifest.stages.get("estimate")
     if found.stopped and earlier is not None and not earlier.result.get("stopped"):
@@ -331,11 +345,36 @@ def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str
     return scores
 
 
+def _model_error(branch: Branch, subject: Subject, found: Estimate, grasp: GraspEntry,
+                 settings: EstimateSettings) -> ModelError:
+    geometry = None
+    if branch.has("skeleton.csv"):
+        geometry = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
+    if not settings.mesh_check:
+        return ModelError(geometry)
+    inside = point_operator(subject.mesh, subject.control_points)
+    model = subject.model.with_parameters(poisson=found.values.poisson)
+    return ModelError(geometry, mesh_error(model, grasp_on(subject.mesh, grasp), inside,
+                                           subject.weights @ found.values.young))
+
+
+def _deviations(found: Estimate) -> dict[str, Any]:
+    """Relative standard deviations of the moduli by where they come from."""
+    groups = list(found.objective.space.groups)
+    sensor = np.minimum(np.sqrt(np.diag(found.uncertainty.covariance))[groups], 35.0)
+    error = found.model_error
+    return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
+            "total": error.total(sensor)}
+
+
 def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
     values, sure = found.values, found.uncertainty
     return {
         "method": settings.method, "young_pa": values.young,
-        "young_interval_pa": sure.young_interval, "poisson": values.poisson,
+        "young_interval_pa": total_interval(values.young, sure.young_interval,
+                                            found.model_error),
+        "young_interval_sensor_pa": sure.young_interval,
+        "young_deviation": _deviations(found), "poisson": values.poisson,
         "density": values.density, "loss_m2": found.fit.evaluation.loss,
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "held_out": found.held_out,

@@ -137,6 +137,11 @@ class Objective:
             self._last = found
         return found
 
+    def standardised(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Per pull: residuals over deviations of points [f, m, 3] and force [f, 3]; NaN: none."""
+        return [(self._points(index, simulated), self._forces(index, simulated))
+                for index, simulated in enumerate(evaluation.pulls)]
+
     def scored(self, evaluation: Evaluation) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per pull: standardised residual of each point [f, m] (RMS of axes) and force [f]."""
         scored = []

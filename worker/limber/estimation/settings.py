@@ -40,3 +40,6 @@ class EstimateSettings(BaseModel):
     robust: bool = Field(True, description="Outliers count less (Gauss-Newton).")
     hold_out: bool = Field(
         True, description="With several pulls: fit without each in turn, and score it.")
+    mesh_check: bool = Field(
+        True, description="At the end, see on a finer mesh how much this one is too stiff; it "
+        "enters the interval.")

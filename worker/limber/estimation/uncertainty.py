@@ -21,12 +21,15 @@ class Uncertainty:
         variance_factor: Mean squared residual over the one expected; 1 where the noise is as
             stated.
         correlation: Of the free vector, shape [p, p].
+        repetition: How many frames in a row say the same thing: 1 where their errors are
+            independent.
     """
 
     covariance: np.ndarray
     young_interval: np.ndarray
     variance_factor: float
     correlation: np.ndarray
+    repetition: float = 1.0
 
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
@@ -34,8 +37,9 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
 
     The stated noise is scaled by what the residuals show, each kind of residual weighing as in
     the fit; a robust share of the residuals is used, so that outliers do not widen the interval.
-    What the mesh gets wrong is not in it: a radius that is 1 % too large makes every modulus 4 %
-    too small, and no residual shows that.
+    Errors that last from frame to frame, as those of points found in depth images do, do not
+    average out: the covariance grows by how many frames repeat each other. What the mesh gets
+    wrong is not in it (:mod:`limber.estimation.model_error`).
     """
     jacobian, residual = evaluation.jacobian, evaluation.residual
     freedom = max(len(residual) - jacobian.shape[1], 1)
@@ -44,7 +48,8 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     factor = float(clipped @ clipped / freedom)
     _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
     spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
-    covariance = factor * spread @ spread.T
+    repetition = repeated(objective.standardised(evaluation))
+    covariance = factor * repetition * spread @ spread.T
     deviation = np.sqrt(np.diag(covariance))
     width = stats.t.ppf(0.5 + level / 2, freedom) * deviation
     space = objective.space
@@ -55,7 +60,39 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     bounds = np.exp(space.bounds()[0][0]), np.exp(space.bounds()[1][0])
     interval = np.clip(np.column_stack([low.young, high.young]), *bounds)
     return Uncertainty(covariance, interval, factor,
-                       covariance / np.maximum(np.outer(deviation, deviation), 1e-300))
+                       covariance / np.maximum(np.outer(deviation, deviation), 1e-300), repetition)
+
+
+def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Integrated autocorrelation of residuals over the frames, all points and axes together.
+
+    1 + 2 sum of the correlations at growing lags, up to the first that is lost in its own noise
+    (Sokal's estimate of how many samples of a sequence are worth one independent sample).
+
+    Args:
+        series: Per pull, residuals of points [f, m, 3] and of force [f, 3], NaN where none.
+    """
+    product, count = np.zeros(0), np.zeros(0)
+    for points, forces in series:
+        columns = np.hstack([points.reshape(len(points), -1), forces])
+        # An outlier would hide the correlation of all others.
+        columns = np.clip(columns, -4.0, 4.0)
+        known = np.isfinite(columns)
+        values = np.where(known, columns, 0.0)
+        lags = len(columns) // 2
+        product, count = (np.pad(a, (0, max(lags - len(a), 0))) for a in (product, count))
+        for lag in range(lags):
+            product[lag] += np.sum(values[:len(values) - lag] * values[lag:])
+            count[lag] += np.sum(known[:len(known) - lag] & known[lag:])
+    if len(product) < 3 or product[0] <= 0:
+        return 1.0
+    correlation = (product / np.maximum(count, 1)) / (product[0] / count[0])
+    total = 1.0
+    for lag in range(1, len(correlation)):
+        if correlation[lag] < 2.0 / np.sqrt(count[lag]):
+            break
+        total += 2.0 * correlation[lag]
+    return float(total)
 
 
 def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> list[dict]:

@@ -23,7 +23,9 @@ SMOOTH_SIGMA = 0.2
 """Prior standard deviation of the change of that turn from knot to knot [rad]."""
 SEEN_SHARE = 0.01
 """A direction of a rigid motion counts as seen from this share of the best one's information."""
-MODEL_SIGMA_M = 2e-4
+PIECES = 80
+"""Pieces of the curve whose points' errors are taken to be independent of the next one's."""
+MODEL_SIGMA_M = 5e-5
 """How well a tube of the skeleton's radii stands for the branch [m]; added to the covariance."""
 
 
@@ -82,8 +84,8 @@ class CurveTracker:
         if anchor is not None:
             curve = _settle(curve, anchor)
         if len(cloud.points) < 10:
-            return self._result(curve, _prior(curve)[0], np.empty(0), 0.0)
-        normal, arcs = _prior(curve)[0], np.empty(0)
+            return self._result(curve, np.linalg.inv(_prior(curve)[0]), np.empty(0), 0.0)
+        arcs = np.empty(0)
         for reach in (0.12, 0.06, 0.03, *([0.0] * 9)):
             normal, gradient, arcs = _equations(curve, cloud, reach * self.rest.length, anchor)
             step = -np.linalg.solve(normal, gradient).reshape(-1, 3)
@@ -92,16 +94,15 @@ class CurveTracker:
             if reach == 0.0 and np.abs(step).max() < 1e-5:
                 break
         share = len(arcs) / len(cloud.points)
-        return self._result(curve, normal, arcs, share)
+        return self._result(curve, _spread(curve, cloud, anchor), arcs, share)
 
     def arc_near(self, point: np.ndarray) -> float:
         """Return the arc length [m] of the point at rest that is nearest to ``point``."""
         return float(self.rest.arc[np.argmin(np.linalg.norm(self.rest.nodes - point, axis=1))])
 
-    def _result(self, curve: BentCurve, normal: np.ndarray, arcs: np.ndarray, share: float,
+    def _result(self, curve: BentCurve, spread: np.ndarray, arcs: np.ndarray, share: float,
                 ) -> TrackedFrame:
         jacobian = _interpolated(curve, self.arcs).reshape(len(self.arcs), 3, -1)
-        spread = np.linalg.inv(normal)
         covariance = np.einsum("kia,ab,kjb->kij", jacobian, spread, jacobian)
         covariance += MODEL_SIGMA_M**2 * np.eye(3)
         window = self.rest.length / 16
@@ -177,6 +178,36 @@ def _equations(curve: BentCurve, cloud: SeenCloud, reach: float, anchor: Anchor 
         normal = normal + jacobian.T @ jacobian / anchor.sigma**2
         gradient = gradient + jacobian.T @ off / anchor.sigma**2
     return normal, gradient, match.arcs[match.inlier]
+
+
+def _spread(curve: BentCurve, cloud: SeenCloud, anchor: Anchor | None) -> np.ndarray:
+    """Covariance of the knots' turns, from how the points scatter about the fitted curve.
+
+    Pixels lie side by side across the branch: their distances from its middle are wide, but they
+    add up to nearly nothing, and flying pixels do not. Taking each as an independent error makes
+    the covariance tenfold too large. The scatter is therefore that of whole pieces of the curve
+    (the sandwich of Huber and White, clustered by arc length).
+    """
+    normal, _, _ = _equations(curve, cloud, 0.0, anchor)
+    match = _match(curve, cloud, 0.0)
+    at = _interpolated(curve, match.arcs).reshape(len(match.arcs), 3, -1)
+    score = np.zeros((len(match.arcs), normal.shape[0]))
+    for direction, value, strength in zip(match.directions, match.residuals, match.weights,
+                                          strict=True):
+        score -= np.einsum("ni,nia->na", direction, at) * (strength * value)[:, None]
+    piece = np.minimum((match.arcs / curve.rest.length * PIECES).astype(int), PIECES - 1)
+    summed = np.zeros((PIECES, normal.shape[0]))
+    np.add.at(summed, piece, score)
+    seen = len(np.unique(piece))
+    inverse = np.linalg.inv(normal)
+    prior = _prior(curve)[0]
+    if anchor is not None:
+        jacobian = _interpolated(curve, np.array([anchor.arc])).reshape(3, -1)
+        prior = prior + jacobian.T @ jacobian / anchor.sigma**2
+    # The fit has followed the scatter with as many turns as the points determine.
+    followed = float(np.trace(inverse @ (normal - prior)))
+    freedom = seen / max(seen - followed, 0.25 * seen)
+    return inverse @ (freedom * summed.T @ summed + prior) @ inverse
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,220 @@
+"""A hung weight: recordings of the form of the silicone beam's, simulated, through the commands."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from limber.cli import call
+from limber.errors import InputError
+from limber.estimation.grasping import grasp_on
+from limber.estimation.hung_load import settled
+from limber.estimation.points import point_operator
+from limber.estimation.recording import GraspEntry, Observations, read_pull
+from limber.estimation.registration import read_nominal, register
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics import solve_static
+
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "silicone_beam"
+YOUNG, WEIGHTS = 2.5e7, (0.3, 0.7)
+TURN = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
+
+
+@dataclass
+class Rig:
+    """A branch of one modulus, clamped upright, pulled down sideways by its own weight and more."""
+
+    folder: Path
+    nominal: np.ndarray
+    grasp: tuple[float, float, float]
+    mesh: object
+
+    def displacement(self, weight: float) -> np.ndarray:
+        """True static displacement of the markers under own weight and ``weight`` [m]."""
+        model = BranchModel(self.mesh, young=YOUNG, poisson=0.36, density=900.0,
+                            gravity=(0.0, 0.0, -9.80665))
+        grasp = grasp_on(self.mesh, GraspEntry(point_m=self.grasp, radius_m=0.01, mode="pinned"))
+        state = solve_static(model, grasp=grasp, grasp_force=(0.0, 0.0, -weight)).require()
+        operator = point_operator(self.mesh, self.nominal)
+        return (operator @ state.displacement.ravel()).reshape(-1, 3)
+
+    def recording(self, weight: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Times and markers in a turned capture frame: still, dropped, swinging, settled."""
+        rng = np.random.default_rng(seed)
+        times = np.arange(450) / 100.0
+        since = np.maximum(times - 0.3, 0.0)
+        part = np.where(times > 0.3, 1 - np.exp(-3 * since) * np.cos(15 * since), 0.0)
+        off = self.nominal + 3e-4 * rng.standard_normal(self.nominal.shape)
+        moved = off + part[:, None, None] * self.displacement(weight)
+        seen = moved @ TURN.T + [0.3, -0.2, 1.4]
+        return times, seen + 2e-5 * rng.standard_normal(seen.shape)
+
+
+@pytest.fixture
+def rig(branch_folder, small) -> Rig:
+    skeleton = small.skeleton
+    path = skeleton.nodes
+    nominal = np.vstack([path[80] + [0.0, 0.012, 0.0], path[70] + [0.0, -0.014, 0.0],
+                         path[60] + [0.012, 0.0, 0.01], path[4] + [0.015, 0.0, 0.0],
+                         path[8] + [0.0, 0.02, 0.0]])
+    grasp = tuple(float(x) for x in path[78])
+    return Rig(branch_folder, nominal, grasp, small.mesh(slice_length=1.3, sides=10))
+
+
+def write_csv(path, times, seen, unit="mm"):
+    scale = {"mm": 1e3, "m": 1.0}[unit]
+    names = [f"tip{k + 1} {axis} ({unit})" for k in range(seen.shape[1]) for axis in "XYZ"]
+    rows = [",".join(f"{value:.7g}" for value in (time, *(scale * row.ravel())))
+            for time, row in zip(times, seen, strict=True)]
+    path.write_text("\n".join([",".join(["Time (s)", *names]), *rows]) + "\n")
+
+
+def write_c3d(path, times, seen):
+    import ezc3d
+
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    file["parameters"]["POINT"]["LABELS"]["value"] = [
+        f"Tip - {k + 1}" for k in range(seen.shape[1])]
+    points = np.ones((4, seen.shape[1], len(times)))
+    points[:3] = 1e3 * seen.transpose(2, 1, 0)
+    file["data"]["points"] = points
+    file.write(str(path))
+
+
+def write_nominal(path, nominal):
+    lines = [f"tip{k + 1},{x:.6f},{y:.6f},{z:.6f}" for k, (x, y, z) in enumerate(1e3 * nominal)]
+    path.write_text("\n".join(["label,x_mm,y_mm,z_mm", *lines]) + "\n")
+
+
+def last_line(capsys):
+    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+
+@pytest.mark.slow
+def test_from_one_load_to_another_by_commands(rig, tmp_path, capsys):
+    """import-pull of a CSV and of a C3D at two weights; estimate from the first; the second's
+    displacement is predicted to within 5 %, and E lies in its interval.
+    """
+    write_nominal(tmp_path / "nominal.csv", rig.nominal)
+    times, light = rig.recording(WEIGHTS[0])
+    write_csv(tmp_path / "light.csv", times, light)
+    _, heavy = rig.recording(WEIGHTS[1], seed=1)
+    write_c3d(tmp_path / "heavy.c3d", times, heavy)
+    grasp = [str(x) for x in rig.grasp]
+    for source, weight in zip(("light.csv", "heavy.c3d"), WEIGHTS, strict=True):
+        assert call(["import-pull", str(rig.folder), str(tmp_path / source),
+                     "--name", source.split(".", 1)[0], "--weight", str(weight), "--own-weight",
+                     "--nominal", str(tmp_path / "nominal.csv"), "--grasp-point", *grasp,
+                     "--json", "--progress", "none"]) == 0
+        line = last_line(capsys)
+        assert np.allclose(line["displacement_m"], rig.displacement(weight), atol=1.5e-3)
+        assert line["settled_s"] > 1.0 and line["registration_rms_m"] < 1e-3
+    assert call(["estimate", str(rig.folder), "--pull", "light", "--fractions", "0.5",
+                 "--json", "--progress", "none"]) == 0
+    line = last_line(capsys)
+    low, high = line["young_interval_pa"][0]
+    assert low < YOUNG < high and high / low < 1.5
+    assert line["young_deviation"]["mesh"] > 0
+    assert call(["predict", str(rig.folder), "--pull", "heavy", "--weight", str(WEIGHTS[1]),
+                 "--json", "--progress", "none"]) == 0
+    found = np.array(last_line(capsys)["displacement_m"])[:3]
+    true = rig.displacement(WEIGHTS[1])[:3]
+    assert np.linalg.norm(found - true) < 0.05 * np.linalg.norm(true)
+
+
+def test_what_a_load_needs(rig, tmp_path):
+    """No point, two loads, clouds instead of markers: each is said."""
+    times, seen = rig.recording(0.25)
+    write_csv(tmp_path / "light.csv", times, seen)
+    common = ["import-pull", str(rig.folder), str(tmp_path / "light.csv"), "--name", "l",
+              "--progress", "none"]
+    assert call([*common, "--weight", "1"]) == 2
+    assert call([*common, "--weight", "1", "--load", "0", "0", "1", "--grasp-point", "0", "0",
+                 "0"]) == 2
+    assert call(["predict", str(rig.folder), "--weight", "1", "--progress", "none"]) == 2
+    assert not (rig.folder / "pulls" / "l").exists()
+
+
+def swinging(decay, count=400, noise=1e-5):
+    rng = np.random.default_rng(0)
+    times = np.arange(count) / 100.0
+    positions = np.zeros((count, 2, 3))
+    since = np.maximum(times - 0.3, 0.0)
+    positions[:, 0, 2] = -0.02 * np.where(
+        times > 0.3, 1 - np.exp(-decay * since) * np.cos(20 * since), 0.0)
+    positions[:, 1, 0] = 0.3
+    return Observations(times, positions + noise * rng.standard_normal(positions.shape))
+
+
+def test_the_settled_end_is_found():
+    """It begins where the swing is under 1 % of the displacement, and gives its mean."""
+    found = settled(swinging(4.0), "beam")
+    assert found.positions[:, 0, 2] == pytest.approx(-0.02, abs=1e-4)
+    assert found.duration == pytest.approx(3.69 - np.log(200) / 4.0, abs=0.25)
+    assert found.noise == pytest.approx(1e-5, rel=0.3) and not found.warnings
+
+
+def test_a_swing_that_has_not_ended_is_refused():
+    """The recording stops while it still moves; nothing is made of it."""
+    with pytest.raises(InputError, match="before the branch is at rest"):
+        settled(swinging(0.2), "beam")
+    with pytest.raises(InputError, match="no marker moves"):
+        still = swinging(4.0)
+        settled(Observations(still.times, np.zeros_like(still.positions) + 1.0), "beam")
+
+
+def test_creep_is_told_and_a_marker_may_vanish():
+    """A slow drift of 0.6 % is a warning; a marker that is lost for a while does not matter."""
+    seen = swinging(6.0)
+    positions = seen.positions.copy()
+    positions[150:, 0, 2] -= 0.02 * 0.008 * np.linspace(0, 1, 250)
+    positions[200:230, 0] = np.nan
+    found = settled(Observations(seen.times, positions), "beam")
+    assert any("creeps" in warning for warning in found.warnings)
+    assert np.isfinite(found.positions).all()
+
+
+def test_registration_by_name_by_fit_and_around_a_stray_marker(tmp_path):
+    """Names pair markers however they are written; without names the best order does; a marker
+    far off is left out and named.
+    """
+    rng = np.random.default_rng(1)
+    nominal = 0.1 * rng.standard_normal((6, 3))
+    points = nominal @ TURN.T + 0.5
+    labels = [f"Tip - {k}" for k in range(6)]
+    found = register(points[::-1], labels[::-1], [f"tip{k}" for k in range(6)], nominal, "b")
+    assert np.allclose(found.apply(points[::-1]), nominal[::-1]) and found.rms < 1e-12
+    order = rng.permutation(6)
+    mixed = register(points[order], [f"u{k}" for k in range(6)], labels, nominal, "b")
+    assert np.allclose(mixed.apply(points), nominal) and "as fits best" in mixed.warnings[0]
+    points[2] += 0.05
+    stray = register(points, labels, labels, nominal, "b")
+    assert np.allclose(stray.apply(points)[[0, 1, 3, 4, 5]], nominal[[0, 1, 3, 4, 5]])
+    assert any("Tip - 2" in warning and "left out" in warning for warning in stray.warnings)
+    with pytest.raises(InputError, match="Three markers"):
+        register(points[:2], labels[:2], labels, nominal, "b")
+    write_nominal(tmp_path / "n.csv", nominal)
+    assert np.allclose(read_nominal(tmp_path / "n.csv")[1], nominal, atol=1e-6)
+    (tmp_path / "bad.csv").write_text("label,x_m,y_m,z_m\na,1,2\n")
+    with pytest.raises(InputError, match="no table of markers"):
+        read_nominal(tmp_path / "bad.csv")
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded beam is not here")
+def test_the_recorded_beam_settles_alike_in_both_files(branch_folder, tmp_path):
+    """The silicone beam's CSV and C3D give the same displacement: about 17 mm at the tip."""
+    moved = []
+    for number, source in enumerate(("beam_load52_V2_a.csv", "beam_load52_V2_a.c3d")):
+        name = f"beam{number}"
+        assert call(["import-pull", str(branch_folder), str(SHARED / source), "--name", name,
+                     "--weight", "0.51012", "--grasp-point", "0", "0", "0.3", "--progress",
+                     "none"]) == 0
+        pull = read_pull(branch_folder / "pulls" / name)
+        moved.append(pull.observations.positions[-1] - np.array(pull.entry.rest_points_m))
+    assert np.allclose(*moved, atol=2e-6)
+    assert np.linalg.norm(moved[0][:3], axis=1) == pytest.approx(0.0173, abs=8e-4)
