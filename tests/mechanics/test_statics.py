@@ -295,3 +295,72 @@ def test_a_column_that_must_buckle_first():
     pushed = result.displacement + 1e-5 * rng.standard_normal(mesh.nodes.shape)
     again = solve_static(model, grasp=grasp, pose=pose, start=pushed).require()
     assert again.strain_energy == pytest.approx(result.strain_energy, rel=1e-6)
+
+
+@pytest.fixture(scope="module")
+def column():
+    """A straight bar of 0.6 m, 12 mm square; its top face."""
+    mesh = box_mesh((0.012, 0.012, 0.6), (1, 1, 40))
+    return mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.6 - 1e-9)
+
+
+@pytest.mark.parametrize(("mode", "factor"), [("pinned", 20.19), ("clamped", 4 * np.pi**2)])
+def test_pressed_column_buckles(column, mode, factor):
+    """A straight bar pressed on its axis buckles at Euler's load, within 4 %, and bends on."""
+    mesh, top = column
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.of_nodes(mesh, top, mode)
+    result = solve_static(model, grasp=grasp, pose=grasp.rest_pose - [0, 0, 0.005, 0, 0, 0])
+    assert result.converged and result.status == "converged", result.message
+    assert np.abs(result.displacement[:, :2]).max() > 0.02
+    euler = factor * YOUNG * 0.012**4 / 12 / 0.6**2
+    assert -result.reaction_force[2] == pytest.approx(euler, rel=0.04)
+
+
+def test_symmetric_column_says_that_its_side_is_chance(column):
+    """Clamped at both ends nothing tells the sides apart: it warns and says where it snapped."""
+    mesh, top = column
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.of_nodes(mesh, top, "clamped")
+    result = solve_static(model, grasp=grasp, pose=grasp.rest_pose - [0, 0, 0.01, 0, 0, 0])
+    assert result.converged
+    assert result.snapped_at and any("buckled" in warning for warning in result.warnings)
+
+
+def test_dead_load_beyond_buckling(column):
+    """1.1 times Euler's load bends a cantilever sideways as the elastica of that load does."""
+    mesh, top = column
+    model = BranchModel(mesh, young=YOUNG, poisson=0.0, density=900, gravity=None)
+    grasp = Grasp.of_nodes(mesh, top, "pinned")
+    euler = np.pi**2 * YOUNG * 0.012**4 / 12 / 4 / 0.6**2
+    result = solve_static(model, grasp=grasp, grasp_force=[0, 0, -1.1 * euler])
+    assert result.converged, result.message
+    moved = grasp.weights @ result.displacement[grasp.nodes] / 0.6
+    # P / P_Euler = (2 K(k) / pi)^2 with k = sin(alpha / 2); sideways 2 k / (pi/2 sqrt(P/PE)).
+    from scipy.optimize import brentq
+    from scipy.special import ellipk
+    k = brentq(lambda k: (2 * ellipk(k * k) / np.pi) ** 2 - 1.1, 1e-3, 0.99)
+    assert np.linalg.norm(moved[:2]) == pytest.approx(2 * k / (np.pi / 2 * np.sqrt(1.1)), rel=0.03)
+
+
+@pytest.mark.parametrize("move", [[0, 0, -0.015], [0, 0, -0.021], [0.01, 0.01, -0.015]])
+def test_neo_hookean_bears_strong_compression(move):
+    """A block pressed to 30 % of its height, or aslant to half of it, finds a stable balance."""
+    mesh = box_mesh((0.01, 0.01, 0.03), (2, 2, 6))
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None,
+                        material="stable_neo_hookean")
+    grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.03 - 1e-9), "clamped")
+    result = solve_static(model, grasp=grasp, pose=grasp.rest_pose + [*move, 0, 0, 0])
+    assert result.converged, result.message
+    assert result.min_det_f > 0
+    assert result.residual_history[-1] < 1e-6
+
+
+def test_soft_stvk_points_to_the_other_material():
+    """Where St. Venant-Kirchhoff gives way the message says so, and what bears it."""
+    mesh = box_mesh((0.01, 0.01, 0.03), (2, 2, 6))
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.03 - 1e-9), "clamped")
+    result = solve_static(model, grasp=grasp, pose=grasp.rest_pose - [0, 0, 0.015, 0, 0, 0])
+    assert not result.converged
+    assert "stable_neo_hookean" in result.message

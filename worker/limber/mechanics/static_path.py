@@ -6,6 +6,7 @@ import numpy as np
 
 from limber.mechanics.factor import NotPositiveDefiniteError
 from limber.mechanics.grasp import pose_between
+from limber.mechanics.materials import Material
 from limber.mechanics.model import InternalState
 from limber.mechanics.static_problem import Problem, Target, make_result, strain_warnings
 from limber.mechanics.static_result import StaticResult
@@ -13,6 +14,7 @@ from limber.mechanics.static_snap import settle
 from limber.mechanics.strain import principal_stretch
 from limber.progress import Progress
 
+_SOFT_DET_F = 0.75
 _SNAP = 1 / 64
 """Part of the way taken when the branch has to snap."""
 
@@ -199,7 +201,8 @@ class Path:
         stretch = principal_stretch(self.model, self.displacement)
         message = "" if converged else (
             f"{self.trouble}; stopped at {100 * self.reached:.1f} % of the way, where the branch"
-            f" is stretched most {stretch.at} ({100 * (stretch.value - 1):.1f} %)")
+            f" is stretched most {stretch.at} ({100 * (stretch.value - 1):.1f} %)"
+            + self._softening())
         warnings = strain_warnings(stretch) + buckling_warnings(self.snaps)
         load = self.load_at(self.reached)
         return make_result(self.problem, self.displacement, self.state, load, converged=converged,
@@ -207,6 +210,14 @@ class Path:
                            iterations=self.iterations, residual_history=self.history,
                            seconds=time.perf_counter() - self.started, reached=self.reached,
                            snapped_at=[part for part, _ in self.snaps])
+
+    def _softening(self) -> str:
+        """Say so where the material, not the branch, is what gives way."""
+        if (self.model.material != Material.st_venant_kirchhoff
+                or self.state.min_det_f > _SOFT_DET_F):
+            return ""
+        return (f"; it is compressed to {100 * self.state.min_det_f:.0f} % of its volume, where St."
+                " Venant-Kirchhoff goes soft: stable_neo_hookean bears more")
 
 
 def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:
