@@ -65,7 +65,7 @@ def test_second_order_in_the_step(grasp, trained):
     reduced, ends = trained[0], []
     times, poses = pull(grasp, [-0.01, 0.02, 0.0], 9)
     poses = poses + np.array([0.03, 0, -0.012, 0, 0, 0])
-    for step in (0.005, 0.0025, 0.00125, 0.0003125):
+    for step in (0.0025, 0.00125, 0.000625, 0.00015625):
         settings = NewmarkSettings(max_step=step, tolerance=1e-9)
         ends.append(simulate_reduced(reduced, poses=poses, times=times, settings=settings))
     last = [reduced.displacement_of(run.coordinates[4]) for run in ends]

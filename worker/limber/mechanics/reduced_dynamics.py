@@ -13,13 +13,16 @@ from scipy.interpolate import CubicSpline
 
 from limber.errors import InputError
 from limber.mechanics.dynamics import NewmarkSettings
-from limber.mechanics.grasp import check_pose
+from limber.mechanics.grasp import check_pose, pose_between
 from limber.mechanics.pose_path import unwrapped
 from limber.mechanics.reduced import ReducedModel, ReducedState, solved_raised
 from limber.progress import SILENT, Progress
 
 _HALVINGS = 6
 _NEAR = 1e-5
+_JUMP = 2e-3
+"""Grasp's motion off its old velocity, as part of the extent, that a first step foresees."""
+_LIVE_HALVINGS = 3
 _NEWMARK = NewmarkSettings()
 
 
@@ -79,6 +82,7 @@ class ReducedStepper:
         zero = np.zeros(model.size)
         self.state = state if isinstance(state, ReducedMotionState) else ReducedMotionState(
             0.0, state.coordinates.copy(), zero, zero.copy())
+        self.pose = None if isinstance(state, ReducedMotionState) else state.pose
         self.iteration_count = 0
         self.strain_energy = 0.0
         self.out = zero.copy()
@@ -94,14 +98,39 @@ class ReducedStepper:
         The grasp's velocity is that of the straight way there, its acceleration 0: poses that
         come live, with noise, must not shake the branch by their second difference.
         """
-        held = self.model.held.at(check_pose(pose))
+        return self._move(check_pose(pose), step, _LIVE_HALVINGS)
+
+    def _move(self, pose: np.ndarray, step: float, halvings: int) -> bool:
+        held = self.model.held.at(pose)
         count = len(held)
-        return self.step(held, (held - self.state.coordinates[:count]) / step, np.zeros(count),
-                         step)
+        velocity = (held - self.state.coordinates[:count]) / step
+        if self.step(held, velocity, np.zeros(count), step, foresee=True):
+            self.pose = pose
+            return True
+        # A branch pressed on its axis buckles within the step: inertia tells shorter ones where.
+        return halvings > 0 and self.pose is not None and all(
+            self._move(goal, step / 2, halvings - 1)
+            for goal in (pose_between(self.pose, pose, 0.5), pose))
+
+    def begin(self, held_acceleration: np.ndarray) -> None:
+        """Set the acceleration that a state at rest starts with when the grasp starts to move.
+
+        Without it the first step would cost the motion its second order.
+        """
+        mass, count = self.model.mass, len(held_acceleration)
+        _, force = self.model.energy_force(self.state.coordinates)
+        right = (self.load - force)[count:] - mass[count:, :count] @ held_acceleration
+        self.state.acceleration[:count] = held_acceleration
+        self.state.acceleration[count:] = np.linalg.solve(mass[count:, count:], right)
 
     def step(self, held: np.ndarray, held_velocity: np.ndarray, held_acceleration: np.ndarray,
-             step: float) -> bool:
-        """Take one Newmark step with the grasp coordinates given at its end."""
+             step: float, *, foresee: bool = False) -> bool:
+        """Take one Newmark step with the grasp coordinates given at its end.
+
+        Args:
+            foresee: Whether the first iteration takes a jump of the grasp into account: for
+                motion that is not smooth.
+        """
         model, old, settings = self.model, self.state, self.settings
         count = len(held)
         free = slice(count, None)
@@ -109,7 +138,9 @@ class ReducedStepper:
         by_mass = 1 / (settings.beta * step**2)
         # Without the acceleration: that of the stiff coordinates swings from step to step.
         q = old.coordinates + step * old.velocity
-        q[:count] = held
+        jump: np.ndarray | None = held - q[:count]
+        if not foresee or np.abs(jump).max() <= _JUMP * model.extent:
+            q[:count], jump = held, None
         viscous, massive = model.damping.stiffness, model.damping.mass
         mass_part = (by_mass + massive * by_rate) * model.mass[free, free]
         mass_coupling = (by_mass + massive * by_rate) * model.mass[free, :count]
@@ -130,9 +161,16 @@ class ReducedStepper:
                 force, tangent = self._add_viscous(force, tangent, velocity, by_rate, free)
             self.out = force + inertia - self.load
             right = -self.out[free]
+            if jump is not None:
+                # The rest follows the grasp's jump along the tangent, not after it.
+                right = right - (coupling - mass_coupling) @ jump
             change, _ = solved_raised(tangent, right)
             self.iteration_count += 1
             q[free] += change
+            if jump is not None:
+                q[:count] += jump
+                jump = None
+                continue
             gain = 0.5 * abs(float(right @ change))
             if not np.isfinite(gain):
                 return False
@@ -183,6 +221,8 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
     stepper = ReducedStepper(model, begin, nodal_forces=nodal_forces, settings=settings)
     stepper.state.time = float(times[0])
     stepper.strain_energy = model.strain_energy(stepper.state.coordinates)
+    if not isinstance(begin, ReducedMotionState):
+        stepper.begin(_held_at(model, path, float(times[0]))[2])
     rows, seconds, message = [_row(stepper, poses[0])], [], ""
     for number in range(1, len(times)):
         progress(number / len(times), "moving the reduced model", time=float(times[number]))

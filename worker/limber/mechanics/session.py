@@ -9,8 +9,9 @@ Commands, one JSON object a line on standard input:
 - ``{"command": "move", "id": 7, "pose": [x, y, z, rx, ry, rz]}``: grasp at this pose [m, rad]. The
   newest pose wins: poses that come while one is being solved replace each other.
 - ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points.
-- ``{"command": "dynamics", "on": true}``: let the branch move in time (60 steps a second) instead
-  of answering with equilibria. Needs the reduced model.
+- ``{"command": "dynamics", "on": true}``: let the branch move in time (about 60 steps a second, one
+  as soon as a pose comes) instead of answering with equilibria. Needs the reduced model. The grasp
+  follows at two lengths of the branch a second at most.
 - ``{"command": "close"}``, or the end of the input: end.
 
 Events, one JSON object a line on standard output; a client may leave them unread:
@@ -29,6 +30,7 @@ goes itself: each sees its input end.
 """
 
 import argparse
+import gc
 import json
 import os
 import queue
@@ -52,9 +54,11 @@ from limber.mechanics.reduced import (
     as_control_points,
 )
 from limber.mechanics.reduced_dynamics import ReducedStepper
+from limber.mechanics.reduced_strain import compile_kernels
 from limber.mechanics.session_frames import FrameWriter
 from limber.mechanics.session_trainer import load_branch, session_arguments
 from limber.mechanics.statics import solve_static
+from limber.threads import one_thread
 
 PROTOCOL = 1
 RATE = 60.0
@@ -62,8 +66,14 @@ RATE = 60.0
 _FULL_STEP = 0.05
 """Longest way to the wanted pose that the full model goes before it shows a frame, as part of the
 branch's extent."""
+_FASTEST = 2.0
+"""Fastest that the gripper moves in dynamics, in extents of the branch a second."""
+_SOONEST, _LATEST = 0.6, 1.4
+"""Bounds of a step's length in dynamics, as parts of 1 / RATE."""
+_STREAM_SECONDS = 0.1
 _CHECK_INTERVAL = 1.0
-_LIVE = NewmarkSettings(beta=0.3025, gamma=0.6)
+_SWITCH_SECONDS = 0.001
+_LIVE = NewmarkSettings(beta=0.3025, gamma=0.6, max_iterations=10)
 """Damps what is too quick for the step: poses of a mouse come in jumps."""
 _QUICK = ReducedStaticSettings(max_iterations=12, max_halvings=2, start_count=2)
 
@@ -80,6 +90,7 @@ class _Wishes:
         self.dynamics = False
         self.closed = False
         self.model: ReducedModel | None = None
+        self.surface_columns = np.empty((0, 0))
         self.model_event: dict[str, Any] = {}
 
     def __call__(self, **values: Any) -> None:
@@ -122,14 +133,17 @@ class _Events:
 class _Trainer:
     """The trainer's process, and the thread that listens to it."""
 
-    def __init__(self, arguments: list[str], wishes: _Wishes, events: _Events):
-        self._wishes, self._events = wishes, events
+    def __init__(self, arguments: list[str], surface: np.ndarray, wishes: _Wishes,
+                 events: _Events):
+        self._surface, self._wishes, self._events = surface, wishes, events
         self._last_check = 0.0
         self._checked: np.ndarray | None = None
         self.busy = True
         self._process = subprocess.Popen(
             [sys.executable, "-m", "limber.mechanics.session_trainer", *arguments],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            # Windows has no `nice` that the trainer could call itself.
+            creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0))
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _listen(self) -> None:
@@ -139,8 +153,7 @@ class _Trainer:
             except json.JSONDecodeError:
                 continue  # a native library's own words
             if content.get("event") == "model":
-                model = ReducedModel.read(Path(content.pop("path")))
-                self._wishes(model=model, model_event=content)
+                self._hand_over(ReducedModel.read(Path(content.pop("path"))), content)
                 self.busy = False
             elif content.get("event") == "check":
                 self._events.say(**content)
@@ -152,6 +165,12 @@ class _Trainer:
         if not self._wishes.closed:
             self._events.say(event="warning", message="the trainer has ended; the reduced model"
                              " is no longer checked, or there is none")
+
+    def _hand_over(self, model: ReducedModel, event: dict[str, Any]) -> None:
+        # All that can be made ready is, so that no frame waits for it.
+        columns = np.ascontiguousarray(
+            model.basis.columns[:, self._surface].reshape(model.size, -1))
+        self._wishes(model=model, surface_columns=columns, model_event=event)
 
     def check(self, state: ReducedState, move_id: int) -> None:
         """Ask for a comparison with the full model, if the trainer has time and news."""
@@ -198,16 +217,19 @@ class Session:
         self._young: np.ndarray = self.young
         self._surface_rest = self.model.mesh.nodes[self.surface]
         self._surface_columns = np.empty((0, 0))
-        self._next_step = 0.0
+        self._last_step = 0.0
 
     def run(self, trainer_arguments: list[str] | None) -> None:
         """Answer until the client closes or goes."""
+        self.model.equations([self.grasp])
+        _steady()
         self.events.say(event="hello", protocol=PROTOCOL, positions=str(self.frames.path),
                         vertex_count=len(self.surface), control_count=len(self.young),
                         rest_pose=self.grasp.rest_pose.tolist(), young_pa=self.young.tolist())
         threading.Thread(target=self._read_commands, daemon=True).start()
         if trainer_arguments is not None:
-            self.trainer = _Trainer(trainer_arguments, self.wishes, self.events)
+            self.trainer = _Trainer(trainer_arguments, self.surface, self.wishes,
+                                    self.events)
         answered = -1
         try:
             while (wish := self._wait(answered)) is not None:
@@ -227,7 +249,7 @@ class Session:
                 if self._take_over() and wishes.pose is not None:
                     new = True
                 if self.stepper is not None and wishes.pose is not None:
-                    left = self._next_step - time.monotonic()
+                    left = self._step_due(new) - time.monotonic()
                     if left <= 0:
                         return wishes.pose, wishes.move_id, wishes.received
                     wishes.changed.wait(left)
@@ -239,6 +261,14 @@ class Session:
                     self.trainer.check(self.state, answered)
         return None
 
+    def _step_due(self, new: bool) -> float:
+        """Return when the next step in time is due: soon after a new pose, else at the rate.
+
+        While poses stream in a step waits a little for the next one: it would just miss it.
+        """
+        streams = time.monotonic() - self.wishes.received < _STREAM_SECONDS
+        return self._last_step + (_SOONEST if new else _LATEST if streams else 1.0) / RATE
+
     def _take_over(self) -> bool:
         """Adopt a new reduced model, Young's modulus or way of answering; True if so."""
         wishes, changed = self.wishes, False
@@ -247,8 +277,7 @@ class Session:
             self.model = self.model.with_young(self.weights @ self._young)
         if wishes.model is not None:
             self._base, wishes.model, changed = wishes.model, None, True
-            self._surface_columns = np.ascontiguousarray(
-                self._base.basis.columns[:, self.surface].reshape(self._base.size, -1))
+            self._surface_columns = wishes.surface_columns
             self.events.say(**wishes.model_event)
         if changed and self._base is not None:
             self.reduced = self._base.with_young(self._young)
@@ -258,7 +287,7 @@ class Session:
             if wishes.dynamics and self.reduced is not None:
                 start = self.state or self.reduced.solve_static(self.full_pose)
                 self.stepper = ReducedStepper(self.reduced, start, settings=_LIVE)
-                self._next_step = time.monotonic()
+                self._last_step = time.monotonic() - 1 / RATE
             changed = True
         return changed
 
@@ -286,9 +315,11 @@ class Session:
     def _step(self, pose: np.ndarray, move_id: int, received: float) -> None:
         now = time.monotonic()
         # A step that came late is not made up for: the motion slows down, it does not burst.
-        self._next_step = max(self._next_step + 1 / RATE, now)
+        length = min(max(now - self._last_step, _SOONEST / RATE), _LATEST / RATE)
+        self._last_step = now
         stepper = self.stepper
-        good = stepper.move(pose, 1 / RATE)
+        self.full_pose = pose = self._within_reach(pose, length)
+        good = stepper.move(pose, length)
         if not good:
             self.stepper = ReducedStepper(self.reduced, self.reduced.solve_static(pose),
                                           settings=_LIVE)
@@ -297,6 +328,12 @@ class Session:
                       kinetic_energy_j=stepper.kinetic_energy, time_s=stepper.state.time,
                       wrench=stepper.reaction(pose))
 
+    def _within_reach(self, pose: np.ndarray, seconds: float) -> np.ndarray:
+        """Return how far the gripper gets towards a pose: a jump would whip the branch."""
+        way = _way(self.full_pose, pose, self.model.extent)
+        part = _FASTEST * self.model.extent * seconds / max(way, 1e-12)
+        return pose if part >= 1.0 else pose_between(self.full_pose, pose, part)
+
     def _publish(self, q: np.ndarray, received: float, *, wrench: tuple[np.ndarray, np.ndarray],
                  **numbers: float) -> None:
         moved = (q @ self._surface_columns).reshape(-1, 3)
@@ -304,8 +341,7 @@ class Session:
 
     def _full(self, pose: np.ndarray, move_id: int, received: float) -> bool:
         """Go towards the pose with the full model; return whether it was reached."""
-        way = np.linalg.norm(pose[:3] - self.full_pose[:3]) + 0.3 * self.model.extent * (
-            np.linalg.norm(pose[3:] - self.full_pose[3:]))
+        way = _way(self.full_pose, pose, self.model.extent)
         part = min(1.0, _FULL_STEP * self.model.extent / max(way, 1e-12))
         goal = pose if part == 1.0 else pose_between(self.full_pose, pose, part)
         result = solve_static(self.model, grasp=self.grasp, pose=goal, start=self.displacement)
@@ -354,6 +390,28 @@ class Session:
             self.wishes(closed=True)
         else:
             raise InputError(f"Command {command!r}.", "It is not known.", "")
+
+
+def _way(first: np.ndarray, second: np.ndarray, extent: float) -> float:
+    """Return how far two poses are apart [m]; a radian counts as 0.3 of the extent."""
+    return float(np.linalg.norm(second[:3] - first[:3])
+                 + 0.3 * extent * np.linalg.norm(second[3:] - first[3:]))
+
+
+def _steady() -> None:
+    """Take away what would hold up a frame now and then.
+
+    Kernels are loaded before the first frame needs them; BLAS keeps to one thread, for a second
+    one waits for the trainer to leave its core; a waiting thread gets the interpreter within a
+    millisecond; garbage collection looks at what is new only.
+    """
+    import scipy.linalg  # noqa: F401 (its BLAS must be there to be limited)
+
+    compile_kernels()
+    one_thread()
+    sys.setswitchinterval(_SWITCH_SECONDS)
+    gc.collect()
+    gc.freeze()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,5 +1,6 @@
 """Python client of an interactive session (limber.mechanics.session)."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -145,7 +146,8 @@ class InteractiveSession:
         self._listener.join(1.0)
         for stream in (self._process.stdin, self._process.stdout, self._errors):
             if stream and not stream.closed:
-                stream.close()
+                with contextlib.suppress(OSError):  # what was not sent has nobody to read it
+                    stream.close()
 
     def _listen(self) -> None:
         for line in self._process.stdout or ():

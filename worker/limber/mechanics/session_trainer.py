@@ -145,6 +145,7 @@ def _serve(options: argparse.Namespace, own: Path) -> None:
     if known is None:
         cache.store(refreshing.reduced, refreshing.snapshots)
     _announce(cache, refreshing, began)
+    _step_back()
     for line in sys.stdin:
         request = json.loads(line)
         if request.get("command") != "check":
@@ -154,6 +155,17 @@ def _serve(options: argparse.Namespace, own: Path) -> None:
         if refreshing.refresh_count > count:
             cache.store(refreshing.reduced, refreshing.snapshots)
             _announce(cache, refreshing, began)
+
+
+def _step_back() -> None:
+    """Run only when a core has nothing else to do: the session holds 60 Hz now.
+
+    Before there is a model the session waits for it, and less patience is called for.
+    """
+    if hasattr(os, "SCHED_IDLE"):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    elif hasattr(os, "nice"):
+        os.nice(14)
 
 
 def _check(refreshing: RefreshingModel, request: dict[str, Any]) -> None:
