@@ -13,10 +13,12 @@ from limber.geometry.mesh_quality import dihedral_angles, measure_quality, radiu
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.surface import Surface
 from limber.geometry.surface_checks import check_surface
-from limber.geometry.sweep import polygon_factor
+from limber.geometry.surface_distance import distance_to_surface
+from limber.geometry.sweep import bending_factor, polygon_factor, rings
 from limber.geometry.tet_mesh import TetMesh
 from limber.geometry.tetrahedra import MeshSettings, mesh_branch, tetrahedralise
 from limber.geometry.tubes import branch_surface
+from limber.mechanics import BranchModel, solve_static
 
 
 def test_branch_surface_is_closed_and_of_the_right_volume(y_skeleton):
@@ -149,6 +151,64 @@ def test_sweep_is_sound_repeatable_and_keeps_volume(forked_branch):
     assert quality.min_dihedral_deg > 3 and first.mesh.volumes.min() > 0
     boundary = check_surface(Surface(first.mesh.nodes, first.mesh.surface_faces()))
     assert boundary.watertight and boundary.piece_count == 1
+
+
+@pytest.mark.parametrize(("thick", "thin"), [(0.005, 0.005), (0.008, 0.003)])
+def test_default_mesh_bends_as_beam_theory_says(thick, thin):
+    """A cantilever's tip moves under a force as Euler and Bernoulli have it, within 0.5 %."""
+    along = np.linspace(0, 0.5, 40)
+    skeleton = Skeleton.from_edges(np.column_stack([0 * along, 0 * along, along]),
+                                   np.arange(40) - 1, np.linspace(thick, thin, 40))
+    mesh = mesh_branch(skeleton).mesh
+    length = mesh.nodes[:, 2].max()
+    tip = np.flatnonzero(mesh.nodes[:, 2] > length - 1e-9)
+    model = BranchModel(mesh, young=1e8, poisson=0.35, density=900, gravity=None,
+                        fixed=mesh.nodes[:, 2] < 1e-9, material="linear")
+    place = np.linspace(0, length, 4001)
+    radius = np.interp(place, [0, 0.5], [thick, thin])
+    share = (length - place)**2 / (1e8 * np.pi * radius**4 / 4)
+    moved = 1e-3 * np.sum((share[1:] + share[:-1]) / 2 * np.diff(place))
+    for k in (0, 1):
+        forces = np.zeros((mesh.node_count, 3))
+        forces[tip, k] = 1e-3 / len(tip)
+        displacement = solve_static(model, nodal_forces=forces).require().displacement
+        assert displacement[tip, k].mean() == pytest.approx(moved, rel=0.005)
+
+
+@pytest.mark.parametrize("sides", [4, 6, 9])
+def test_swept_sections_have_the_circles_second_moment(sides):
+    """Second moment of area of the polygon, by Green's theorem, is a unit circle's."""
+    corner = rings(np.zeros((1, 3)), np.ones(1), np.eye(3)[:1], np.eye(3)[1:2], sides,
+                   bending_factor(sides))[0, :, :2]
+    after = np.roll(corner, -1, axis=0)
+    twice = corner[:, 0] * after[:, 1] - after[:, 0] * corner[:, 1]
+    for k in (0, 1):
+        moment = (twice * (corner[:, k]**2 + corner[:, k] * after[:, k] + after[:, k]**2)).sum()
+        assert moment / 12 == pytest.approx(np.pi / 4, rel=1e-12)
+
+
+def test_quality_states_the_distance_from_the_surface(forked_branch):
+    """The mesh of the default sweep lies within a tenth of the radius of the rounded surface."""
+    skeleton = forked_branch.skeleton
+    surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
+    quality = measure_quality(mesh_branch(skeleton).mesh, surface.volume, skeleton, surface)
+    assert 1 <= quality.elements_across < 1.6
+    assert 0.02 < quality.surface_distance_mean < 0.1
+    assert quality.fork_distance_mean < 0.12 and quality.fork_distance_max < 0.5
+    assert quality.surface_distance_max_m < 0.5 * skeleton.radius.max()
+
+
+def test_distance_to_a_surface_is_exact():
+    """Points around a box: distances from faces, edges and corners, inside and out."""
+    import trimesh
+
+    box = trimesh.creation.box((2, 2, 6))
+    surface = Surface(np.asarray(box.vertices, float), np.asarray(box.faces))
+    points = np.random.default_rng(2).uniform(-4, 4, (400, 3))
+    excess = np.abs(points) - [1, 1, 3]
+    outside = np.linalg.norm(np.maximum(excess, 0), axis=1)
+    expected = np.where(outside > 0, outside, -excess.max(axis=1))
+    np.testing.assert_allclose(distance_to_surface(points, surface), expected, atol=1e-12)
 
 
 def test_sweep_joins_twigs_all_around():

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton import Skeleton
+from limber.geometry.surface import Surface
 from limber.geometry.tet_mesh import EDGES, TetMesh
 
 
@@ -23,6 +24,11 @@ class MeshQuality:
         mean_radius_ratio: Its mean.
         elements_across: Median over the nodes of the skeleton of the diameter over the mean edge
             of the elements there; None without a skeleton.
+        surface_distance_mean: Mean distance of the mesh's boundary (its corners, edge middles and
+            face centres) from the surface, in local radii; None without a surface.
+        surface_distance_max_m: The largest [m].
+        fork_distance_mean: Mean of those that lie within two radii of a fork, in radii.
+        fork_distance_max: The largest of them, in radii.
     """
 
     tet_count: int
@@ -32,20 +38,49 @@ class MeshQuality:
     min_radius_ratio: float
     mean_radius_ratio: float
     elements_across: float | None
+    surface_distance_mean: float | None = None
+    surface_distance_max_m: float | None = None
+    fork_distance_mean: float | None = None
+    fork_distance_max: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self)
 
 
 def measure_quality(mesh: TetMesh, surface_volume: float, skeleton: Skeleton | None = None,
-                    ) -> MeshQuality:
-    """Measure a mesh against the surface it fills [m^3] and, if given, its skeleton."""
+                    surface: Surface | None = None) -> MeshQuality:
+    """Measure a mesh against the surface it fills (volume [m^3]) and, if given, its skeleton."""
     ratio = radius_ratios(mesh)
     volume = float(mesh.volumes.sum())
+    distances = {} if skeleton is None or surface is None else _surface_distances(
+        mesh, skeleton, surface)
     return MeshQuality(
         mesh.tet_count, volume, volume / surface_volume, float(dihedral_angles(mesh).min()),
         float(ratio.min()), float(ratio.mean()),
-        None if skeleton is None else _elements_across(mesh, skeleton))
+        None if skeleton is None else _elements_across(mesh, skeleton), **distances)
+
+
+def _surface_distances(mesh: TetMesh, skeleton: Skeleton, surface: Surface) -> dict[str, Any]:
+    from limber.geometry.surface_distance import distance_to_surface
+
+    corner = mesh.nodes[mesh.surface_faces()]
+    points = np.vstack([corner.reshape(-1, 3), corner.mean(axis=1),
+                        ((corner + corner[:, [1, 2, 0]]) / 2).reshape(-1, 3)])
+    points = np.unique(points, axis=0)
+    distance = distance_to_surface(points, surface)
+    _, near = cKDTree(skeleton.nodes).query(points)
+    share = distance / np.maximum(skeleton.radius[near], 1e-300)
+    found: dict[str, Any] = {"surface_distance_mean": float(share.mean()),
+                             "surface_distance_max_m": float(distance.max())}
+    forks = skeleton.forks()
+    if len(forks):
+        away, fork = cKDTree(skeleton.nodes[forks]).query(points)
+        at_fork = away < 2 * skeleton.radius[forks][fork]
+        if at_fork.any():
+            local = distance[at_fork] / skeleton.radius[forks][fork[at_fork]]
+            found |= {"fork_distance_mean": float(local.mean()),
+                      "fork_distance_max": float(local.max())}
+    return found
 
 
 def dihedral_angles(mesh: TetMesh) -> np.ndarray:

@@ -91,7 +91,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         surface.write_ply(stage.path("surface.ply"))
         mesh.write(stage.path("mesh.vtu"))
         up = np.array(settings.up) / np.linalg.norm(settings.up)
-        quality = measure_quality(mesh, surface.volume, skeleton)
+        quality = measure_quality(mesh, surface.volume, skeleton, surface)
         stage.result.update({
             "point_count": len(surface.vertices), "node_count": skeleton.node_count,
             "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,

@@ -147,7 +147,7 @@ def write_geometry(stage: Any, skeleton: Skeleton, settings: ReconstructSettings
 
 def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed: MeshResult,
              kept: Skeleton) -> dict[str, Any]:
-    quality = measure_quality(meshed.mesh, surface.volume, kept)
+    quality = measure_quality(meshed.mesh, surface.volume, kept, surface)
     return {
         "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
         "length_m": skeleton.length, "main_length_m": float(

@@ -31,7 +31,7 @@ class MeshSettings(BaseModel):
     mesh_sides: int = Field(
         6, ge=4, le=24, description="Sides of fTetWild's cross-sections; the sweep has six.")
     mesh_spacing: float = Field(
-        4.0, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
+        2.5, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
     mesh_time_limit: float = Field(20.0, gt=0, description="fTetWild's time limit [s].")
     mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
 

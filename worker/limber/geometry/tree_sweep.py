@@ -1,6 +1,7 @@
 """Our own tetrahedra for forked branches, swept along the axes: deterministic and quick.
 
-Each run is a stack of prisms around its axis, six sides, or four for a thin twig. A twig grows out
+Each run is a stack of prisms around its axis, six sides, or four for a thin twig, with the second
+moment of area of the round section, so that it bends like one. A twig grows out
 of its carrier's side: the carrier has a slice there as long as the twig is thick, and one or two
 of that slice's side faces are the twig's first cross-section. The block between them and the
 twig's first ring is a fan of tetrahedra around that ring's centre.
@@ -15,11 +16,12 @@ from scipy.spatial import cKDTree
 from limber.errors import MeshingError
 from limber.geometry.cylinder_mesh import split_wedges
 from limber.geometry.skeleton import Skeleton
-from limber.geometry.sweep import any_normal, frames, rings, tangents
+from limber.geometry.sweep import any_normal, bending_factor, frames, rings, tangents
 from limber.geometry.tet_mesh import TetMesh
 
 _FLAT = 0.02  # a tetrahedron's shape under that (1 is regular) is avoided
 _SHIFTS = (1, -1, 2, -2, 3, -3)  # where else a twig's slice may go, in its own lengths
+_CLAMP_SLICES = (1.0, 3.0)  # where the first slices end, in radii of the root
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
 
@@ -36,7 +38,7 @@ class SweptTree:
     left_out: list[int] = field(default_factory=list)
 
 
-def sweep_tree(skeleton: Skeleton, *, spacing: float = 4.0) -> SweptTree:
+def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
     """Sweep prisms along each run of a skeleton and join them at the forks.
 
     Args:
@@ -252,6 +254,12 @@ class _TreeSweep:
         marks = [start, *[v for v in fixed if start < v < axis.length], axis.length]
         inside = {(round(w.low, 12), round(w.high, 12)) for w in windows}
         places = [start]
+        if start == 0.0 and len(marks) > 1:
+            # Short slices at the clamp, which keeps the section from narrowing where it is
+            # stretched: long ones there made a cantilever 0.4 % too stiff, at any length elsewhere.
+            near = [g * float(axis.radius[0]) for g in _CLAMP_SLICES]
+            places += [v for v in near if v + near[0] < marks[1]]
+            marks[0] = places[-1]
         for low, high in itertools.pairwise(marks):
             size = self._spacing * float(axis.radius_at((low + high) / 2))
             within = any(a <= low + 1e-9 and high <= b + 1e-9 for a, b in inside)
@@ -324,7 +332,7 @@ class _TreeSweep:
         centre = axis.at(start)
         order, turn = _matched(known[patch.loop], centre, tangent)
         ring = rings(centre[None], np.array([radius]), turn[None],
-                     np.cross(tangent, turn)[None], sides)[0]
+                     np.cross(tangent, turn)[None], sides, bending_factor(sides))[0]
         tets, quality = _block(known, patch.loop[order], triangles, centre, ring)
         return None if quality < _FLAT else _Joint(start, tangent, turn, tets, quality)
 
@@ -363,7 +371,7 @@ def _tube_mesh(axis: _Axis, where: np.ndarray, sides: int, first_normal: np.ndar
     if first_tangent is not None:
         tangent[0] = first_tangent
     normals, binormals = frames(centres, tangent, first_normal)
-    ring = rings(centres, axis.radius_at(where), normals, binormals, sides)
+    ring = rings(centres, axis.radius_at(where), normals, binormals, sides, bending_factor(sides))
     nodes = np.concatenate([centres[:, None], ring], axis=1).reshape(-1, 3)
     return TetMesh(nodes, split_wedges(_wedges(len(where), sides))), centres
 
