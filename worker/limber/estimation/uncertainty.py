@@ -9,6 +9,8 @@ from limber.estimation.objective import Evaluation, Objective
 
 OUTLIER = 4.5
 """Standardised residual (RMS over axes) from which a measurement is named an outlier."""
+OUTLIER_SHARE = 0.15
+"""Above this share of residuals far off, the others are not the truth about the noise."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +45,16 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     """
     jacobian, residual = evaluation.jacobian, evaluation.residual
     freedom = max(len(residual) - jacobian.shape[1], 1)
-    # Huber's proposal: residuals beyond 3 deviations count as 3.
-    clipped = np.clip(residual, -3 * _scale(residual), 3 * _scale(residual))
+    # Huber's proposal: residuals beyond 3 deviations count as 3. Where they are many they are no
+    # outliers, but a model that does not fit.
+    limit = 3 * _scale(residual)
+    stray = float(np.mean(np.abs(residual) > 1.5 * limit))
+    clipped = np.clip(residual, -limit, limit) if stray < OUTLIER_SHARE else residual
     factor = float(clipped @ clipped / freedom)
+    if _from_images(objective):
+        # Their stated error lasts from frame to frame: that residuals scatter less is no sign
+        # that it is smaller.
+        factor = max(factor, 1.0)
     _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
     spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
     repetition = repeated(objective.standardised(evaluation))
@@ -110,6 +119,11 @@ def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> l
                 found.append({"pull": forward.name, "time_s": float(forward.frames.times[frame]),
                               "what": "force", "deviations": float(forces[frame])})
     return sorted(found, key=lambda entry: -entry["deviations"])[:limit]
+
+
+def _from_images(objective: Objective) -> bool:
+    entries = [getattr(forward, "entry", None) for forward in objective.forwards]
+    return any(entry is not None and entry.observation in ("depth", "clouds") for entry in entries)
 
 
 def _scale(residual: np.ndarray) -> float:
