@@ -18,6 +18,7 @@ from limber.mechanics import (
     solve_static,
     young_weights,
 )
+from limber.mechanics.rest_shape import unloaded_rest_shape
 
 ELASTICA = Path(__file__).parents[3] / "shared" / "data" / "elastica"
 LENGTH, SIDE, YOUNG = 0.6, 0.008, 5e7
@@ -364,3 +365,26 @@ def test_soft_stvk_points_to_the_other_material():
     result = solve_static(model, grasp=grasp, pose=grasp.rest_pose - [0, 0, 0.015, 0, 0, 0])
     assert not result.converged
     assert "stable_neo_hookean" in result.message
+
+
+@pytest.mark.parametrize(("gravity", "young"), [((9.81, 0, 0), 2e7), ((6.9, 0, -6.9), 2e7)])
+def test_rest_shape_of_a_branch_that_sags_by_most_of_its_length(column, gravity, young):
+    """Rest shapes farther off than 60 % of the length: their load gives the scan to 0.1 mm."""
+    mesh, _ = column
+    model = BranchModel(mesh, young=young, poisson=0.35, density=900, gravity=gravity)
+    shape = unloaded_rest_shape(model)
+    assert np.linalg.norm(shape.nodes - mesh.nodes, axis=1).max() > 0.6 * 0.6
+    loaded = solve_static(model.with_rest_nodes(shape.nodes),
+                          start=mesh.nodes - shape.nodes).require()
+    corners = np.unique(mesh.tets[:, :4])
+    miss = np.linalg.norm(shape.nodes + loaded.displacement - mesh.nodes, axis=1)
+    assert miss[corners].max() < 1e-4
+
+
+def test_too_soft_to_stand():
+    """A column beyond self-buckling has no stable rest shape: it says so, and what to check."""
+    mesh = box_mesh((0.012, 0.012, 0.6), (1, 1, 30))
+    model = BranchModel(mesh, young=1e7, poisson=0.35, density=900, gravity=(0, 0, -9.81))
+    with pytest.raises(ConvergenceError, match="not stably") as caught:
+        unloaded_rest_shape(model)
+    assert "Young" in str(vars(caught.value)) or "Young" in str(caught.value)
