@@ -1,0 +1,104 @@
+"""The online estimator: corrected by the full model, honest without it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import Bench, measured
+from limber.estimation.alignment import frames_of
+from limber.estimation.online import OnlineEstimator, OnlineFrame
+from limber.estimation.online_exact import FullBranch, Here
+from limber.estimation.settings import EstimateSettings
+from limber.mechanics.reduced import ReducedSettings, build_reduced
+from limber.mechanics.reduced_training import TrainingSettings
+
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+@pytest.fixture(scope="module")
+def bench(small):
+    return Bench(small, slice_length=3.0, sides=6)
+
+
+@pytest.fixture(scope="module")
+def pull(small_pull):
+    return measured(small_pull, 8, points=5e-4, force=0.01)
+
+
+@pytest.fixture(scope="module")
+def batch(bench, pull):
+    return bench.fit([pull], EstimateSettings(hold_out=False, key_frames=16)).values.young
+
+
+@pytest.fixture(scope="module")
+def full(bench, pull):
+    return FullBranch(bench.mesh, bench.weights, pull.entry.grasp, bench.points, 0.35, 900.0,
+                      (0.0, 0.0, 0.0))
+
+
+def reduced_around(full, young, spread):
+    here = Here(full)._solver
+    model = full.model(young)
+    training = TrainingSettings(grasp_count=20, young_spread=spread)
+    return build_reduced(model, here.grasp, full.weights, young,
+                         ReducedSettings(size=48, training=training))[0]
+
+
+def followed(reduced, full, pull, exact, repeat=1):
+    estimator = OnlineEstimator(
+        reduced, pull.entry.grasp, full.mesh, full.rest_points,
+        position_sigma=pull.entry.sensor.position_sigma_m,
+        force_sigma=pull.entry.sensor.force_sigma_n, prior_deviation=0.8, exact=exact)
+    frames, states = frames_of(pull), []
+    for turn in range(repeat):
+        for index in range(len(frames)):
+            states.append(estimator.update(OnlineFrame(
+                frames.times[index] + 10.0 * turn, frames.poses[index],
+                frames.wrenches[index, :3], frames.positions[index])))
+    return estimator, states
+
+
+def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
+    """From few training grasps the reduced model alone misses; the full model sets it right, well
+    within the interval, and the interval says beforehand that nobody has checked.
+    """
+    reduced = reduced_around(full, 1.2 * TRUTH, 1.5)
+    alone, _ = followed(reduced, full, pull, None)
+    alone.settle()
+    estimator, states = followed(reduced, full, pull, Here(full))
+    end = estimator.settle()
+    deviation = np.sqrt(np.diag(estimator.covariance))
+    off, off_alone = (np.abs(np.log(found / batch)) for found in (end.young, alone.young))
+    assert np.all(off < deviation)
+    assert off.max() < 0.03 and off.max() < 0.5 * off_alone.max()
+    assert 0 < estimator.model_error < 0.1
+    assert not states[1].enough
+
+
+def test_a_basis_for_other_moduli_is_made_on_the_way(bench, pull, batch, full):
+    """Begun a factor of three too stiff, outside of what the training sampled."""
+    estimator, _ = followed(reduced_around(full, 3 * TRUTH, 1.3), full, pull, Here(full))
+    estimator.settle()
+    assert estimator.refresh_count >= 1
+    deviation = np.sqrt(np.diag(estimator.covariance))
+    assert np.all(np.abs(np.log(estimator.young / batch)) < np.maximum(2 * deviation, 0.02))
+
+
+def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, full):
+    """Standing still at the end narrows nothing: idle. Enough is said only where every modulus is
+    known to 2 %, which another pull could not improve by more than that.
+    """
+    reduced = reduced_around(full, TRUTH, 1.5)
+    _, states = followed(reduced, full, pull, Here(full))
+    assert not states[-1].enough and not any(state.idle for state in states)
+    quiet = pull.entry.model_copy(update={"sensor": pull.entry.sensor.model_copy(update={
+        "position_sigma_m": 2e-5, "force_sigma_n": 1e-4 * pull.entry.sensor.force_sigma_n})})
+    estimator, states = followed(reduced, full, replace(pull, entry=quiet), None, repeat=2)
+    assert states[-1].enough
+    assert np.sqrt(np.diag(estimator.covariance)).max() < 0.02
+    frames = frames_of(pull)
+    rest = OnlineFrame(99.0, frames.poses[0], np.full(3, np.nan), np.full((4, 3), np.nan))
+    for step in range(30):
+        state = estimator.update(replace(rest, time=99.0 + step))
+    assert state.idle
