@@ -15,7 +15,6 @@ from limber.geometry.generated import generate_branch, write_generated
 from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
 from limber.geometry.reconstruct import ReconstructSettings, reconstruct
 from limber.geometry.skeleton import Skeleton
-from limber.geometry.surface import Surface
 from limber.geometry.tet_mesh import TetMesh
 from limber.store import Branch
 
@@ -166,13 +165,3 @@ def test_mesh_a_box_in_millimetres(tmp_path):
     assert result["length_m"] == pytest.approx(0.1, rel=0.02)
     mesh = TetMesh.read(tmp_path / "b.branch" / "mesh.vtu")
     assert mesh.nodes[mesh.point_data["fixed"] == 1][:, 2].max() < 0.005
-
-
-def test_holes_in_a_surface_are_refused(tmp_path):
-    """An open surface names a place on the hole's edge."""
-    import trimesh
-
-    box = trimesh.creation.box((1, 1, 3))
-    Surface(np.asarray(box.vertices), np.asarray(box.faces)[2:]).write_ply(tmp_path / "open.ply")
-    with pytest.raises(InputError, match="open or double edges"):
-        mesh_surface(tmp_path / "open.ply", tmp_path / "b.branch")

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from limber.errors import InputError
+from limber.errors import InputError, MeshingError
 from limber.geometry.control_points import FRACTIONS
 from limber.geometry.marks import GRASP_FRACTION, mark
 from limber.geometry.mesh_quality import measure_quality
@@ -15,7 +15,7 @@ from limber.geometry.reconstruct import peak_memory_mb, require_file
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.skeleton_files import UNIT_METRES
 from limber.geometry.surface import Surface
-from limber.geometry.surface_checks import check_surface
+from limber.geometry.surface_input import usable_surface
 from limber.geometry.tetrahedra import MeshSettings, tetrahedralise
 from limber.geometry.upright import shortest_turn
 from limber.progress import SILENT, Progress
@@ -61,16 +61,20 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         warn: Gets each thing that the user should know.
 
     Raises:
-        InputError: the surface cannot be read, has holes, or crosses itself.
+        InputError: the surface cannot be read or is not that of one solid:
+            :func:`limber.geometry.surface_input.usable_surface`.
         MeshingError: fTetWild failed.
     """
     settings = settings or MeshSurfaceSettings()
     scale = UNIT_METRES[settings.unit]
-    surface = _closed(Surface.read(require_file(path, "A surface"), scale=scale), path)
+    surface, warnings = usable_surface(
+        Surface.read(require_file(path, "A surface"), scale=scale), path)
     branch = Branch.create(folder)
     digests = {"surface": file_digest(path)}
     if not force and branch.is_current("mesh", settings, digests=digests):
         return branch.manifest.stages["mesh"].result
+    for text in warnings:
+        warn(text)
     with branch.stage("mesh", settings, digests=digests) as stage:
         skeleton = section_axis(
             surface, None if settings.root is None else np.array(settings.root) * scale)
@@ -78,9 +82,14 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         thick = float(np.median(skeleton.radius))
         limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
                               mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
-        mesh, cached = tetrahedralise(
-            surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
-            settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
+        try:
+            mesh, cached = tetrahedralise(
+                surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
+                settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
+        except MeshingError as error:  # there are no axes to sweep along here
+            raise MeshingError(
+                error.seen, error.why, "Raise --mesh-time-limit or --mesh-memory-limit-mb, lower "
+                "--elements-across, or simplify the surface.") from error
         mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
                     density=settings.density, fractions=FRACTIONS,
                     grasp_fraction=settings.grasp_fraction)
@@ -101,7 +110,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
             "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count,
             "mesher": "ftetwild (cached)" if cached else "ftetwild", "watertight": True,
             "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb(),
-            "gravity_m_s2": -GRAVITY * np.array(alignment.rotation) @ up, "warnings": []})
+            "gravity_m_s2": -GRAVITY * np.array(alignment.rotation) @ up, "warnings": warnings})
         progress(1.0, "meshed", tets=mesh.tet_count)
     return branch.manifest.stages["mesh"].result
 
@@ -187,26 +196,6 @@ def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: 
     if turn:
         nodes, radius = nodes[::-1], radius[::-1]
     return Skeleton.from_edges(nodes, np.arange(len(nodes)) - 1, radius)
-
-
-def _closed(surface: Surface, path: Path) -> Surface:
-    if surface.volume < 0:
-        surface = Surface(surface.vertices, surface.faces[:, ::-1])
-    check = check_surface(surface)
-    if not check.watertight:
-        raise InputError(
-            f"{path} has {len(check.open_edges)} open or double edges, one at "
-            f"{np.round(check.open_edges[0], 4).tolist()} m.", "The surface must be closed.",
-            "Close its holes (in Blender: select non-manifold, fill), then mesh it again.")
-    if not check.oriented:
-        raise InputError(f"{path}: faces point in and out.", "They must be oriented alike.",
-                         "Recalculate its normals (in Blender: Shift N).")
-    if len(check.crossings):
-        raise InputError(
-            f"{path} crosses itself in {len(check.crossings)} places, one at "
-            f"{np.round(check.crossings[0], 4).tolist()} m.", "A solid does not overlap itself.",
-            "Unite its parts (in Blender: a Boolean modifier with Self), then mesh it again.")
-    return surface
 
 
 def _aligned(surface: Surface, skeleton: Skeleton, scale: float, settings: MeshSurfaceSettings,
