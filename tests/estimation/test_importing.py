@@ -1,10 +1,13 @@
 """Recordings of other programs."""
 
 import json
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from limber.cli import call
 from limber.errors import InputError
@@ -17,6 +20,7 @@ from limber.estimation.recording import read_pull, write_pull
 from limber.estimation.registration import rigid_fit
 from limber.estimation.streams import Stream, read_stream, write_stream
 from limber.perception.camera import D455, read_camera, write_camera
+from limber.perception.masks import read_mask
 from limber.perception.observe import list_frames, read_depth, write_depth
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -133,3 +137,53 @@ def test_c3d_holds_what_its_table_holds():
     assert labels[0] == "Tip - 1" and len(labels) == 6
     assert np.allclose(stream.values, table.values, atol=2e-6)
     assert np.allclose(stream.times, table.times, atol=1e-6)
+
+
+def test_masks_of_a_yolo_model_of_ones_own(branch_folder, source, monkeypatch, capsys):
+    """Colour images of an RGB-D folder go through ultralytics' interface (a stand-in here, with
+    its call and its shapes); each depth image gets the mask of the colour image nearest in time.
+    """
+    class StandIn:
+        names = {58: "potted plant"}  # noqa: RUF012
+
+        def __init__(self, _weights):
+            self.classes = None
+
+        def set_classes(self, classes):
+            self.classes = classes
+
+        def predict(self, image, **_options):
+            assert self.classes == ["branch"]
+            data = np.zeros((1, *image.shape[:2]))
+            data[0, :, image[0, 0, 2] // 50] = 1.0
+            return [types.SimpleNamespace(masks=types.SimpleNamespace(data=data))]
+
+    module = types.ModuleType("ultralytics")
+    module.YOLO = StandIn
+    monkeypatch.setitem(sys.modules, "ultralytics", module)
+    folder = source / "rgbd"
+    for sub in ("depth", "rgb"):
+        (folder / sub).mkdir(parents=True)
+    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    write_camera(folder / "camera.toml", camera)
+    lists = {"depth": [], "rgb": []}
+    for k in range(3):
+        write_depth(folder / "depth" / f"d{k}.png", np.full((6, 8), 1.25), camera)
+        Image.fromarray(np.full((6, 8, 3), 50 * k, np.uint8)).save(folder / "rgb" / f"c{k}.png")
+        lists["depth"].append(f"{k:.6f} depth/d{k}.png")
+        lists["rgb"].append(f"{k + 0.02:.6f} rgb/c{k}.png")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    weights = source / "mine.pt"
+    weights.write_bytes(b"weights")
+    arguments = ["import-pull", str(branch_folder), str(folder), "--name", "seen", "--robot",
+                 str(source / "robot.csv"), "--yolo-weights", str(weights), "--yolo-prompt",
+                 "branch", "--json", "--progress", "none"]
+    assert call(arguments) == 0
+    masks = [read_mask(path) for path in sorted(
+        (branch_folder / "pulls" / "seen" / "mask").iterdir())]
+    assert [np.flatnonzero(mask.any(axis=0)).tolist() for mask in masks] == [[0], [1], [2]]
+    monkeypatch.setitem(sys.modules, "ultralytics", None)
+    capsys.readouterr()
+    assert call([*arguments, "--force"]) != 0
+    assert "ultralytics" in json.loads(capsys.readouterr().out.strip().splitlines()[-1])["error"]
