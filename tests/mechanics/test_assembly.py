@@ -13,6 +13,7 @@ from limber.mechanics.equations import Viscous
 from limber.mechanics.fronts import make_fronts, postordered
 from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.statics import solve_prescribed
+from limber.mechanics.strain import deformation_gradients, principal_stretch
 
 MATERIALS = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")
 
@@ -201,3 +202,19 @@ def test_bulky_meshes_go_to_a_general_library(short_box, monkeypatch):
     assert isinstance(factor.make_factor(pattern), factor.CholmodFactor)
     monkeypatch.setitem(sys.modules, "cvxopt.cholmod", None)
     assert isinstance(factor.make_factor(pattern), factor.SuperLuFactor)
+
+
+@pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
+                         ids=["quadratic", "linear", "curved"])
+def test_largest_stretch_is_the_largest_eigenvalue(mesh):
+    """The closed form agrees with an eigenvalue solver, and points at the same tetrahedron."""
+    model = make_model(mesh)
+    rng = np.random.default_rng(8)
+    for size in (0.0, 1e-7, 1e-3):
+        u = size * rng.standard_normal(mesh.nodes.shape)
+        F = deformation_gradients(model, u).mean(axis=1)
+        stretches = np.sqrt(np.linalg.eigvalsh(np.swapaxes(F, 1, 2) @ F)[:, -1])
+        value, tet = model.largest_stretch(u)
+        assert value == pytest.approx(stretches.max(), rel=1e-12)
+        assert stretches[tet] == pytest.approx(stretches.max(), rel=1e-12)
+        assert principal_stretch(model, u).position == pytest.approx(mesh.centroids[tet])

@@ -1,8 +1,8 @@
-"""The kernels: internal force, energy and tangent stiffness of all tetrahedra, compiled by numba.
+"""The kernels element by element: strains, and the tangent stiffness times a direction.
 
-All refer to the rest shape: with H = du/dX and F = I + H, the second Piola-Kirchhoff stress S
-follows from the Green-Lagrange strain E = (H + H^T + H^T H) / 2, and the force of node a is
-the integral of F S grad N_a.
+All kernels refer to the rest shape: with H = du/dX and F = I + H, the second Piola-Kirchhoff
+stress S follows from the Green-Lagrange strain E = (H + H^T + H^T H) / 2, and the force of node
+a is the integral of F S grad N_a.
 
 Shared arguments:
     displacement: Node displacements [m], shape [node_count, 3].
@@ -23,76 +23,8 @@ import numpy as np
 
 from limber.mechanics.compiled import compiled
 
-_SVK = 0
 _NEO_HOOKE = 1
 _LINEAR = 2
-
-
-@compiled
-def internal_force(displacement, gradients, weights, lame_lambda, lame_mu, tets, material,
-                   growth, memory, force, energies):
-    """Write the internal force [N] and each element's strain energy [J]; return min det F."""
-    tet_count, point_count = weights.shape
-    node_count = tets.shape[1]
-    local = np.empty((3, node_count))
-    local_force = np.empty((3, node_count))
-    F = np.empty((3, 3))
-    P = np.empty((3, 3))
-    M = np.zeros(6)
-    force[:] = 0.0
-    min_det = np.inf
-    for e in range(tet_count):
-        first = tets[e, 0]
-        for a in range(node_count):
-            node = tets[e, a]
-            for i in range(3):
-                local[i, a] = displacement[node, i] - displacement[first, i]
-                local_force[i, a] = 0.0
-        energy = 0.0
-        for q in range(point_count):
-            for i in range(3):
-                for j in range(3):
-                    total = 0.0
-                    for a in range(node_count):
-                        total += local[i, a] * gradients[e, q, j, a]
-                    F[i, j] = total
-                F[i, i] += 1.0
-            if memory.shape[0]:
-                for k in range(6):
-                    M[k] = memory[e, q, k]
-            density, det = first_stress(F, lame_lambda[e], lame_mu[e], material, growth, M, P)
-            min_det = min(min_det, det)
-            weight = weights[e, q]
-            energy += weight * density
-            for i in range(3):
-                x, y, z = weight * P[i, 0], weight * P[i, 1], weight * P[i, 2]
-                for a in range(node_count):
-                    local_force[i, a] += (x * gradients[e, q, 0, a] + y * gradients[e, q, 1, a]
-                                          + z * gradients[e, q, 2, a])
-        energies[e] = energy
-        for a in range(node_count):
-            node = tets[e, a]
-            for i in range(3):
-                force[node, i] += local_force[i, a]
-    return min_det
-
-
-@compiled
-def strains(displacement, gradients, tets, material, out):
-    """Write the strain at each quadrature point, shape [tet_count, q, 6]."""
-    F = np.empty((3, 3))
-    for e in range(tets.shape[0]):
-        first = tets[e, 0]
-        for q in range(gradients.shape[1]):
-            for i in range(3):
-                for j in range(3):
-                    total = 0.0
-                    for a in range(tets.shape[1]):
-                        total += (displacement[tets[e, a], i] - displacement[first, i]
-                                  ) * gradients[e, q, j, a]
-                    F[i, j] = total
-                F[i, i] += 1.0
-            out[e, q] = _strain(F, material)
 
 
 @compiled
@@ -117,46 +49,6 @@ def strain_changes(displacement, direction, gradients, tets, material, out):
                     for j in range(3):
                         F[i, j] = 1.0 if i == j else 0.0
             out[e, q] = _strain_rate(F, H)
-
-
-@compiled
-def first_stress(F, lam, mu, material, growth, M, P):
-    """Write the first Piola-Kirchhoff stress [Pa]; return energy density [J/m^3] and det F."""
-    det = (F[0, 0] * (F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1])
-           - F[0, 1] * (F[1, 0] * F[2, 2] - F[1, 2] * F[2, 0])
-           + F[0, 2] * (F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0]))
-    e00, e11, e22, e01, e02, e12 = _strain(F, material)
-    if material == _NEO_HOOKE:
-        density = _neo_hookean_stress(F, det, lam, mu, P)
-        factor = growth - 1.0
-    else:
-        trace = e00 + e11 + e22
-        density = (0.5 * lam * trace * trace + mu * (
-            e00 * e00 + e11 * e11 + e22 * e22 + 2.0 * (e01 * e01 + e02 * e02 + e12 * e12)))
-        factor = growth
-        for i in range(3):
-            for j in range(3):
-                P[i, j] = 0.0
-    e00, e11, e22 = factor * e00 + M[0], factor * e11 + M[1], factor * e22 + M[2]
-    e01, e02, e12 = factor * e01 + M[3], factor * e02 + M[4], factor * e12 + M[5]
-    if material == _LINEAR:
-        trace = lam * (e00 + e11 + e22)
-        P[0, 0], P[1, 1], P[2, 2] = (trace + 2 * mu * e00, trace + 2 * mu * e11,
-                                     trace + 2 * mu * e22)
-        P[0, 1] = P[1, 0] = 2 * mu * e01
-        P[0, 2] = P[2, 0] = 2 * mu * e02
-        P[1, 2] = P[2, 1] = 2 * mu * e12
-    else:
-        _add_turned(F, lam, mu, e00, e11, e22, e01, e02, e12, P)
-    return density, det
-
-
-@compiled
-def _strain(F, material):
-    if material == _LINEAR:
-        return (F[0, 0] - 1.0, F[1, 1] - 1.0, F[2, 2] - 1.0, 0.5 * (F[0, 1] + F[1, 0]),
-                0.5 * (F[0, 2] + F[2, 0]), 0.5 * (F[1, 2] + F[2, 1]))
-    return _green_strain(F)
 
 
 @compiled
@@ -201,18 +93,6 @@ def _cofactor(F, i, j):
     a, b = (i + 1) % 3, (i + 2) % 3
     c, d = (j + 1) % 3, (j + 2) % 3
     return F[a, c] * F[b, d] - F[a, d] * F[b, c]
-
-
-@compiled
-def _neo_hookean_stress(F, det, lam, mu, P):
-    squares = 0.0
-    pressure = (lam + mu) * (det - 1.0) - mu
-    for i in range(3):
-        for j in range(3):
-            squares += F[i, j] * F[i, j]
-            P[i, j] = mu * F[i, j] + pressure * _cofactor(F, i, j)
-    return (0.5 * mu * (squares - 3.0) - mu * (det - 1.0)
-            + 0.5 * (lam + mu) * (det - 1.0) * (det - 1.0))
 
 
 @compiled

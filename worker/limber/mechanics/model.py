@@ -13,12 +13,11 @@ from limber.errors import InputError
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import elements
 from limber.mechanics.assembly import (
-    internal_force,
     strain_changes,
-    strains,
     tangent_times,
 )
 from limber.mechanics.equations import Equations, Viscous
+from limber.mechanics.forces import ForceLayout, internal_force, largest_stretch, strains
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import (
     Material,
@@ -87,6 +86,7 @@ class _MeshData:
         self.tets = np.ascontiguousarray(mesh.tets, np.int32)
         self.rule = elements.stiffness_quadrature(mesh)
         self.gradients, self.weights = elements.element_gradients(mesh, self.rule)
+        self.layout = ForceLayout(self.tets, self.gradients, self.weights)
         self.volume_weights = elements.volume_weights(mesh)
         edge = mesh.nodes[mesh.tets[:, 1]] - mesh.nodes[mesh.tets[:, 0]]
         self.edge = float(np.linalg.norm(edge, axis=1).mean())
@@ -254,9 +254,10 @@ class BranchModel:
         lam, mu = lame_pair or (self.lame_lambda, self.lame_mu)
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         force, energies = np.empty((self.mesh.node_count, 3)), np.empty(self.mesh.tet_count)
-        det = internal_force(np.ascontiguousarray(displacement, float), data.gradients,
-                             data.weights, lam, mu, data.tets, int(self.material), growth,
-                             memory, force, energies)
+        layout = data.layout
+        det = internal_force(np.ascontiguousarray(displacement, float), layout.gradients,
+                             layout.weights, layout.per_element(lam), layout.per_element(mu),
+                             layout.nodes, int(self.material), growth, memory, force, energies)
         return InternalState(force, energies, float(det))
 
     def tangent_times(self, displacement: np.ndarray, direction: np.ndarray,
@@ -275,9 +276,16 @@ class BranchModel:
         """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12)."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
-        strains(np.ascontiguousarray(displacement, float), data.gradients, data.tets,
-                int(self.material), out)
+        strains(np.ascontiguousarray(displacement, float), data.layout.gradients,
+                data.layout.nodes, int(self.material), out)
         return out
+
+    def largest_stretch(self, displacement: np.ndarray) -> tuple[float, int]:
+        """Return the largest principal stretch of the mean deformation of an element, and which."""
+        layout = self._data.layout
+        stretch, tet = largest_stretch(np.ascontiguousarray(displacement, float),
+                                       layout.mean_gradients, layout.nodes)
+        return float(stretch), min(int(tet), self.mesh.tet_count - 1)
 
     def strain_changes(self, displacement: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the derivative of :meth:`strains` along ``direction`` [m]."""

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.mechanics.factor import elimination_order
+from limber.mechanics.forces import lanes_last
 from limber.mechanics.stiffness_pairs import LANES
 
 _SCRATCH = 9
@@ -107,15 +108,16 @@ class LaneLayout:
         self._real = len(order)
         turn = turn[self._order]
         nodes = np.take_along_axis(tets[self._order], turn, axis=1)
-        self.nodes = _lanes(nodes.astype(np.int32))
+        self.nodes = lanes_last(nodes.astype(np.int32))
         weights = weights[self._order].copy()
         weights[self._real:] = 0.0
-        self.weights = _lanes(weights)
-        self.gradients = _lanes(np.swapaxes(np.take_along_axis(
+        self.weights = lanes_last(weights)
+        self.gradients = lanes_last(np.swapaxes(np.take_along_axis(
             gradients[self._order], turn[:, None, None, :], axis=3), 2, 3))
         later, earlier = np.tril_indices(tets.shape[1])
         slots, lengths = pattern.slots(nodes[:, later], nodes[:, earlier])
-        self.slots, self.lengths = _lanes(slots.astype(np.int32)), _lanes(lengths.astype(np.int32))
+        self.slots = lanes_last(slots.astype(np.int32))
+        self.lengths = lanes_last(lengths.astype(np.int32))
 
     def per_element(self, values: np.ndarray) -> np.ndarray:
         """Return one number a tetrahedron in this layout, shape [batch, LANES]."""
@@ -123,12 +125,7 @@ class LaneLayout:
 
     def per_point(self, values: np.ndarray) -> np.ndarray:
         """Return values [tet_count, q, k] in this layout, shape [batch, q, k, LANES]."""
-        return _lanes(values[self._order])
-
-
-def _lanes(array: np.ndarray) -> np.ndarray:
-    batched = array.reshape(-1, LANES, *array.shape[1:])
-    return np.ascontiguousarray(np.moveaxis(batched, 1, -1))
+        return lanes_last(values[self._order])
 
 
 def _node_graph(tets: np.ndarray, node_count: int, cliques: Sequence[np.ndarray]) -> sp.csr_matrix:

@@ -70,18 +70,23 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
     factor = growth - 1.0 if material == _NEO_HOOKE else growth
     has_strain = material != _NEO_HOOKE or memory.shape[0] > 0
     for batch in range(batch_count):
-        _gather(displacement, nodes[batch], local)
+        gather(displacement, nodes[batch], local)
         if mixed:
-            _gather(increment, nodes[batch], rate)
+            gather(increment, nodes[batch], rate)
         for l in range(LANES):
             lam[l], mu[l] = factor * lame_lambda[batch, l], factor * lame_mu[batch, l]
             both[l] = lame_lambda[batch, l] + lame_mu[batch, l]
         for q in range(point_count):
-            _deformation(local, flat[batch, q], node_count, material == _LINEAR, F)
+            if material == _LINEAR:
+                F[:] = 0.0
+                for l in range(LANES):
+                    F[l] = F[4 * LANES + l] = F[8 * LANES + l] = 1.0
+            else:
+                deformation(local, flat[batch, q], node_count, F)
             for l in range(LANES):
                 root[l] = np.sqrt(weights[batch, q, l])
             if has_strain:
-                _green_strain(F, E)
+                green_strain(F, E)
                 if mixed:
                     _gradient(rate, flat[batch, q], node_count, D)
                     _subtract_half_square(D, E)
@@ -117,7 +122,8 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
 
 
 @compiled
-def _gather(field, nodes, out):
+def gather(field, nodes, out):
+    """Write a nodal field, less its value at each element's first node."""
     for a in range(nodes.shape[0]):
         for l in range(LANES):
             node, first = nodes[a, l], nodes[0, l]
@@ -134,11 +140,9 @@ def _gradient(values, gradients, node_count, out):
 
 
 @compiled
-def _deformation(values, gradients, node_count, is_linear, F):
-    if is_linear:
-        F[:] = 0.0
-    else:
-        _gradient(values, gradients, node_count, F)
+def deformation(values, gradients, node_count, F):
+    """Write the deformation gradient of a nodal displacement, by rows."""
+    _gradient(values, gradients, node_count, F)
     for l in range(LANES):
         F[l] += 1.0
         F[4 * LANES + l] += 1.0
@@ -146,7 +150,8 @@ def _deformation(values, gradients, node_count, is_linear, F):
 
 
 @compiled
-def _green_strain(F, E):
+def green_strain(F, E):
+    """Write the Green-Lagrange strain: 00 11 22 01 02 12."""
     for l in range(LANES):
         f00, f01, f02 = F[l], F[LANES + l], F[2 * LANES + l]
         f10, f11, f12 = F[3 * LANES + l], F[4 * LANES + l], F[5 * LANES + l]

@@ -46,11 +46,9 @@ def deformation_gradients(model: BranchModel, displacement: np.ndarray) -> np.nd
 
 def principal_stretch(model: BranchModel, displacement: np.ndarray) -> Place:
     """Return the largest principal stretch of any tetrahedron (1: unstretched), and where."""
-    F = deformation_gradients(model, displacement).mean(axis=1)
-    largest = np.sqrt(np.linalg.eigvalsh(np.swapaxes(F, 1, 2) @ F)[:, -1])
-    tet = int(largest.argmax())
-    place = tuple(float(x) for x in model.mesh.centroids[tet])
-    return Place(float(largest[tet]), tet, place)
+    value, tet = model.largest_stretch(displacement)
+    place = tuple(float(x) for x in model.mesh.nodes[model.mesh.tets[tet, :4]].mean(axis=0))
+    return Place(value, tet, place)
 
 
 def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
