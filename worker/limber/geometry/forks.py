@@ -33,48 +33,42 @@ _REACH = 2.5  # how far from the crease a fillet's solid goes, in radii of the f
 _RIM = 2.2  # where it lies lowest under the cylinders
 _MARGIN = 0.02  # how far it lies over them near the crease and under them at the rim, in fillets
 _LONGEST = 8.0  # crease of a twig along its parent, in radii of both together
-_TRIES = (1.0, 0.83, 1.21)  # steps of the lattice, in turn, where the first one's solid will not do
+_SCALES = (1.0, 0.83, 1.21)  # of the lattice's step, in turn
 
 
-def smooth_forks(surface: Surface, skeleton: Skeleton, *, spacing: float = SPACING,
-                 ) -> tuple[Surface, SurfaceCheck, list[str]]:
+def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = None,
+                 spacing: float = SPACING) -> tuple[Surface, SurfaceCheck, list[str]]:
     """Round the creases between twigs and their parents.
 
     Args:
         surface: The union of the cylinders, :func:`branch_surface`: closed, oriented, not
             crossing itself.
         skeleton: The axes and radii it was made of.
+        sides: The sides it was made with.
         spacing: The spacing it was made with.
 
     Returns:
         The surface, within 2 % of the volume; its check; and warnings about forks that had to
         stay sharp.
     """
-    forks = _forks(skeleton, spacing)
-    fillets = {fork.run: fork.fillet(_TRIES[0]) for fork in forks}
-    by_run = {fork.run: fork for fork in forks}
+    forks = {fork.run: fork for fork in _forks(skeleton, sides, spacing)}
+    fillets = {run: fork.fillet(_SCALES[0]) for run, fork in forks.items()}
     tolerance = 0.02 * float(skeleton.radius.min())
-    for scale in (*_TRIES[1:], None):
-        solids = [fillet for fillet in fillets.values() if fillet is not None]
-        joined = _joined(surface, solids, tolerance)
-        if joined is not None and abs(joined.volume / surface.volume - 1) > VOLUME_CHANGE:
+    # Where a fillet crosses something, another lattice may do; then it is left out.
+    for scale in (*_SCALES[1:], None, None):
+        made = [fillet for fillet in fillets.values() if fillet is not None]
+        joined = _joined(surface, made, tolerance)
+        if joined is None or abs(joined.volume / surface.volume - 1) > VOLUME_CHANGE:
             break
-        check = None if joined is None else check_surface(joined)
-        if check is not None and check.valid:
-            sharp = sum(fillet is None for fillet in fillets.values())
-            return joined, check, _warnings(sharp, len(forks))
-        wrong = [run for run, fillet in fillets.items() if fillet is not None
-                 and (check is None or _holds(fillet, check.crossings))]
+        check = check_surface(joined)
+        if check.valid:
+            return joined, check, _warnings(len(forks) - len(made), len(forks))
+        wrong = [run for run, fillet in fillets.items()
+                 if fillet is not None and _holds(fillet, check.crossings)]
         if not wrong:
             break
         for run in wrong:
-            fillets[run] = None if scale is None else by_run[run].fillet(scale)
-    else:
-        joined = _joined(surface, [f for f in fillets.values() if f is not None], tolerance)
-        check = None if joined is None else check_surface(joined)
-        if check is not None and check.valid:
-            sharp = sum(fillet is None for fillet in fillets.values())
-            return joined, check, _warnings(sharp, len(forks))
+            fillets[run] = None if scale is None else forks[run].fillet(scale)
     return surface, check_surface(surface), _warnings(len(forks), len(forks))
 
 
@@ -150,9 +144,9 @@ class _Fork:
             _COARSENED * self.rounding))
 
 
-def _forks(skeleton: Skeleton, spacing: float) -> list[_Fork]:
+def _forks(skeleton: Skeleton, sides: int | None, spacing: float) -> list[_Fork]:
     """Twigs that come out of their parents."""
-    excess = np.array([polygon_factor(sides) - 1 for sides in sides_of_runs(skeleton)])
+    excess = np.array([polygon_factor(n) - 1 for n in sides_of_runs(skeleton, sides)])
     runs = skeleton.runs()
     axes = [run_axis(skeleton, run, spacing) for run in range(skeleton.branch_count)]
     cones = [segments(*axis) for axis in axes]

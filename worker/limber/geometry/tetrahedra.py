@@ -29,10 +29,10 @@ class MeshSettings(BaseModel):
         "auto", description="auto: sweep along the axes, and fTetWild where that cannot join a "
         "twig; ftetwild falls back to the sweep.")
     mesh_sides: int = Field(
-        6, ge=4, le=24, description="Sides of fTetWild's cross-sections; the sweep has six.")
+        8, ge=4, le=24, description="Sides of fTetWild's cross-sections; the sweep has six.")
     mesh_spacing: float = Field(
         2.5, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
-    mesh_time_limit: float = Field(20.0, gt=0, description="fTetWild's time limit [s].")
+    mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's time limit [s].")
     mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
 
 
@@ -82,8 +82,8 @@ def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
                                   or _share(skeleton, swept.left_out) < _LEFT_OUT_LIMIT):
             return swept
     try:
-        mesh, mesher = _wild(skeleton, settings, progress)
-        return MeshResult(mesh, mesher, warnings)
+        mesh, mesher, told = _wild(skeleton, settings, progress)
+        return MeshResult(mesh, mesher, warnings + told)
     except (MeshingError, MissingDependencyError) as error:
         if swept is None and settings.mesher == "auto":
             raise
@@ -111,15 +111,18 @@ def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:
     return MeshResult(swept.mesh.quadratic(), "sweep", warnings, swept.left_out)
 
 
-def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress) -> tuple[TetMesh, str]:
+def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
+          ) -> tuple[TetMesh, str, list[str]]:
+    from limber.geometry.forks import smooth_forks
     from limber.geometry.tubes import branch_surface
 
-    surface = branch_surface(skeleton, sides=settings.mesh_sides, spacing=settings.mesh_spacing)
+    shape = {"sides": settings.mesh_sides, "spacing": settings.mesh_spacing}
+    surface, _, warnings = smooth_forks(branch_surface(skeleton, **shape), skeleton, **shape)
     radii = np.sort(skeleton.radius)
     mesh, cached = tetrahedralise(
-        surface, edge_length=8 * float(np.median(radii)),
+        surface, edge_length=4 * float(np.median(radii)),
         epsilon=0.25 * float(radii[len(radii) // 10]), settings=settings, progress=progress)
-    return mesh, "ftetwild (cached)" if cached else "ftetwild"
+    return mesh, "ftetwild (cached)" if cached else "ftetwild", warnings
 
 
 def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,

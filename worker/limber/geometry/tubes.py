@@ -49,7 +49,7 @@ def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: flo
         MeshingError: the union is empty or in several pieces.
     """
     tubes = {run: tubes_of_run(skeleton, run, spacing) for run in range(skeleton.branch_count)}
-    count = sides_of_runs(skeleton) if sides is None else [sides] * skeleton.branch_count
+    count = sides_of_runs(skeleton, sides)
     in_pieces: set[int] = set()
     for _ in range(4):
         surface = _union(tubes, in_pieces, count, 0.02 * float(skeleton.radius.min()))
@@ -63,8 +63,11 @@ def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: flo
     return surface
 
 
-def sides_of_runs(skeleton: Skeleton) -> list[int]:
-    """Sides of each run's cross-section, so many that the facets do not show beside a twig."""
+def sides_of_runs(skeleton: Skeleton, given: int | None = None) -> list[int]:
+    """Sides of each run's cross-section: so many that facets do not show beside a twig, or given.
+    """
+    if given is not None:
+        return [given] * skeleton.branch_count
     sides = [_SIDES] * skeleton.branch_count
     for members in skeleton.runs()[1:]:
         carrier = int(skeleton.branch[members[0]])
