@@ -1,50 +1,123 @@
-"""The recorded silicone beam: Young's modulus from how far a hung weight bends it.
+"""The recorded silicone beam, as a user brings it in: Young's modulus from a hung weight.
 
-Frame 0 of the recording is the straight beam, held up; then both its own weight and the hung one
-act. The recording's marker coordinates are fitted rigidly onto the nominal ones at frame 0.
+Surface to branch folder, recording to pull, pull to modulus, modulus to other loads: the stages
+behind ``limber mesh``, ``import-pull``, ``estimate`` and ``predict``, nothing of its own. What is
+given here is what a user gives: density, Poisson's ratio, where markers and load are.
+
+Other loads are predicted; how well is measured on recordings of the same form, simulated on a
+finer mesh of another kind.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from limber.estimation.alignment import Frames
-from limber.estimation.estimate import fit_pulls
-from limber.estimation.objective import Objective
-from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.quasi_static import QuasiStaticForward
-from limber.estimation.recording import GraspEntry, PullEntry, SensorEntry
-from limber.estimation.registration import rigid_fit
+from limber.estimation.estimate import estimate
+from limber.estimation.importing import ImportSettings, import_pull
+from limber.estimation.points import point_operator
+from limber.estimation.predict import PredictSettings, predict
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.streams import read_stream
+from limber.estimation.streams import Stream, write_stream
+from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.statics import solve_static
 
-RECORDING = Path(__file__).parents[4] / "shared/data/silicone_beam/beam_load52_V2_a.csv"
+FOLDER = Path(__file__).parents[4] / "shared/data/silicone_beam"
+RECORDING, RECORDING_C3D = FOLDER / "beam_load52_V2_a.csv", FOLDER / "beam_load52_V2_a.c3d"
 SIZE_M = (0.1, 0.03, 0.03)
 DENSITY, POISSON = 1070.0, 0.49
 GRAVITY = (0.0, 0.0, -9.80709)
 LOAD_N = 0.51012
+LABELS = ("tip1", "tip2", "tip3", "base1", "base2", "base3")
 NOMINAL_M = np.array([[0, .015, .036], [0, -.006, .024], [0, .036, .006],
                       [-.094, -.01, -.001], [-.094, .04, .0275], [-.094, .04, 0]])
+LOAD_POINT_M = np.array([0.0, 0.015, 0.03])
+TIPS = slice(0, 3)
 
 
 @dataclass(frozen=True)
 class BeamResult:
-    """What the recording gives.
+    """What a recording gives.
 
     Attributes:
         young: [Pa].
-        interval: 95 % [Pa].
+        interval: 95 %, mesh included [Pa].
+        sensor, mesh: Relative standard deviations by cause.
         measured_drop, simulated_drop: Mean of the tip markers, downwards [m].
     """
 
     young: float
     interval: tuple[float, float]
+    sensor: float
+    mesh: float
     measured_drop: float
     simulated_drop: float
+
+
+def in_scan(points: np.ndarray) -> np.ndarray:
+    """Take points of the beam's frame [m] to that of ``beam.stl`` [m]: long axis z, y up."""
+    return np.asarray(points)[..., [1, 2, 0]] + [0.0, 0.0, SIZE_M[0]]
+
+
+def made_branch(folder: Path) -> Path:
+    """The branch folder of ``beam.stl``, clamped at its far face; beside it the marker table."""
+    branch = folder / "beam.branch"
+    mesh_surface(FOLDER / "beam.stl", branch, MeshSurfaceSettings(
+        unit="mm", up=(0.0, 1.0, 0.0), root=(15.0, 15.0, 0.0), poisson=POISSON,
+        density=DENSITY))
+    rows = [f"{label},{x:.6f},{y:.6f},{z:.6f}" for label, (x, y, z) in
+            zip(LABELS, in_scan(NOMINAL_M), strict=True)]
+    (folder / "nominal.csv").write_text("\n".join(["label,x_m,y_m,z_m", *rows]) + "\n")
+    return branch
+
+
+def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> BeamResult:
+    """Bring a recording in and estimate one modulus from it."""
+    x, y, z = in_scan(LOAD_POINT_M)
+    pull = import_pull(branch, recording, name, ImportSettings(
+        nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
+        own_weight=True, grasp_point=(float(x), float(y), float(z)), grasp_radius=0.012))
+    found = estimate(branch, EstimateSettings(pull=(name,), fractions=(0.5,)), force=True)
+    down = -np.array(pull["load_n"]) / load
+    measured = -np.mean(np.array(pull["displacement_m"])[TIPS] @ down)
+    deviation = found["young_deviation"]
+    low, high = found["young_interval_pa"][0]
+    return BeamResult(float(found["young_pa"][0]), (float(low), float(high)),
+                      float(deviation["sensor"][0]), float(deviation["mesh"]),
+                      float(measured), predicted_drop(branch, name, load))
+
+
+def predicted_drop(branch: Path, name: str, load: float) -> float:
+    """Mean drop of the tip markers [m] that the branch folder's estimate foretells for a load."""
+    found = predict(branch, PredictSettings(pull=name, weight=load))
+    return float(np.mean(np.array(found["drops_m"])[TIPS]))
+
+
+def simulated_recording(path: Path, young: float, load: float, seed: int) -> float:
+    """Write a recording as the given one is, of a beam of known modulus; return its true drop [m].
+
+    Markers sit up to 1 mm beside their nominal places, the capture frame is turned, the beam is
+    let go after 0.4 s and swings.
+    """
+    rng = np.random.default_rng(seed)
+    mesh = box_mesh((16, 5, 5))
+    model = BranchModel(mesh, young=young, poisson=POISSON, density=DENSITY, gravity=GRAVITY)
+    state = solve_static(model, grasp=edge_load(mesh), grasp_force=(0.0, 0.0, -load)).require()
+    placed = NOMINAL_M + rng.uniform(-1e-3, 1e-3, NOMINAL_M.shape) / np.sqrt(3)
+    moved = (point_operator(mesh, placed) @ state.displacement.ravel()).reshape(-1, 3)
+    times = np.arange(600) / 100.0
+    since = np.maximum(times - 0.4, 0.0)
+    part = np.where(times > 0.4, 1 - np.exp(-2.2 * since) * np.cos(18 * since), 0.0)
+    turn = Rotation.from_rotvec(rng.uniform(-2, 2, 3)).as_matrix()
+    seen = (placed + part[:, None, None] * moved) @ turn.T + rng.uniform(-1, 1, 3)
+    seen = seen + 5e-6 * rng.standard_normal(seen.shape)
+    write_stream(path, Stream(times, seen.reshape(len(times), -1), tuple(
+        f"{label}_{axis}_m" for label in LABELS for axis in "xyz")))
+    return -float(moved[TIPS, 2].mean())
 
 
 def box_mesh(cells: tuple[int, int, int] = (12, 4, 4)) -> TetMesh:
@@ -76,48 +149,9 @@ def edge_load(mesh: TetMesh) -> Grasp:
     return Grasp(on_edge, weights, weights @ mesh.nodes[on_edge], "pinned")
 
 
-def tip_markers(path: Path = RECORDING) -> tuple[np.ndarray, np.ndarray]:
-    """Tip markers in the beam's frame [m]: at rest, shape [3, 3], and over time [n, 3, 3]."""
-    stream = read_stream(path)
-    positions = stream.values.reshape(len(stream), 6, 3)
-    turn, shift = rigid_fit(positions[0], NOMINAL_M)
-    moved = positions @ turn.T + shift
-    return moved[0, :3], moved[:, :3]
-
-
-def estimate_beam(load: float = LOAD_N, *, poisson: float = POISSON,
-                  cells: tuple[int, int, int] = (12, 4, 4), path: Path = RECORDING) -> BeamResult:
-    """Estimate E from the settled part of the recording (its last second)."""
-    rest, track = tip_markers(path)
-    # The rigid fit of frame 0 leaves 0.3 to 2 mm a marker: that, not the camera's noise, is how
-    # well the markers' places are known. Displacements since frame 0 are far better.
-    settled = track[-100:].mean(axis=0)[None].repeat(2, axis=0)
-    mesh = box_mesh(cells)
-    model = BranchModel(mesh, young=2e5, poisson=poisson, density=DENSITY, gravity=GRAVITY)
-    entry = PullEntry(drive="force", gravity_m_s2=GRAVITY, sensor=SensorEntry(),
-                      grasp=GraspEntry(point_m=(0.0, 0.015, 0.03), radius_m=0.01, mode="pinned"))
-    force = np.full((2, 6), np.nan)
-    force[:, :3] = (0.0, 0.0, -load)
-    frames = Frames(np.array([0.0, 1.0]), np.zeros((2, 6)), force, np.ones(2, int), settled,
-                    np.broadcast_to(2 * (4e-4)**2 * np.eye(3), (2, 3, 3, 3)))
-    forward = QuasiStaticForward("beam", model, np.ones((mesh.tet_count, 1)), entry, frames, rest)
-    forward.grasp = edge_load(mesh)
-    start = Values(np.array([2e5]), poisson, DENSITY)
-    objective = Objective([forward], ParameterSpace.separate(start))
-    found = fit_pulls(objective, start, EstimateSettings(hold_out=False), lambda _message: None)
-    simulated = found.fit.evaluation.pulls[0].positions[0]
-    low, high = found.uncertainty.young_interval[0]
-    return BeamResult(float(found.values.young[0]), (float(low), float(high)),
-                      float(np.mean(rest[:, 2] - settled[0, :, 2])),
-                      float(np.mean(rest[:, 2] - simulated[:, 2])))
-
-
 def drop(young: float, load: float, *, poisson: float = POISSON,
          cells: tuple[int, int, int] = (12, 4, 4)) -> float:
-    """Static drop of the tip markers [m] under another load [N]: what other recordings show."""
-    from limber.estimation.points import point_operator
-    from limber.mechanics.statics import solve_static
-
+    """Static drop of the tip markers [m] under a load [N], on bricks of ``cells`` cut in six."""
     mesh = box_mesh(cells)
     model = BranchModel(mesh, young=young, poisson=poisson, density=DENSITY, gravity=GRAVITY)
     state = solve_static(model, grasp=edge_load(mesh), grasp_force=(0.0, 0.0, -load)).require()

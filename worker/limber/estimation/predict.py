@@ -38,8 +38,9 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
 
     Returns:
         ``load_n`` [3], ``points_m`` and ``displacement_m`` [m][3] of the pull's points,
-        ``displacement_sigma_m`` [m] (of its size, from Young's modulus' covariance),
-        ``drop_m`` (mean along gravity) with ``drop_interval_m`` (95 %),
+        ``displacement_sigma_m`` [m] (of its size, from Young's modulus' covariance), ``drops_m``
+        [m] (along gravity), ``drop_m`` (their mean over the points that move at least half as far
+        as the farthest) with ``drop_interval_m`` (95 %),
         ``grasp_displacement_m`` [3], ``young_pa``.
 
     Raises:
@@ -67,7 +68,7 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
     held = grasp.weights @ forward.displacements()[0][grasp.nodes]
     return plain({
         "load_n": load, "points_m": forward.rest_points, "displacement_m": moved,
-        "displacement_sigma_m": sigma, "drop_m": drop,
+        "displacement_sigma_m": sigma, "drops_m": moved @ down, "drop_m": drop,
         "drop_interval_m": [drop - 1.96 * drop_sigma, drop + 1.96 * drop_sigma],
         "grasp_displacement_m": held, "young_pa": values.young})
 
@@ -125,5 +126,7 @@ def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: Pa
     size = np.linalg.norm(moved, axis=1)
     along = moved / np.maximum(size, 1e-12)[:, None]
     sigma = np.sqrt(np.maximum(np.einsum("mi,mi->m", along**2, each), 0.0))
-    mean = np.einsum("mip,i->p", free, down) / len(moved)
-    return float(np.mean(moved @ down)), sigma, float(np.sqrt(max(mean @ covariance @ mean, 0.0)))
+    far = size >= 0.5 * size.max()
+    mean = np.einsum("mip,i->p", free[far], down) / far.sum()
+    return (float(np.mean(moved[far] @ down)), sigma,
+            float(np.sqrt(max(mean @ covariance @ mean, 0.0))))
