@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled
+from limber.errors import Cancelled, LimberError
 from limber.estimation.checks import force_unit_suspicion
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.grasping import grasp_on
@@ -24,7 +24,7 @@ from limber.estimation.model_error import (
     mesh_error,
     total_interval,
 )
-from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
+from limber.estimation.objective import Evaluation, Forward, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, gauss_newton, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.points import point_operator
@@ -61,7 +61,8 @@ class Estimate:
         uncertainty: Covariance and intervals.
         identifiability: Judged before the fit.
         warnings: What the user should know.
-        held_out: Per pull, RMS distance [m] and RMS force error [N] of a fit that did not see it.
+        held_out: Per pull, how a fit that did not see it foretells it: RMS distance [m] and RMS
+            force error [N], also over the pull's own travel and peak force.
         stopped: Whether it was stopped before its end.
         model_error: What residuals cannot show: of the branch's radii and of its mesh.
     """
@@ -71,7 +72,7 @@ class Estimate:
     uncertainty: Uncertainty
     identifiability: Identifiability
     warnings: list[str] = field(default_factory=list)
-    held_out: dict[str, dict[str, float]] = field(default_factory=dict)
+    held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     stopped: bool = False
     model_error: ModelError = field(default_factory=ModelError)
 
@@ -129,6 +130,8 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     if not found.stopped:
         progress(0.96, "how much the mesh is too stiff")
         found.model_error = _model_error(branch, subject, found, pulls[0].entry.grasp, settings)
+        if settings.hold_out:
+            _score_others(branch, names, subject, found, settings, tell)
     result = _summary(found, settings)
     earlier = branch.manifest.stages.get("estimate")
     if found.stopped and earlier is not None and not earlier.result.get("stopped"):
@@ -334,15 +337,48 @@ def _judge(found: Estimate, tell: Callable[[str], None]) -> None:
         tell(f"The optimiser did not converge: {found.fit.reason}")
 
 
-def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str, float]]:
+def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str, Any]]:
     scores = {}
     for index, forward in enumerate(found.objective.forwards):
         rest = without(found.objective, index)
         fit = gauss_newton(rest, found.fit.evaluation.free, robust=settings.robust,
                            evaluation_limit=15)
         distance, force = held_out(found.objective, fit.evaluation.free, index)
-        scores[forward.name] = {"rms_m": distance, "rms_force_n": force}
+        scores[forward.name] = _score(forward, distance, force, in_fit=True)
     return scores
+
+
+def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> dict[str, Any]:
+    """How a fit that did not see a pull foretells it.
+
+    ``in_fit``: the pull is one of the estimate's, left out for this score alone.
+    """
+    moved = forward.frames.positions - getattr(forward, "rest_points", np.nan)
+    size = float(np.sqrt(np.nanmean(np.sum(moved**2, axis=2)))) if (
+        np.isfinite(moved).any()) else np.nan
+    pull = np.linalg.norm(forward.frames.wrenches[:, :3], axis=1)
+    peak = float(np.nanmax(pull)) if np.isfinite(pull).any() else np.nan
+    return {"rms_m": distance, "rms_force_n": force, "in_fit": in_fit,
+            "relative_distance": distance / size if size > 0 else np.nan,
+            "relative_force": force / peak if peak > 0 else np.nan}
+
+
+def _score_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
+                  settings: EstimateSettings, tell: Callable[[str], None]) -> None:
+    """Score the branch's pulls that this estimate was not asked to use."""
+    others = [name for name in branch.names("pulls")
+              if name not in names and branch.has(f"pulls/{name}/pull.toml")]
+    for name in others:
+        try:
+            pull = read_pulls(branch, [name], subject, settings, lambda _message: None)
+            forward = forwards_of(pull, subject, settings, lambda _message: None)
+        except LimberError as error:
+            tell(f"{name}, which the estimate did not use, could not be scored: {error}")
+            continue
+        alone = Objective(forward, found.objective.space,
+                          force_sigma=[pull[0].entry.sensor.force_sigma_n])
+        distance, force = held_out(alone, found.fit.evaluation.free, 0)
+        found.held_out[name] = _score(forward[0], distance, force, in_fit=False)
 
 
 def _model_error(branch: Branch, subject: Subject, found: Estimate, grasp: GraspEntry,

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.estimation.uncertainty import OUTLIER
 from limber.store import Branch
 
 OBSERVED, SIMULATED, TRUE = "#222222", "#2a6fb0", "#c0602a"
@@ -17,8 +18,10 @@ def report_figures(branch: Branch, estimate: dict[str, Any]) -> Iterator[tuple[A
         branch: The opened branch folder.
         estimate: Content of its ``estimate.json``.
     """
-    yield (young_along_branch(estimate),
-           "Young's modulus along the branch with its 95 % interval.")
+    yield (young_along_branch(estimate), _interval_caption(estimate))
+    yield (what_the_pulls_tell(estimate),
+           "How well the pulls tell each parameter: standard deviation before the fit (at its "
+           "start) and after it. Over 1 a modulus is tied to its neighbour.")
     yield (loss_over_evaluations(estimate),
            "Loss against forward simulations; the line is the best so far.")
     for pull in estimate["pulls"]:
@@ -26,9 +29,17 @@ def report_figures(branch: Branch, estimate: dict[str, Any]) -> Iterator[tuple[A
             yield (simulated_over_observed(pull, estimate),
                    f"Pull {pull['name']}: simulated (blue) over observed (black) at several "
                    "frames; bars are residuals, ten times enlarged.")
+        if np.size(pull.get("point_residual", ())):
+            yield (residuals_over_time(pull),
+                   f"Pull {pull['name']}: residuals of each point and of the force over their "
+                   f"deviation; about 1 is noise, crosses from {OUTLIER} are outliers.")
         if pull["measured_force_n"] and _numbers(pull["measured_force_n"]).size:
             yield (force_over_time(pull),
                    f"Pull {pull['name']}: force of the gripper on the branch.")
+    if estimate.get("held_out"):
+        yield (held_out_scores(estimate),
+               "Pulls foretold by a fit that did not see them: error over the pull's own travel "
+               "and peak force.")
 
 
 def young_along_branch(estimate: dict[str, Any]) -> Any:
@@ -37,20 +48,86 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
     place = np.array(estimate["fractions"])
     young = np.array(estimate["young_pa"]) / 1e6
     interval = np.array(estimate["young_interval_pa"]) / 1e6
-    axes.fill_between(place, interval[:, 0], interval[:, 1], color=SIMULATED, alpha=0.2, lw=0)
-    axes.errorbar(place, young, np.abs(interval.T - young), fmt="o-", color=SIMULATED, capsize=4,
-                  label="estimated, 95 %")
+    sensor = np.array(estimate.get("young_interval_sensor_pa", estimate["young_interval_pa"]))
+    if len(place) == 1:
+        # One modulus for the whole branch.
+        place, young = np.array([0.0, 1.0]), np.repeat(young, 2)
+        interval, sensor = np.repeat(interval, 2, axis=0), np.repeat(sensor, 2, axis=0)
+    axes.fill_between(place, *interval.T, color=SIMULATED, alpha=0.18, lw=0,
+                      label="95 %, radii and mesh included")
+    axes.errorbar(place, young, np.abs(sensor.T / 1e6 - young), fmt="o-", color=SIMULATED,
+                  capsize=4, label="estimated, 95 % by the sensors alone")
     truth = estimate.get("truth")
     if truth:
         axes.plot(truth["fractions"], np.array(truth["young_pa"]) / 1e6, "D", ms=7, mfc="none",
                   color=TRUE, label="true")
-    if young.max() > 5 * young.min():
+    if young.max() > 5 * young.min() or interval[:, 1].max() > 20 * young.max():
         axes.set_yscale("log")
     else:
         axes.set_ylim(bottom=0)
     axes.set_xlabel("place on the main path (0 base, 1 tip)")
     axes.set_ylabel("Young's modulus [MPa]")
     axes.set_xlim(0, 1)
+    axes.legend(frameon=False)
+    return figure
+
+
+def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
+    """Standard deviations of the parameters before and after the fit."""
+    figure, axes = _figure(5.2, 3.0)
+    before = np.array(estimate["deviations_before_fit"], float)
+    after = np.sqrt(np.abs(np.diag(np.array(estimate["covariance"], float))))
+    groups = [*estimate["groups"]]
+    extra = estimate["parameters"][len(set(groups)):]
+    names = [f"E{k + 1}" for k in range(len(groups))] + list(extra)
+    after = np.concatenate([after[groups], after[len(set(groups)):]])
+    place = np.arange(len(names))
+    least = 1e-4
+    axes.bar(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color="#bbbbbb",
+             label="before the fit")
+    axes.bar(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after it")
+    axes.axhline(1.0, color=TRUE, lw=0.8)
+    axes.set_yscale("log")
+    axes.set_xticks(place, names)
+    axes.set_ylabel("standard deviation of log E")
+    axes.legend(frameon=False)
+    return figure
+
+
+def residuals_over_time(pull: dict[str, Any]) -> Any:
+    """Standardised residual of every point and of the force at every frame."""
+    figure, axes = _figure(5.2, 3.0)
+    points = _numbers(pull["point_residual"])
+    time = np.array(pull["all_times_s"])
+    force = _numbers(pull["force_residual"])
+    shades = ["#16324f", "#2a6fb0", "#6aa5d8", "#a9cdea"]
+    columns = [(f"point {k + 1}", points[:, k], shades[k % 4]) for k in range(points.shape[1])]
+    if np.isfinite(force).any():
+        columns.append(("force", force, "#2e8b57"))
+    for label, values, colour in columns[:9]:
+        axes.plot(time, values, ".-", ms=3, lw=0.7, color=colour, label=label)
+        far = np.where(np.isfinite(values), values, 0.0) > OUTLIER
+        axes.plot(time[far], values[far], "x", color=TRUE, ms=7)
+    axes.axhline(OUTLIER, color=TRUE, lw=0.8)
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("residual / its deviation")
+    axes.legend(frameon=False, ncol=3, fontsize=8)
+    return figure
+
+
+def held_out_scores(estimate: dict[str, Any]) -> Any:
+    """Errors of foretold pulls in percent, points and force."""
+    scores = estimate["held_out"]
+    figure, axes = _figure(5.2, 0.9 + 0.45 * len(scores))
+    place = np.arange(len(scores))
+    for shift, key, colour, label in ((0.2, "relative_distance", SIMULATED, "points, of travel"),
+                                      (-0.2, "relative_force", "#2e8b57", "force, of its peak")):
+        values = 100 * np.array([_number(score.get(key)) for score in scores.values()])
+        axes.barh(place + shift, np.nan_to_num(values), 0.36, color=colour, label=label)
+    axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
+                            for name, score in scores.items()])
+    axes.set_xlabel("error of the foretold pull [%]")
     axes.legend(frameon=False)
     return figure
 
@@ -110,6 +187,22 @@ def force_over_time(pull: dict[str, Any]) -> Any:
     axes.set_ylabel("force [N], dots measured")
     axes.legend(frameon=False, ncol=3)
     return figure
+
+
+def _interval_caption(estimate: dict[str, Any]) -> str:
+    parts = estimate.get("young_deviation") or {}
+    told = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
+            (("sensor", "sensors"), ("geometry", "radii of the scan"), ("mesh", "mesh"))
+            if parts.get(key) is not None]
+    missing = "" if parts.get("geometry") is not None or not parts else (
+        " The radii came without a deviation: what they are off by is not in the interval.")
+    return ("Young's modulus along the branch with its 95 % interval"
+            + (f"; largest standard deviation by {', '.join(told)}" if told else "")
+            + "." + missing)
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else float(value)
 
 
 def _numbers(values: Any) -> np.ndarray:

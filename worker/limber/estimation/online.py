@@ -12,7 +12,7 @@ average out as noise does.
 
 import time
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
@@ -35,6 +35,8 @@ UNCHECKED_ERROR = 0.3
 """Error of the reduced model over the noise of a measurement, until it is measured."""
 COVERED = 0.1
 """Part of the way that lies between frames of the full model at the end."""
+FINAL_FRAMES = 300
+"""So many frames at most are linearised again when the pull is over."""
 STALE = 0.25
 """Change of a log E after which a frame of the full model is solved again at the end."""
 IDLE_GAIN = 0.01
@@ -152,6 +154,7 @@ class OnlineEstimator:
         self._making: Future | None = None
         self._surprises: list[float] = []
         self._lost: list[OnlineFrame] = []
+        self._past: list[OnlineFrame] = []
         self._untrusted = self._since_basis = 0
 
     def _use(self, reduced: ReducedModel) -> None:
@@ -202,7 +205,7 @@ class OnlineEstimator:
         return self._state(frame.time, kept.residual, kept.state.trusted)
 
     def settle(self) -> OnlineState | None:
-        """Wait for the full model, linearise all kept frames again; None before any frame."""
+        """Wait for the full model, linearise all frames again; None before any frame."""
         if not self._kept:
             return None
         if self._exact is not None:
@@ -218,15 +221,32 @@ class OnlineEstimator:
                 if not self._ask(whole=True):
                     break
                 self._await()
+        self._linearise_all()
+        last = self._kept[-1]
+        return self._state(last.frame.time, last.residual, last.state.trusted)
+
+    def _linearise_all(self) -> None:
+        """Put in place of what was merged on the way the frames themselves, as seen from now."""
+        states = {id(kept.frame): kept.state for kept in self._kept}
+        frames = sorted([*(kept.frame for kept in self._kept), *self._past],
+                        key=lambda frame: frame.time)
+        chosen = np.unique(np.linspace(0, len(frames) - 1, FINAL_FRAMES).round().astype(int))
+        weight = len(frames) / len(chosen)
+        kept: list[_Kept] = []
         for _ in range(6):
-            before = self.log_young.copy()
-            for index, old in enumerate(self._kept):
-                self._kept[index] = self._linearised(old.frame, old.state) or old
+            before, kept, state = self.log_young.copy(), [], None
+            for index in chosen:
+                frame = frames[index]
+                found = self._linearised(frame, states.get(id(frame), state))
+                if found is not None:
+                    state = states[id(frame)] = found.state
+                    kept.append(replace(found, normal=weight * found.normal,
+                                        gradient=weight * found.gradient))
+            self._kept, self._past = kept, []
+            self._merged.normal[:], self._merged.gradient[:] = 0.0, 0.0
             self._step()
             if np.abs(self.log_young - before).max() < 1e-3:
                 break
-        last = self._kept[-1]
-        return self._state(last.frame.time, last.residual, last.state.trusted)
 
     def _is_strange(self) -> bool:
         """Whether the pull has left what the basis was made from, and it is worth another one."""
@@ -358,6 +378,7 @@ class OnlineEstimator:
         poses = np.array([kept.frame.pose for kept in self._kept])
         steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
         gone = self._kept.pop(int(np.argmin(steps[:-1] + steps[1:])) + 1)
+        self._past.append(gone.frame)
         self._merged.normal += gone.normal
         self._merged.gradient += gone.gradient - gone.normal @ gone.centre
 
