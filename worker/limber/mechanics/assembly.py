@@ -181,3 +181,16 @@ def tangent_times(displacement, direction, gradients, weights, lame_lambda, lame
             node = tets[e, a]
             for i in range(3):
                 product[node, i] += out[i, a]
+
+
+@compiled
+def sparse_times(starts, columns, values, field, product):
+    """Write a matrix in compressed rows times a nodal field, shape [node_count, 3]."""
+    for row in range(len(starts) - 1):
+        x, y, z = 0.0, 0.0, 0.0
+        for p in range(starts[row], starts[row + 1]):
+            value, column = values[p], columns[p]
+            x += value * field[column, 0]
+            y += value * field[column, 1]
+            z += value * field[column, 2]
+        product[row, 0], product[row, 1], product[row, 2] = x, y, z

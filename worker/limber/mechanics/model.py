@@ -12,10 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from limber.errors import InputError
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import elements
-from limber.mechanics.assembly import (
-    strain_changes,
-    tangent_times,
-)
+from limber.mechanics.assembly import sparse_times, strain_changes, tangent_times
 from limber.mechanics.equations import Equations, Viscous
 from limber.mechanics.forces import ForceLayout, internal_force, largest_stretch, strains
 from limber.mechanics.grasp import Grasp
@@ -322,6 +319,14 @@ class BranchModel:
         if "matrix" not in self._mass:
             self._mass["matrix"] = self._make_mass_matrix()
         return self._mass["matrix"]
+
+    def mass_times(self, field: np.ndarray) -> np.ndarray:
+        """Return the mass matrix times a nodal field of shape [node_count, 3]."""
+        matrix = self.mass_matrix
+        product = np.empty((self.mesh.node_count, 3))
+        sparse_times(matrix.indptr, matrix.indices, matrix.data,
+                     np.ascontiguousarray(field, float), product)
+        return product
 
     @property
     def _added(self) -> list[tuple[int, float]]:

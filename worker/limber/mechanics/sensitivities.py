@@ -187,7 +187,7 @@ def _density_force(model: BranchModel, state: object) -> np.ndarray:
     force = -bare.weight_force
     velocity = getattr(state, "velocity", None)
     if velocity is not None:
-        force = force + bare.mass_matrix @ (state.acceleration + model.damping.mass * velocity)
+        force = force + bare.mass_times(state.acceleration + model.damping.mass * velocity)
     return force
 
 
@@ -197,7 +197,7 @@ def _damping_force(model: BranchModel, name: str, state: object,
     if velocity is None:
         return np.zeros_like(state.displacement)
     if name == "damping_mass":
-        return model.mass_matrix @ velocity
+        return model.mass_times(velocity)
     if viscous is None:
         return np.zeros_like(state.displacement)
     # The viscous force is linear in the factor.

@@ -1,0 +1,132 @@
+"""What moves a branch: grasps along poses or with forces, loads, gravity; at any time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.mechanics.equations import Equations
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.model import BranchModel
+from limber.mechanics.motion import MotionState
+from limber.mechanics.pose_path import PosePath
+from limber.mechanics.static_problem import checked_forces
+from limber.mechanics.static_result import StaticResult
+from limber.mechanics.statics import solve_static
+
+
+class Drive:
+    """Loads and constraints of a motion; arguments as for simulate_dynamics.
+
+    Attributes:
+        times: Of the frames [s].
+        grasps: All of them; single: whether one was given by itself.
+        path: The grasps' motion; None where they do not follow poses.
+        load: Gravity and nodal forces [N], shape [node_count, 3].
+        equations: With the grasps held that follow poses.
+
+    Raises:
+        InputError: arguments that do not fit each other.
+    """
+
+    def __init__(self, model: BranchModel, grasp: Grasp | Sequence[Grasp] | None,
+                 poses: np.ndarray | None, grasp_forces: np.ndarray | None,
+                 nodal_forces: np.ndarray | None, times: np.ndarray):
+        self.model, self.times = model, _checked_times(times)
+        self.single = isinstance(grasp, Grasp)
+        self.grasps = [] if grasp is None else [grasp] if self.single else list(grasp)
+        self.path = None
+        if poses is not None:
+            if not self.grasps or grasp_forces is not None:
+                raise InputError("Poses without a grasp, or together with grasp forces.",
+                                 "A grasp follows poses or exerts a force, not both.",
+                                 "Leave one out.")
+            self.path = PosePath(self.grasps, model.mesh.nodes, self.times, poses)
+        self.load = model.weight_force
+        if nodal_forces is not None:
+            self.load = self.load + checked_forces(nodal_forces, (model.mesh.node_count, 3))
+        self._grasp_forces = self._checked_grasp_forces(grasp_forces)
+        self.equations: Equations = model.equations(self.grasps if self.path else ())
+        self._known: tuple[float, tuple] | None = None
+
+    def load_at(self, instant: float) -> np.ndarray:
+        """Return nodal loads [N] at a time."""
+        if self._grasp_forces is None:
+            return self.load
+        load = self.load.copy()
+        for number, grasp in enumerate(self.grasps):
+            force = [np.interp(instant, self.times, self._grasp_forces[:, number, axis])
+                     for axis in range(3)]
+            load[grasp.nodes] += grasp.weights[:, None] * force
+        return load
+
+    def equilibrium(self) -> StaticResult:
+        """Return the equilibrium under pose and loads of the first time.
+
+        Raises:
+            ConvergenceError: there is none.
+        """
+        pose = self.path.poses[0] if self.path else None
+        force = None if self._grasp_forces is None else self._grasp_forces[0]
+        extra = self.load - self.model.weight_force
+        return solve_static(self.model, grasp=self.grasps or None, pose=pose, grasp_force=force,
+                            nodal_forces=extra if extra.any() else None).require()
+
+    def moves(self, state: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
+        """Return how held nodes and pinned means have to move to where the path is.
+
+        Returns:
+            [m], shape [node_count, 3], or None if they do not, and shape [pinned, 3].
+        """
+        if not self.path:
+            return None, np.zeros((0, 3))
+        held, means = self._at(state.time)
+        moved = np.zeros_like(state.displacement)
+        for grasp, patch in zip(self.path.clamped, held[0], strict=True):
+            moved[grasp.nodes] = patch - state.displacement[grasp.nodes]
+        now = np.array([g.weights @ state.displacement[g.nodes] for g in self.path.pinned])
+        return (moved if moved.any() else None), means[0] - now.reshape(-1, 3)
+
+    def hold(self, state: MotionState) -> None:
+        """Give held nodes the path's velocity and acceleration."""
+        if self.path:
+            held, _ = self._at(state.time)
+            for values, motion in zip((state.velocity, state.acceleration), held[1:],
+                                      strict=True):
+                for grasp, patch in zip(self.path.clamped, motion, strict=True):
+                    values[grasp.nodes] = patch
+
+    def impose(self, state: MotionState) -> None:
+        """Give held nodes, and the means of pinned patches, all of the path's motion."""
+        held, pins = self._at(state.time)
+        fields = (state.displacement, state.velocity, state.acceleration)
+        for field_, values, means in zip(fields, held, pins, strict=True):
+            for grasp, patch in zip(self.path.clamped, values, strict=True):
+                field_[grasp.nodes] = patch
+            for grasp, mean in zip(self.path.pinned, means, strict=True):
+                field_[grasp.nodes] += mean - grasp.weights @ field_[grasp.nodes]
+
+    def _at(self, instant: float) -> tuple:
+        if self._known is None or self._known[0] != instant:
+            self._known = (instant, self.path.at(instant))
+        return self._known[1]
+
+    def _checked_grasp_forces(self, forces: np.ndarray | None) -> np.ndarray | None:
+        if forces is None:
+            return None
+        wanted = (len(self.times), len(self.grasps), 3)
+        values = np.asarray(forces, float)
+        if not self.grasps or values.size != np.prod(wanted) or not np.isfinite(values).all():
+            raise InputError(f"Grasp forces of shape {values.shape}.",
+                             f"{len(self.times)} times and {len(self.grasps)} grasps need"
+                             f" {wanted}.", "Give three numbers [N] for each.")
+        return values.reshape(wanted)
+
+
+def _checked_times(times: np.ndarray) -> np.ndarray:
+    times = np.asarray(times, float)
+    if times.ndim != 1 or len(times) < 1 or not np.isfinite(times).all() or (
+            np.diff(times) <= 0).any():
+        raise InputError("Times are not ascending.", "Each frame must be later than the last.",
+                         "Sort them and remove what is double.")
+    return times
