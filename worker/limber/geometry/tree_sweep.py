@@ -338,10 +338,13 @@ class _TreeSweep:
 
     def _patch_triangles(self, patch: "_Patch") -> np.ndarray:
         """The carrier's boundary triangles on the patch, outward, shape [2 or 4, 3]."""
-        inside = set(patch.loop.tolist())
-        faces = TetMesh(np.vstack(self._nodes), np.vstack(self._tets)).surface_faces()
-        chosen = [face for face in faces if set(face.tolist()) <= inside]
-        return np.array(chosen)
+        inside = np.zeros(self._node_count, bool)
+        inside[patch.loop] = True
+        tets = np.vstack(self._tets)
+        # Both tetrahedra at a face have three corners in the loop if the face has.
+        near = tets[inside[tets].sum(axis=1) > 2]
+        faces = TetMesh(np.empty((0, 3)), near).surface_faces()
+        return faces[inside[faces].all(axis=1)]
 
 
 @dataclass(frozen=True)
