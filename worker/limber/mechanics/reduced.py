@@ -122,12 +122,13 @@ class ReducedSensitivities:
 
     Attributes:
         coordinates: Shape [size, K]; displacements by ``ReducedModel.displacement_of``.
-        reaction_force: [N], shape [3, K].
+        reaction_force, reaction_torque: [N, Nm], shape [3, K]; about the pose's position.
         strain_energy: [J], shape [K].
     """
 
     coordinates: np.ndarray
     reaction_force: np.ndarray
+    reaction_torque: np.ndarray
     strain_energy: np.ndarray
 
 
@@ -297,9 +298,11 @@ class ReducedModel:
             change = np.zeros(self.size)
             change[free] = -cho_solve(factor, explicit[free])
             columns.append(change)
-            forces.append(self.wrench(state.pose, explicit + tangent @ change)[0])
+            forces.append(np.concatenate(self.wrench(state.pose, explicit + tangent @ change)))
             energies.append(0.5 * modulus * strain @ part @ strain + force @ change)
-        return ReducedSensitivities(np.array(columns).T, np.array(forces).T, np.array(energies))
+        wrench = np.array(forces).T
+        return ReducedSensitivities(np.array(columns).T, wrench[:3], wrench[3:],
+                                    np.array(energies))
 
     def nearest(self, pose: np.ndarray, count: int = 4) -> np.ndarray:
         """Return the training states nearest to a pose at this Young's modulus."""
