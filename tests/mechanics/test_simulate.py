@@ -1,6 +1,7 @@
 """The command simulate on a small branch folder: frames, keys, failure, the VTU series."""
 
 import json
+import re
 from xml.etree import ElementTree
 
 import numpy as np
@@ -102,3 +103,111 @@ def test_left_out_twigs_hang_on_the_branch(tmp_path):
     bare = BranchModel.from_branch(branch, point_masses=())
     weights = [solve_static(m).require().base_force[2] for m in (model, bare)]
     assert weights[0] - weights[1] == pytest.approx(0.25 * 9.80665, rel=1e-6)
+
+
+def _replace_mesh(folder, mesh):
+    with Branch.open(folder).stage("reconstruct") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+
+
+def _swapped(mesh):
+    mesh.tets[5, [0, 1]] = mesh.tets[5, [1, 0]]
+
+
+def _flat(mesh):
+    tet = mesh.tets[5]
+    mesh.nodes[tet[3]] = mesh.nodes[tet[:3]].mean(axis=0)
+
+
+def _loose_end(mesh):
+    mesh.point_data["fixed"][:] = 0
+
+
+def _cell(name, value):
+    def spoil(mesh):
+        mesh.cell_data[name][3] = value
+    return spoil
+
+
+SPOILT = {
+    "inverted": (_swapped, "inverted|negative|inside out"),
+    "flat": (_flat, "inverted|volume|flat|inside out"),
+    "not fixed": (_loose_end, "fixed"),
+    "poisson 0.5": (_cell("poisson", 0.5), "Poisson"),
+    "negative young": (_cell("young", -1e9), "Young"),
+    "no density": (_cell("density", 0.0), "Density"),
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_spoilt_mesh_exits_with_2(folder, name, capsys):
+    """Each fault of a mesh ends `limber simulate` with exit code 2 and its reason."""
+    spoil, message = SPOILT[name]
+    mesh = TetMesh.read(folder / "mesh.vtu")
+    mesh = TetMesh(mesh.nodes.copy(), mesh.tets.copy(),
+                   {k: v.copy() for k, v in mesh.cell_data.items()},
+                   {k: v.copy() for k, v in mesh.point_data.items()})
+    spoil(mesh)
+    _replace_mesh(folder, mesh)
+    assert call(["simulate", str(folder), "--progress", "none"]) == 2
+    said = capsys.readouterr()
+    assert re.search(message, said.out + said.err)
+    assert not (folder / "frames").exists()
+
+
+def test_two_pieces_exit_with_2(folder, capsys):
+    """A second piece beside the branch: exit code 2, with the sizes of both."""
+    mesh = TetMesh.read(folder / "mesh.vtu")
+    two = TetMesh(
+        np.vstack([mesh.nodes, mesh.nodes + [0.1, 0, 0]]),
+        np.vstack([mesh.tets, mesh.tets + mesh.node_count]),
+        {k: np.concatenate([v, v]) for k, v in mesh.cell_data.items()},
+        {k: np.concatenate([v, v]) for k, v in mesh.point_data.items()})
+    _replace_mesh(folder, two)
+    assert call(["simulate", str(folder), "--progress", "none"]) == 2
+    assert "2 pieces" in "".join(capsys.readouterr())
+
+
+def test_grasp_in_the_base_exits_with_2(folder, capsys):
+    """A grasp of the fixed base: exit code 2."""
+    assert call(["simulate", str(folder), "--grasp-point", "0", "0", "0",
+                 "--progress", "none"]) == 2
+    assert "fixed base" in "".join(capsys.readouterr())
+
+
+def test_load_in_wrong_units_warns(folder):
+    """A force far too large: a warning that names strain, place and units."""
+    said = []
+    settings = SimulateSettings(kind="static", grasp_force=(0, 0, 150000.0), frame_rate=2,
+                                gravity=False)
+    simulate(folder, settings, warn=said.append)
+    assert any("units" in message and "at (" in message for message in said)
+
+
+def test_frames_say_strain_and_stress_of_each(folder):
+    """Largest principal strain and stress per frame, growing with a pull that grows."""
+    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), frame_rate=4,
+                                gravity=False)
+    result = simulate(folder, settings)
+    frames = json.loads((folder / "frames" / "simulate.json").read_text())
+    strain = frames["largest_principal_strains"]
+    stress = frames["largest_principal_stresses_pa"]
+    assert len(strain) == len(stress) == result["frame_count"]
+    assert np.all(np.diff(strain) > 0)
+    assert stress[-1] == pytest.approx(1e9 * strain[-1], rel=0.3)
+
+
+def test_series_reads_back_elsewhere(folder):
+    """meshio, which is not what wrote them, reads each VTU of the series with all its fields."""
+    meshio = pytest.importorskip("meshio")
+    settings = SimulateSettings(kind="static", grasp_force=(1.0, 0, 0), frame_rate=2, vtu=True,
+                                gravity=False)
+    simulate(folder, settings)
+    files = sorted((folder / "frames" / "simulate").glob("*.vtu"))
+    own = TetMesh.read(folder / "mesh.vtu")
+    assert len(files) == 3
+    read = meshio.read(files[-1])
+    assert read.cells_dict["tetra10"].shape == own.tets.shape
+    assert read.points == pytest.approx(own.nodes + read.point_data["displacement"], abs=1e-9)
+    assert {"young", "energy_density", "principal_strain", "principal_stress",
+            "det_f"} <= set(read.cell_data)

@@ -72,7 +72,7 @@ def write_pvd_series(folder: Path, name: str, model: BranchModel, times: np.ndar
             model.mesh.nodes + moved, model.mesh.tets,
             cell_data={"young": model.young, "energy_density": state.energy_density,
                        "principal_strain": state.principal_strain,
-                       "principal_stress": state.principal_stress},
+                       "principal_stress": state.principal_stress, "det_f": state.det_f},
             point_data={"displacement": moved})
         paths.append(folder / f"{name}-{number:04d}.vtu")
         mesh.write(paths[-1])

@@ -228,7 +228,7 @@ def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
         write_pvd_series(folder, settings.name, model, motion["times"], displacement)
     tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
                              axis=1).argmax())
-    last = strain_state(model, displacement[-1])
+    strain, stress = _largest(model, displacement)
     rows = {name: np.asarray(motion[name]).tolist()
             for name in ("times", "strain_energy", "kinetic_energy", "grasp_force",
                          "grasp_torque", "min_det_f")}
@@ -238,11 +238,17 @@ def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
         "kinetic_energies_j": rows["kinetic_energy"], "grasp_forces_n": rows["grasp_force"],
         "grasp_torques_nm": rows["grasp_torque"], "min_det_f": rows["min_det_f"],
         "converged": motion["converged"],
-        "largest_principal_strain": float(last.principal_strain[:, -1].max()),
-        "largest_principal_stress_pa": float(last.principal_stress[:, -1].max())}
+        "largest_principal_strains": strain, "largest_principal_stresses_pa": stress}
     write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
     return {
         "converged": motion["converged"], "frame_count": len(displacement),
         "energy_j": rows["strain_energy"][-1], "grasp_force_n": rows["grasp_force"][-1],
         "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
         "min_det_f": float(np.min(rows["min_det_f"]))}
+
+
+def _largest(model: BranchModel, displacement: np.ndarray) -> tuple[list[float], list[float]]:
+    """Return the largest principal strain and stress [Pa] of each frame."""
+    states = [strain_state(model, frame) for frame in displacement]
+    return ([float(s.principal_strain[:, -1].max()) for s in states],
+            [float(s.principal_stress[:, -1].max()) for s in states])

@@ -30,11 +30,13 @@ class StrainState:
         energy_density: Strain energy density [J/m^3].
         principal_strain: Principal Green-Lagrange strains, ascending.
         principal_stress: Principal Cauchy stresses [Pa], ascending.
+        det_f: Volume relative to that at rest, at the quadrature point where it is least.
     """
 
     energy_density: np.ndarray
     principal_strain: np.ndarray
     principal_stress: np.ndarray
+    det_f: np.ndarray
 
 
 def deformation_gradients(model: BranchModel, displacement: np.ndarray) -> np.ndarray:
@@ -60,7 +62,8 @@ def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
     strain = np.einsum("eq,eqij->eij", part, green)
     energy = model.internal(displacement).tet_energy / model.weights.sum(axis=1)
     stress = np.einsum("eq,eqij->eij", part, _cauchy(model, F, green))
-    return StrainState(energy, np.linalg.eigvalsh(strain), np.linalg.eigvalsh(stress))
+    return StrainState(energy, np.linalg.eigvalsh(strain), np.linalg.eigvalsh(stress),
+                       np.linalg.det(F).min(axis=1))
 
 
 def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray) -> np.ndarray:
