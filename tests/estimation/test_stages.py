@@ -62,7 +62,10 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
     assert len(stored["history"]) == stored["forward_count"]
     captions = [caption for figure, caption in report_figures(branch, stored)
                 if figure.axes and figure.axes[0].has_data()]
-    assert len(captions) == 4
+    assert len(captions) == 6
+    parts = stored["young_deviation"]
+    assert parts["geometry"] is None and parts["mesh"] < 0.05
+    assert "came without a deviation" in captions[0]
 
 
 def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):

@@ -238,14 +238,16 @@ def _option(name: str, field: Any) -> Callable:
     if typing.get_origin(kind) is tuple:
         items = typing.get_args(kind)
         if items[-1] is Ellipsis:
-            return click.option(flag, name, callback=_number_list, metavar="A,B,...", **common)
+            # Given twice it adds up: the last one alone would drop the others without a word.
+            return click.option(flag, name, callback=_listed, metavar="A,B,...", multiple=True,
+                                **common)
         metavar = "X Y Z" if len(items) == 3 else None
         return click.option(flag, name, nargs=len(items), type=items[0], metavar=metavar, **common)
     return click.option(flag, name, type=kind, **common)
 
 
-def _number_list(_ctx: click.Context, _param: click.Parameter, text: str | None) -> Any:
-    return None if text is None else tuple(part.strip() for part in text.split(","))
+def _listed(_ctx: click.Context, _param: click.Parameter, texts: tuple[str, ...]) -> Any:
+    return tuple(part.strip() for text in texts for part in text.split(",")) or None
 
 
 def _plain_type(annotation: Any) -> tuple[Any, bool]:

@@ -112,14 +112,14 @@ def residuals_over_time(pull: dict[str, Any]) -> Any:
     axes.set_ylim(bottom=0)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("residual / its deviation")
-    axes.legend(frameon=False, ncol=3, fontsize=8)
+    figure.legend(frameon=False, ncol=5, fontsize=8, loc="outside upper left")
     return figure
 
 
 def held_out_scores(estimate: dict[str, Any]) -> Any:
     """Errors of foretold pulls in percent, points and force."""
     scores = estimate["held_out"]
-    figure, axes = _figure(5.2, 0.9 + 0.45 * len(scores))
+    figure, axes = _figure(5.2, 1.2 + 0.45 * len(scores))
     place = np.arange(len(scores))
     for shift, key, colour, label in ((0.2, "relative_distance", SIMULATED, "points, of travel"),
                                       (-0.2, "relative_force", "#2e8b57", "force, of its peak")):
@@ -128,7 +128,7 @@ def held_out_scores(estimate: dict[str, Any]) -> Any:
     axes.set_yticks(place, [name if score.get("in_fit", True) else f"{name} (not in the fit)"
                             for name, score in scores.items()])
     axes.set_xlabel("error of the foretold pull [%]")
-    axes.legend(frameon=False)
+    figure.legend(frameon=False, ncol=2, fontsize=8, loc="outside upper right")
     return figure
 
 
