@@ -125,11 +125,11 @@ def _depth_rows(quick: bool) -> list[Row]:
                 f"{sum(covered)} of {len(covered)} intervals hold)", max(worst) <= 0.10)]
 
 
-def _moved(truth: object, states: list) -> list[np.ndarray]:
+def _moved(truth: object, displacements: list) -> list[np.ndarray]:
     from limber.estimation.points import point_operator
 
     operator = point_operator(truth.mesh, truth.control_points)
-    return [(operator @ state.displacement.ravel()).reshape(-1, 3) for state in states]
+    return [(operator @ displacement.ravel()).reshape(-1, 3) for displacement in displacements]
 
 
 def _optimiser_rows() -> list[Row]:

@@ -391,7 +391,7 @@ def _model_error(branch: Branch, subject: Subject, found: Estimate, grasp: Grasp
     inside = point_operator(subject.mesh, subject.control_points)
     model = subject.model.with_parameters(poisson=found.values.poisson)
     return ModelError(geometry, mesh_error(model, grasp_on(subject.mesh, grasp), inside,
-                                           subject.weights @ found.values.young))
+                                           subject.weights, found.values.young))
 
 
 def _deviations(found: Estimate) -> dict[str, Any]:

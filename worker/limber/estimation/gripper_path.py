@@ -1,19 +1,190 @@
 """The way a gripper goes in a virtual pull: where the branch goes when it is pulled sideways.
 
+Slow pulls follow that way once. Fast ones shake the branch along it, or pull and let go. A weight
+needs no way: it hangs.
+
 A path invented in space would compress a branch (it buckles) or stretch it (it tears): its length
 is fixed and nobody knows beforehand how it bends. A hand feels that and yields. Here the truth is
 pulled by a force that grows and turns, and where its grasp then goes is the path.
 """
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from limber.errors import WorkError
-from limber.mechanics.grasp import Grasp
+from limber.mechanics.dynamics import simulate_dynamics
+from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics import StaticResult, StaticSettings, solve_static
 from limber.progress import SILENT, Progress
 
 SETTINGS = StaticSettings(tolerance=1e-8)
+TURNED_PART = 0.7
+"""Of the turn that a branch would make by itself, how much a clamping gripper lets it."""
+WAY_STATES = 12
+"""Slow states that the way of a shaken gripper is a spline through."""
+SHAKES = 2.0
+"""How often a shaken gripper goes back and forth."""
+
+
+@dataclass(frozen=True)
+class MotionWanted:
+    """How a virtual gripper moves.
+
+    Attributes:
+        kind: ``pull`` (slow, the branch turns freely), ``turned`` (slow, held back in turning),
+            ``shake`` (fast, along the way of a pull), ``release`` (fast, pulled by force and let
+            go), ``weight`` (a growing weight hangs on the grasp).
+        point: The grasp point at rest [m], shape [3].
+        axis: From base to grasp, shape [3].
+        travel: Of the grasp [m].
+        turn, phase: See :func:`sideways_forces`.
+        times: [s], shape [n].
+        weight: The largest weight's force [N], shape [3].
+    """
+
+    kind: Literal["pull", "turned", "shake", "release", "weight"]
+    point: np.ndarray
+    axis: np.ndarray
+    travel: float
+    turn: float
+    phase: float
+    times: np.ndarray
+    weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class MotionMade:
+    """What came of it, at each time.
+
+    Attributes:
+        poses: Of the grasp point [m, rad], shape [n, 6].
+        wrenches: Of the gripper on the branch [N, N m], torque about the pose, shape [n, 6].
+        displacements: Of all nodes [m], each of shape [node_count, 3].
+    """
+
+    poses: np.ndarray
+    wrenches: np.ndarray
+    displacements: list[np.ndarray]
+
+
+def moved(model: BranchModel, grasp: Grasp, wanted: MotionWanted, *,
+          progress: Progress = SILENT) -> MotionMade:
+    """Move a branch as wanted.
+
+    Raises:
+        WorkError: no force moves the grasp as far, or the motion cannot be followed.
+    """
+    count = len(wanted.times)
+    if wanted.kind == "weight":
+        share = np.linspace(0.0, 1.0, count)
+        return _slow(model, grasp, wanted, share[:, None] * wanted.weight, progress)
+    if wanted.kind == "release":
+        return _released(model, grasp, wanted, progress)
+    states = WAY_STATES if wanted.kind == "shake" else count
+    directions = sideways_forces(wanted.axis, states, turn=wanted.turn, phase=wanted.phase)
+    size = force_for_travel(model, grasp, directions[-1], wanted.travel)
+    slow = _slow(model, grasp, wanted, size * directions, progress)
+    if wanted.kind == "pull":
+        return slow
+    if wanted.kind == "shake":
+        return _shaken(model, grasp, wanted, slow, progress)
+    poses = slow.poses * np.r_[np.ones(3), np.full(3, TURNED_PART)]
+    held = _about_centre(grasp, wanted.point, poses)
+    results, start = [], None
+    for pose in held:
+        results.append(solve_static(model, grasp=grasp, pose=pose, start=start,
+                                    settings=SETTINGS).require())
+        start = results[-1]
+    forces = np.array([result.reaction_force for result in results])
+    torques = np.array([result.reaction_torque for result in results])
+    return _made(poses, held, forces, torques, [result.displacement for result in results])
+
+
+def _slow(model: BranchModel, grasp: Grasp, wanted: MotionWanted, forces: np.ndarray,
+          progress: Progress) -> MotionMade:
+    """Equilibria under forces of the gripper that exert no torque on the branch."""
+    displacements, start = [], None
+    for index, force in enumerate(forces):
+        progress(index / len(forces), "pulling", frame=index)
+        start = solve_static(model, grasp=grasp, grasp_force=force, start=start,
+                             settings=SETTINGS).require()
+        displacements.append(start.displacement)
+    poses, centres = _poses(model, grasp, wanted.point, displacements)
+    return _made(poses, centres, forces, np.zeros_like(forces), displacements)
+
+
+def _shaken(model: BranchModel, grasp: Grasp, wanted: MotionWanted, way: MotionMade,
+            progress: Progress) -> MotionMade:
+    """Out within a quarter of the time, back and forth over half the way, and held still."""
+    share = wanted.times / wanted.times[-1]
+    out = np.clip(share / 0.25, 0.0, 1.0)
+    swing = np.clip((share - 0.25) / 0.5, 0.0, 1.0)
+    along = out**2 * (3 - 2 * out) * (0.75 + 0.25 * np.cos(2 * np.pi * SHAKES * swing))
+    poses = CubicSpline(np.linspace(0.0, 1.0, len(way.poses)), way.poses)(along)
+    held = _about_centre(grasp, wanted.point, poses)
+    result = simulate_dynamics(model, grasp=grasp, poses=held, times=wanted.times,
+                               progress=progress)
+    _require(result)
+    return _made(poses, held, result.reaction_force, result.reaction_torque,
+                 list(result.displacement))
+
+
+def _released(model: BranchModel, grasp: Grasp, wanted: MotionWanted,
+              progress: Progress) -> MotionMade:
+    """A force that grows over a third of the time and is gone within a frame."""
+    direction = sideways_forces(wanted.axis, 2, turn=0.0, phase=wanted.phase)[-1]
+    size = force_for_travel(model, grasp, direction, wanted.travel)
+    share = wanted.times / wanted.times[-1]
+    ramp = np.clip(share / 0.3, 0.0, 1.0)
+    forces = (ramp**2 * (3 - 2 * ramp) * (share < 0.4))[:, None] * size * direction
+    result = simulate_dynamics(model, grasp=grasp, grasp_forces=forces, times=wanted.times,
+                               progress=progress)
+    _require(result)
+    displacements = list(result.displacement)
+    poses, centres = _poses(model, grasp, wanted.point, displacements)
+    return _made(poses, centres, forces, np.zeros_like(forces), displacements)
+
+
+def _require(result: object) -> None:
+    if not result.converged:
+        raise WorkError("The motion of the true branch cannot be followed.",
+                        "It is too fast or goes too far for this branch.",
+                        "Pull less far (--reach), or slower (--duration).")
+
+
+def _poses(model: BranchModel, grasp: Grasp, point: np.ndarray,
+           displacements: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of the grasp point, which the patch carries, and of the patch's centre."""
+    centres = np.array([grasp.pose_of(model.mesh.nodes, displacement)
+                        for displacement in displacements])
+    if grasp.mode == "pinned":
+        # Held by its weighted mean: where the point goes, whatever the turn.
+        poses = centres.copy()
+        poses[:, :3] += point - grasp.centre
+        return poses, centres
+    poses = centres.copy()
+    for pose in poses:
+        pose[:3] += rotation_matrix(pose[3:]) @ (point - grasp.centre)
+    return poses, centres
+
+
+def _about_centre(grasp: Grasp, point: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Poses of the patch's centre for those of the grasp point."""
+    held = poses.copy()
+    for pose in held:
+        turn = rotation_matrix(pose[3:]) if grasp.mode == "clamped" else np.eye(3)
+        pose[:3] += turn @ (grasp.centre - point)
+    return held
+
+
+def _made(poses: np.ndarray, held: np.ndarray, forces: np.ndarray, torques: np.ndarray,
+          displacements: list[np.ndarray]) -> MotionMade:
+    torques = torques + np.cross(held[:, :3] - poses[:, :3], forces)
+    return MotionMade(poses, np.hstack([forces, torques]), displacements)
 
 
 def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: float,
@@ -37,31 +208,6 @@ def sideways_forces(axis: np.ndarray, frame_count: int, *, turn: float, phase: f
     return eased[:, None] * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
 
 
-def pulled(model: BranchModel, grasp: Grasp, directions: np.ndarray,
-           travel: float, *, progress: Progress = SILENT,
-           ) -> tuple[list[StaticResult], np.ndarray]:
-    """Pull a branch by forces along ``directions`` until its grasp has gone ``travel`` [m].
-
-    The forces' common size is found first, from the unloaded stiffness and then by bisection.
-
-    Returns:
-        States, and forces of the gripper on the branch [N], shape [n, 3].
-
-    Raises:
-        WorkError: no force moves the grasp as far.
-    """
-    size = force_for_travel(model, grasp, directions[-1], travel)
-    results: list[StaticResult] = []
-    start = None
-    for index, direction in enumerate(directions):
-        progress(index / len(directions), "pulling", frame=index)
-        result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=start,
-                              settings=SETTINGS).require()
-        results.append(result)
-        start = result
-    return results, size * directions
-
-
 def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, travel: float,
                      ) -> float:
     """Return the factor of ``direction`` [N] that moves the grasp by ``travel`` [m], to 3 %.
@@ -69,7 +215,7 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
     Raises:
         WorkError: none does.
     """
-    def moved(size: float, start: StaticResult | None) -> tuple[float, StaticResult]:
+    def pulled(size: float, start: StaticResult | None) -> tuple[float, StaticResult]:
         result = solve_static(model, grasp=grasp, grasp_force=size * direction, start=start)
         if not result.converged:
             return np.inf, result
@@ -77,13 +223,13 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
         return float(np.linalg.norm(shift)), result
 
     probe = 1e-6
-    while (found := moved(probe, None))[0] < 1e-4 * travel and probe < 1e6:
+    while (found := pulled(probe, None))[0] < 1e-4 * travel and probe < 1e6:
         probe *= 10
     size = probe * min(travel / max(found[0], 1e-12), 50.0)
     low, high = 0.0, np.inf
     result = None
     for _ in range(14):
-        distance, tried = moved(size, result)
+        distance, tried = pulled(size, result)
         if abs(distance - travel) < 0.03 * travel:
             return size
         if distance < travel:

@@ -16,12 +16,15 @@ from limber.errors import WorkError
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics import solve_static
 
 RADIUS_POWER = 4.0
 """Bending stiffness is Young's modulus times radius to the fourth: one can stand for the other."""
 REFINED_LIMIT = 60_000
 """Tetrahedra of a refined mesh from which its check is left out: it would take minutes."""
+SMALL_FORCE_N = 1e-6
+"""Far below what bends any branch visibly: the response is linear."""
 REMAINING = 4 / 3
 """Error over its drop when edges are halved, at second order. Singular corners converge slower."""
 
@@ -33,18 +36,16 @@ class ModelError:
     Attributes:
         geometry: At the control points, from the radii's deviation, shape [K]; None where the
             branch's radii came without one.
-        mesh: From the mesh, alike everywhere; None where it was not measured.
+        mesh: From the mesh, shape [K]; None where it was not measured.
     """
 
     geometry: np.ndarray | None = None
-    mesh: float | None = None
+    mesh: np.ndarray | None = None
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
-        square = np.asarray(sensor)**2
-        if self.geometry is not None:
-            square = square + self.geometry**2
-        return np.sqrt(square + (self.mesh or 0.0)**2)
+        parts = [part for part in (sensor, self.geometry, self.mesh) if part is not None]
+        return np.sqrt(np.sum(np.square(parts), axis=0))
 
 
 def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.ndarray | None:
@@ -77,15 +78,19 @@ def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.nd
     return RADIUS_POWER * (share.T @ relative[nearest]) / share.sum(axis=0)
 
 
-def mesh_error(model: BranchModel, grasp: Grasp, operator: object, young: np.ndarray,
-               ) -> float | None:
-    """Relative standard deviation of E from the mesh: how much farther a finer one bends.
+def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.ndarray,
+               young: np.ndarray) -> np.ndarray | None:
+    """Relative standard deviation of E at the control points from the mesh, shape [K].
+
+    A small force bends the branch on this mesh and on a refined one; the moduli that make this
+    one bend like the refined one differ by the mesh's error.
 
     Args:
-        model: The branch with its modulus; gravity is left out.
-        grasp: Where a small force acts.
+        model: The branch; gravity is left out.
+        grasp: Where the force acts.
         operator: Displacement of points inside from the nodes', shape [3 m, 3 n]; sparse.
-        young: Of the tetrahedra [Pa], shape [tet_count].
+        weights: Part of each control point in each tetrahedron, shape [tet_count, K].
+        young: At the control points [Pa], shape [K].
 
     Returns:
         None where the refined mesh is too large, or gives no answer.
@@ -93,24 +98,39 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, young: np.nda
     mesh = model.mesh
     if 8 * mesh.tet_count > REFINED_LIMIT or not mesh.is_quadratic:
         return None
-    weightless = model.with_parameters(young=young, gravity=(0.0, 0.0, 0.0))
-    axis = grasp.centre - mesh.nodes[weightless.fixed].mean(axis=0)
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    fine_mesh = refined(mesh)
-    fine = BranchModel(fine_mesh, young=np.repeat(young, 8),
-                       poisson=np.repeat(weightless.poisson, 8), density=900.0, gravity=None)
+    coarse = model.with_parameters(young=weights @ young, gravity=(0.0, 0.0, 0.0))
+    fine = BranchModel(refined(mesh), young=np.repeat(weights @ young, 8),
+                       poisson=np.repeat(coarse.poisson, 8), density=900.0, gravity=None)
     free = Grasp(grasp.nodes, grasp.weights, grasp.centre, "pinned")
+    missing, slopes = [], []
     try:
-        coarse_moved, fine_moved = (
-            solve_static(each, grasp=free, grasp_force=1e-6 * across).require().displacement
-            for each in (weightless, fine))
+        for across in _across(free, mesh.nodes[coarse.fixed]):
+            ours, theirs = (solve_static(each, grasp=free, grasp_force=SMALL_FORCE_N * across
+                                         ).require() for each in (coarse, fine))
+            found = static_sensitivities(coarse, ours, free, weights, ("log_young",),
+                                         is_held=False, control_young=young)
+            # The refined mesh has the coarse one's nodes first.
+            extra = theirs.displacement[:mesh.node_count] - ours.displacement
+            size = np.linalg.norm(operator @ ours.displacement.ravel())
+            missing.append(operator @ extra.ravel() / size)
+            slopes.append(np.column_stack([
+                operator @ found.displacement[..., k].ravel() for k in range(len(young))]) / size)
     except WorkError:
         return None
-    # The refined mesh has the coarse one's nodes first.
-    points = operator @ coarse_moved.ravel()
-    ratio = (operator @ fine_moved[:mesh.node_count].ravel()) @ points / (points @ points)
-    return float(REMAINING * abs(np.log(ratio))) if ratio > 0 else None
+    missing, slopes = np.concatenate(missing), np.vstack(slopes)
+    together = slopes.sum(axis=1)
+    alike = float(missing @ together / (together @ together))
+    # Around the change alike everywhere, as far as the response tells the moduli apart.
+    apart = np.linalg.lstsq(slopes, missing - alike * together, rcond=0.03)[0]
+    return REMAINING * np.maximum(np.abs(alike + apart), abs(alike))
+
+
+def _across(grasp: Grasp, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors across the way from base to grasp."""
+    axis = grasp.centre - base.mean(axis=0)
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first) / np.linalg.norm(axis)
 
 
 def refined(mesh: TetMesh) -> TetMesh:

@@ -9,6 +9,7 @@ from limber.errors import Cancelled
 from limber.estimation.alignment import Frames
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.recording import PullEntry
 from limber.progress import SILENT, Progress
 
 FAILED_OBJECTIVE = 1e12
@@ -25,18 +26,23 @@ class Simulated:
         d_positions: Shape [f, m, 3, P], or None; P parameters in the order log E_1..log E_K and
             the extra ones of the parameter space.
         d_forces: Shape [f, 3, P], or None.
+        torques: About the grasp point [N m], shape [f, 3]; None: not known.
+        d_torques: Shape [f, 3, P], or None.
     """
 
     positions: np.ndarray
     forces: np.ndarray
     d_positions: np.ndarray | None = None
     d_forces: np.ndarray | None = None
+    torques: np.ndarray | None = None
+    d_torques: np.ndarray | None = None
 
 
 class Forward(Protocol):
     """Simulates one pull for given values; None where no equilibrium was found."""
 
     name: str
+    entry: PullEntry
     frames: Frames
     uses_force: bool
 
@@ -167,6 +173,14 @@ class Objective:
                 if simulated.d_forces is not None:
                     slope = simulated.d_forces / self._sigma(index)[:, None, None]
                     jacobian.append(slope[measured].reshape(-1, slope.shape[-1]))
+            if simulated.torques is not None:
+                measured = np.isfinite(frames.wrenches[:, 3:]).all(axis=1)
+                off = simulated.torques - frames.wrenches[:, 3:]
+                sigma = self._torque_sigma(index)[:, None]
+                residual.append((off / sigma)[measured].ravel())
+                if simulated.d_torques is not None:
+                    slope = simulated.d_torques / sigma[..., None]
+                    jacobian.append(slope[measured].reshape(-1, slope.shape[-1]))
         return Evaluation(free, np.concatenate(residual),
                           self._on_free(np.vstack(jacobian)) if jacobian else None,
                           loss, tuple(pulls))
@@ -182,6 +196,11 @@ class Objective:
     def _forces(self, index: int, simulated: Simulated) -> np.ndarray:
         off = simulated.forces - self.forwards[index].frames.wrenches[:, :3]
         return off / self._sigma(index)[:, None]
+
+    def _torque_sigma(self, index: int) -> np.ndarray:
+        forward = self.forwards[index]
+        counts = np.maximum(forward.frames.wrench_counts, 1)
+        return forward.entry.sensor.torque_sigma_nm / np.sqrt(counts)
 
     def _sigma(self, index: int) -> np.ndarray:
         counts = np.maximum(self.forwards[index].frames.wrench_counts, 1)

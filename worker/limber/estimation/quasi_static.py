@@ -17,7 +17,7 @@ from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.mechanics.sensitivities import static_sensitivities
+from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
 from limber.mechanics.statics import StaticResult, StaticSettings, solve_static
 
 SETTINGS = StaticSettings(tolerance=1e-6)
@@ -67,6 +67,7 @@ class QuasiStaticForward:
         self.entry = entry
         gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
         self._model = model.with_parameters(gravity=gravity)
+        self.uses_torque = uses_torque(entry, frames)
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
         self.set_key_count(key_count)
@@ -119,6 +120,9 @@ class QuasiStaticForward:
         points, forces = np.empty(shape), np.empty((len(self.keys), 3))
         d_points = np.empty((*shape, count)) if sensitivities else None
         d_forces = np.empty((len(self.keys), 3, count)) if sensitivities else None
+        with_torque = self.uses_torque
+        torques = np.empty((len(self.keys), 3)) if with_torque else None
+        d_torques = np.empty((len(self.keys), 3, count)) if with_torque and sensitivities else None
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
         for key, drive in enumerate(self._drives):
@@ -134,13 +138,20 @@ class QuasiStaticForward:
             slope = None if memory is None else memory.slope
             points[key] = self.rest_points + self._observed(before)
             forces[key] = result.reaction_force if self.drive == "pose" else drive
+            if with_torque:
+                # About the recorded grasp point, which the patch's centre lies beside.
+                arm = drive[:3] - self.frames.poses[self.keys[key], :3]
+                torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
             if sensitivities:
                 slope, d_forces[key] = self._slopes(model, values, extra, result)
                 for column in range(count):
                     d_points[key, ..., column] = self._observed(slope[..., column])
+                if with_torque:
+                    d_torques[key] = self._torque_slopes(model, values, extra, result, slope,
+                                                         self.frames.poses[self.keys[key], :3])
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
-        return self._at_all_frames(points, forces, d_points, d_forces)
+        return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques)
 
     def hint(self, displacements: list[np.ndarray]) -> None:
         """Start the next simulation from these displacements [m] of the key frames."""
@@ -227,13 +238,31 @@ class QuasiStaticForward:
             is_held=self.drive == "pose", control_young=values.young)
         return found.displacement, found.reaction_force
 
-    def _at_all_frames(self, points: np.ndarray, forces: np.ndarray, d_points: np.ndarray | None,
-                       d_forces: np.ndarray | None) -> Simulated:
-        def spread(values: np.ndarray) -> np.ndarray:
-            return np.tensordot(self.spread, values, axes=1)
-        return Simulated(spread(points), spread(forces),
-                         None if d_points is None else spread(d_points),
-                         None if d_forces is None else spread(d_forces))
+    def _torque_slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
+                       result: StaticResult, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
+        """Derivative of the gripper's torque about a point that does not move, shape [3, p]."""
+        wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
+        held = self.grasp.nodes
+        arm = model.mesh.nodes[held] + result.displacement[held] - about
+        columns = []
+        for column, partial in enumerate(explicit_forces(model, wanted, result, None)):
+            out = partial + model.tangent_times(result.displacement,
+                                                np.ascontiguousarray(slope[..., column]))
+            columns.append(np.cross(arm, out[held]).sum(axis=0))
+        return np.array(columns).T
+
+    def _at_all_frames(self, *at_keys: np.ndarray | None) -> Simulated:
+        return Simulated(*(None if values is None else np.tensordot(self.spread, values, axes=1)
+                           for values in at_keys))
+
+
+def uses_torque(entry: PullEntry, frames: Frames) -> bool:
+    """Whether the gripper's torque is an observation: a clamped grasp, and a sensor that says how
+    well it measures torque.
+    """
+    return (entry.drive == "pose" and entry.grasp.mode == "clamped"
+            and entry.sensor.torque_sigma_nm is not None
+            and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
 
 
 def _equal(one: Values | None, other: Values) -> bool:

@@ -58,6 +58,8 @@ class _Correction:
     forces: np.ndarray
     d_positions: np.ndarray
     d_forces: np.ndarray
+    torques: np.ndarray | None
+    d_torques: np.ndarray | None
 
 
 class CorrectedForward:
@@ -80,8 +82,9 @@ class CorrectedForward:
         if exact is None:
             return False
         keys, spread = self.full.keys, self.full.spread
-        off = [np.tensordot(spread, (getattr(exact, name) - getattr(rough, name))[keys], axes=1)
-               for name in ("positions", "forces", "d_positions", "d_forces")]
+        names = ("positions", "forces", "d_positions", "d_forces", "torques", "d_torques")
+        off = [None if getattr(exact, name) is None else np.tensordot(
+            spread, (getattr(exact, name) - getattr(rough, name))[keys], axes=1) for name in names]
         self._correction = _Correction(values, *off)
         return True
 
@@ -107,7 +110,16 @@ class CorrectedForward:
             found.positions + known.positions + known.d_positions @ step,
             found.forces + known.forces + known.d_forces @ step,
             found.d_positions + known.d_positions if sensitivities else None,
-            found.d_forces + known.d_forces if sensitivities else None)
+            found.d_forces + known.d_forces if sensitivities else None,
+            *self._torques(found, step, sensitivities))
+
+    def _torques(self, found: Simulated, step: np.ndarray, sensitivities: bool,
+                 ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        known = self._correction
+        if found.torques is None:
+            return None, None
+        return (found.torques + known.torques + known.d_torques @ step,
+                found.d_torques + known.d_torques if sensitivities else None)
 
 
 class Reduction:

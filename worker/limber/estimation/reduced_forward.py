@@ -11,9 +11,10 @@ from limber.estimation.key_frames import key_frames, travel
 from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.estimation.points import point_operator
+from limber.estimation.quasi_static import uses_torque
 from limber.estimation.recording import PullEntry
 from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics.reduced import ReducedModel, ReducedState
+from limber.mechanics.reduced import ReducedModel, ReducedSensitivities, ReducedState
 
 STEPS = {"poisson": 2e-3, "density": 2e-2}
 """Steps of the central differences for what the reduced model has no derivatives to."""
@@ -45,6 +46,7 @@ class ReducedForward:
                              "Use the full model for this pull (--forward full).")
         self.name, self.frames, self.entry = name, frames, entry
         self.uses_force = bool(np.isfinite(frames.wrenches[:, :3]).all(axis=1).any())
+        self.uses_torque = uses_torque(entry, frames)
         self.rest_points = np.asarray(rest_points, float)
         self.keys, self.spread = key_frames(travel(frames.poses), key_count)
         self._reduced, self._density = reduced, density
@@ -63,9 +65,9 @@ class ReducedForward:
                         for sign in (1, -1)] for name in extra if name in STEPS}
         count = len(values.young)
         shape = (len(self._poses), len(self.rest_points), 3)
-        positions, forces = np.empty(shape), np.empty((len(self._poses), 3))
+        positions, forces = np.empty(shape), np.empty((len(self._poses), 6))
         d_positions = np.zeros((*shape, count + len(extra))) if sensitivities else None
-        d_forces = np.zeros((len(self._poses), 3, count + len(extra))) if sensitivities else None
+        d_forces = np.zeros((len(self._poses), 6, count + len(extra))) if sensitivities else None
         before, untrusted = None, 0
         for index, pose in enumerate(self._poses):
             state = model.solve_static(pose, start=self._states[index] or before)
@@ -74,23 +76,30 @@ class ReducedForward:
             untrusted += not state.trusted
             self._states[index] = before = state
             positions[index] = self._seen(state)
-            forces[index] = state.reaction_force
+            # About the recorded grasp point, which the patch's centre lies beside.
+            arm = pose[:3] - self.frames.poses[self.keys[index], :3]
+            forces[index] = _wrench(state, arm)
             if not sensitivities:
                 continue
             slopes = model.sensitivities(state)
             d_positions[index, ..., :count] = (self._observe @ slopes.coordinates).reshape(
                 *shape[1:], count)
-            d_forces[index, :, :count] = slopes.reaction_force
+            d_forces[index, :, :count] = _wrench(slopes, arm)
             for name, pair in moved.items():
                 column, step = count + extra.index(name), 2 * STEPS[name]
                 ahead, behind = (beside.solve_static(pose, start=state) for beside in pair)
                 if not (ahead.converged and behind.converged):
                     return None
                 d_positions[index, ..., column] = (self._seen(ahead) - self._seen(behind)) / step
-                d_forces[index, :, column] = (ahead.reaction_force - behind.reaction_force) / step
+                d_forces[index, :, column] = (_wrench(ahead, arm) - _wrench(behind, arm)) / step
         self.untrusted_count = untrusted
-        return Simulated(*(None if value is None else np.tensordot(self.spread, value, axes=1)
-                           for value in (positions, forces, d_positions, d_forces)))
+        positions, wrenches, d_positions, d_wrenches = (
+            None if value is None else np.tensordot(self.spread, value, axes=1)
+            for value in (positions, forces, d_positions, d_forces))
+        torques = (wrenches[:, 3:], None if d_wrenches is None else d_wrenches[:, 3:])
+        return Simulated(positions, wrenches[:, :3], d_positions,
+                         None if d_wrenches is None else d_wrenches[:, :3],
+                         *(torques if self.uses_torque else (None, None)))
 
     def displacements(self, frames: np.ndarray) -> list[np.ndarray]:
         """Nodal displacements [m] at the simulated frames nearest to ``frames``, as of the last
@@ -107,6 +116,12 @@ class ReducedForward:
         # The load of the coordinates is weight alone; with_young has made a copy.
         model.load = self._reduced.load * (values.density / self._density)
         return model
+
+
+def _wrench(of: ReducedState | ReducedSensitivities, arm: np.ndarray) -> np.ndarray:
+    """Force, and torque about a point that lies ``arm`` behind the pose's position."""
+    torque = of.reaction_torque.T + np.cross(arm, of.reaction_force.T)
+    return np.concatenate([of.reaction_force, torque.T])
 
 
 def _shifted(values: Values, name: str, step: float) -> Values:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
 from limber.estimation.grasping import grasp_on
-from limber.estimation.gripper_path import pulled, sideways_forces
+from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.points import point_operator
 from limber.estimation.recording import (
     GraspEntry,
@@ -30,8 +30,8 @@ from limber.geometry.marks import base_nodes
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.tet_mesh import TetMesh
 from limber.geometry.tetrahedra import MeshSettings, mesh_branch
+from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics import StaticResult
 from limber.mechanics.young_field import young_weights
 from limber.perception.camera import D455, Camera, write_camera
 from limber.perception.observe import write_depth
@@ -54,13 +54,28 @@ class VirtualPullSettings(BaseModel):
         "generated branch, or a gradient from 160 to 40 MPa.")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
-    frames: int = Field(24, ge=2, description="Number of recorded frames.")
-    duration: float = Field(6.0, gt=0, description="Length of the recording [s].")
+    motion: Literal["quasi_static", "dynamic"] = Field(
+        "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
+        "the branch; with --drive force it pulls and lets go.")
+    drive: Literal["pose", "force"] = Field(
+        "pose", description="What is said to move the branch; force: its force, as in the paper.")
+    weight: float | None = Field(
+        None, gt=0, description="Hang a growing weight of at last so many kilograms on the grasp "
+        "instead of pulling sideways (slow, driven by force).")
+    damping: tuple[float, float] = Field(
+        (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
+    frames: int | None = Field(
+        None, ge=2, description="Number of recorded frames; without it 24, or 60 of a dynamic "
+        "pull.")
+    duration: float | None = Field(
+        None, gt=0, description="Length of the recording [s]; without it 6, or 1.5 of a dynamic "
+        "pull.")
     grasp_fraction: float = Field(
         0.92, gt=0, le=1, description="Where the branch is held. Past the last control point: "
         "what lies beyond the grasp is not bent and cannot be estimated.")
     mode: Literal["clamped", "pinned"] = Field(
-        "pinned", description="pinned: held in a loop that lets the branch turn.")
+        "pinned", description="pinned: held in a loop that lets the branch turn; clamped: turned "
+        "less than it would turn by itself, so that a torque acts.")
     reach: float = Field(
         0.35, gt=0, le=0.8, description="Sideways travel of the grasp over its arc length.")
     turn: float = Field(2.0, description="How far the pull's direction turns on the way [rad].")
@@ -69,6 +84,8 @@ class VirtualPullSettings(BaseModel):
     position_noise: float = Field(1e-3, ge=0, description="Noise of observed points [m].")
     force_noise: float = Field(
         0.02, ge=0, description="Noise of the force over its largest size.")
+    torque_noise: float = Field(
+        0.02, ge=0, description="Noise of the torque over its largest size (clamped).")
     gravity: bool = Field(
         False, description="Let gravity bend the branch out of its scanned shape; without it "
         "the scanned shape carries it already.")
@@ -76,6 +93,16 @@ class VirtualPullSettings(BaseModel):
         False, description="Record depth images of a simulated D455 instead of points.")
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")
     seed: int = Field(0, ge=0, description="Seed of all that is random.")
+
+    @property
+    def frame_count(self) -> int:
+        return self.frames or (60 if self.motion == "dynamic" else 24)
+
+    @property
+    def times(self) -> np.ndarray:
+        """Time stamps [s], shape [frame_count]."""
+        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
+        return np.linspace(0.0, duration, self.frame_count)
 
 
 @dataclass(frozen=True)
@@ -126,10 +153,10 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
         for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
-        pull, states = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
+        pull, displacements = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
         write_pull(folder, pull)
         if settings.camera:
-            write_depth_frames(folder, truth, pull, states, settings)
+            write_depth_frames(folder, truth, pull, displacements, settings)
         reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
         stage.result.update({
             "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
@@ -163,48 +190,73 @@ def true_branch(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,
-                  progress: Progress = SILENT) -> tuple[Pull, list[StaticResult]]:
-    """Pull the true branch and measure it; returns the pull and the true states."""
+                  progress: Progress = SILENT) -> tuple[Pull, list[np.ndarray]]:
+    """Pull the true branch and measure it; returns the pull and the true displacements [m].
+
+    Raises:
+        InputError: settings that do not go together. WorkError: the branch cannot be pulled so.
+    """
     rng = np.random.default_rng(settings.seed)
     entry = _entry(truth, settings)
     gravity = truth.gravity if settings.gravity else (0.0, 0.0, 0.0)
     weights = young_weights(truth.mesh, truth.control_points)
     model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
-                        density=settings.density, gravity=gravity)
+                        density=settings.density, gravity=gravity,
+                        damping=RayleighDamping(*settings.damping))
     grasp = grasp_on(truth.mesh, entry.grasp)
-    point = np.array(entry.grasp.point_m)
-    phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
-    directions = sideways_forces(point - truth.skeleton.nodes[0], settings.frames,
-                                 turn=settings.turn, phase=phase)
     arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
-    states, forces = pulled(model, grasp, directions, settings.reach * arc, progress=progress)
-    poses = np.array([_pose(grasp, point, state) for state in states])
+    phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
+    made = moved(model, grasp, MotionWanted(
+        kind=_kind(settings), point=np.array(entry.grasp.point_m),
+        axis=np.array(entry.grasp.point_m) - truth.skeleton.nodes[0], travel=settings.reach * arc,
+        turn=settings.turn, phase=phase, times=settings.times,
+        weight=np.array(truth.gravity) * (settings.weight or 0.0)), progress=progress)
     operator = point_operator(truth.mesh, truth.control_points)
-    positions = np.array([truth.control_points + (operator @ state.displacement.ravel()
-                                                  ).reshape(-1, 3) for state in states])
-    peak = np.linalg.norm(forces, axis=1).max()
-    forces = forces + settings.force_noise * peak * rng.standard_normal(forces.shape)
+    positions = np.array([truth.control_points + (operator @ displacement.ravel()).reshape(-1, 3)
+                          for displacement in made.displacements])
+    sizes = [float(np.linalg.norm(made.wrenches[:, part], axis=1).max())
+             for part in (slice(0, 3), slice(3, 6))]
+    wrenches = made.wrenches.copy()
+    count = len(wrenches)
+    wrenches[:, :3] += settings.force_noise * sizes[0] * rng.standard_normal((count, 3))
     positions = positions + settings.position_noise * rng.standard_normal(positions.shape)
     stray = rng.random(positions.shape[:2]) < settings.outliers
     positions[stray] += 0.05 * rng.standard_normal((int(stray.sum()), 3))
+    wrenches[:, 3:] += settings.torque_noise * sizes[1] * rng.standard_normal((count, 3))
+    torque_sigma = max(settings.torque_noise, 2e-3) * sizes[1]
     entry = entry.model_copy(update={"sensor": SensorEntry(
         position_sigma_m=max(settings.position_noise, 1e-4),
-        force_sigma_n=max(settings.force_noise, 2e-3) * peak)})
-    times = np.linspace(0.0, settings.duration, settings.frames)
-    torque = np.full(forces.shape, 0.0 if settings.mode == "pinned" else np.nan)
-    observations = None if settings.camera else Observations(times, positions)
-    return Pull(name, entry, times, poses, np.hstack([forces, torque]), observations), states
+        force_sigma_n=max(settings.force_noise, 2e-3) * sizes[0],
+        torque_sigma_nm=torque_sigma if settings.mode == "clamped" and torque_sigma > 0 else None)})
+    observations = None if settings.camera else Observations(settings.times, positions)
+    pull = Pull(name, entry, settings.times, made.poses, wrenches, observations)
+    return pull, made.displacements
+
+
+def _kind(settings: VirtualPullSettings) -> str:
+    if settings.weight is not None:
+        if settings.motion == "dynamic":
+            raise InputError("A weight that is hung on in motion.",
+                             "A hung weight is a slow pull that its force drives.",
+                             "Leave --weight or --motion dynamic out.")
+        return "weight"
+    if settings.motion == "dynamic":
+        return "release" if settings.drive == "force" else "shake"
+    return "turned" if settings.mode == "clamped" and settings.drive == "pose" else "pull"
 
 
 def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
     point = truth.skeleton.point_at(settings.grasp_fraction)
     radius = truth.skeleton.radius_at(settings.grasp_fraction)
     known = {"young_pa": truth.young.tolist(), "poisson": settings.poisson,
-             "density": settings.density, "fractions": list(truth.fractions),
+             "density": settings.density, "damping": list(settings.damping),
+             "fractions": list(truth.fractions),
              "control_points_m": truth.control_points.tolist(),
              "tet_count": truth.mesh.tet_count, "seed": settings.seed}
     return PullEntry(
         observation="depth" if settings.camera else "markers",
+        drive="force" if settings.weight is not None else settings.drive,
+        motion=settings.motion,
         gravity_m_s2=truth.gravity if settings.gravity else None,
         grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
                          mode=settings.mode),
@@ -213,27 +265,16 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
         source="limber virtual-pull", truth=known)
 
 
-def _pose(grasp: Any, point: np.ndarray, state: StaticResult) -> np.ndarray:
-    mean = grasp.weights @ state.displacement[grasp.nodes]
-    turn = state.pose[3:]
-    if grasp.mode == "pinned":
-        return np.concatenate([point + mean, turn])
-    from limber.mechanics.grasp import rotation_matrix
-
-    # The pose belongs to the grasp point, which a clamped patch carries rigidly.
-    return np.concatenate([state.pose[:3] + rotation_matrix(turn) @ (point - grasp.centre), turn])
-
-
-def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, states: list[StaticResult],
+def write_depth_frames(folder: Path, truth: TrueBranch, pull: Pull, displacements: list[np.ndarray],
                         settings: VirtualPullSettings) -> None:
     """Write what a D455 would see of a pull's states: ``depth/`` and ``camera.toml``."""
-    camera = viewing(truth.mesh.nodes, [state.displacement for state in states])
+    camera = viewing(truth.mesh.nodes, displacements)
     write_camera(folder / "camera.toml", camera)
     (folder / "depth").mkdir(exist_ok=True)
     faces = truth.mesh.surface_faces()
     rng = np.random.default_rng([settings.seed, 1])
-    for time, state in zip(pull.times, states, strict=True):
-        depth = render_depth(camera, truth.mesh.nodes + state.displacement, faces)
+    for time, displacement in zip(pull.times, displacements, strict=True):
+        depth = render_depth(camera, truth.mesh.nodes + displacement, faces)
         write_depth(folder / "depth" / f"{time:.6f}.png", with_noise(camera, depth, rng), camera)
 
 

@@ -1,0 +1,104 @@
+"""Virtual pulls that are not slow, not free to turn, or not pulled at all."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import Bench
+from limber.errors import InputError
+from limber.estimation.alignment import frames_of
+from limber.estimation.dynamic import DynamicForward
+from limber.estimation.identifiability import identifiability
+from limber.estimation.objective import Objective
+from limber.estimation.optimise import gauss_newton
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.recording import read_pull, write_pull
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.virtual_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.geometry.control_points import control_points
+
+TRUTH = (40e6, 22e6, 12e6, 3e6)
+FRACTIONS = (0.2, 0.4, 0.6, 0.8)
+EXACT = {"young": TRUTH, "poisson": 0.36, "phase": 0.5, "position_noise": 0.0,
+         "force_noise": 0.0, "torque_noise": 0.0}
+
+
+@pytest.fixture(scope="module")
+def truth(small):
+    """Coarser than a real truth, and another mesh than the fit's."""
+    skeleton = small.skeleton
+    return TrueBranch(small.mesh(slice_length=2.6, sides=6), skeleton,
+                      control_points(skeleton, FRACTIONS), FRACTIONS, np.array(TRUTH))
+
+
+@pytest.fixture(scope="module")
+def bench(small):
+    return Bench(small, slice_length=3.4, sides=6)
+
+
+def simulated(truth, **settings):
+    return simulate_pull(truth, "pull-1", VirtualPullSettings(**(EXACT | settings)))[0]
+
+
+@pytest.mark.parametrize("drive", ["pose", "force"])
+def test_a_fast_pull_gives_young_and_swings_on(truth, bench, drive, tmp_path):
+    """Shaken by poses, or pulled and let go: written, read and fitted, the moduli come back."""
+    pull = simulated(truth, motion="dynamic", drive=drive, frames=17, duration=0.48, reach=0.2)
+    write_pull(tmp_path / "pull-1", pull)
+    pull = read_pull(tmp_path / "pull-1")
+    assert pull.entry.motion == "dynamic" and pull.entry.drive == drive
+    tip = pull.observations.positions[:, -1]
+    if drive == "force":
+        # Let go at 0.4 of the time: it swings back, and over its place at rest.
+        away = (tip - tip[0]) @ (tip[6] - tip[0]) / np.sum((tip[6] - tip[0])**2)
+        assert away[8:].min() < -0.2
+        assert not pull.wrenches[7:, :3].any()
+    forward = DynamicForward(pull.name, bench.model, bench.weights, pull.entry, frames_of(pull),
+                             bench.points)
+    start = Values(1.3 * np.array(TRUTH), 0.36, 900.0, (0.5, 0.002))
+    objective = Objective([forward], ParameterSpace.separate(start), force_sigma=[
+        pull.entry.sensor.force_sigma_n])
+    fit = gauss_newton(objective, objective.space.pack(start), evaluation_limit=8, tolerance=1e-3)
+    assert np.abs(np.exp(fit.evaluation.free) / TRUTH - 1).max() < 0.1
+
+
+def test_a_hung_weight_is_driven_by_its_force(truth, bench):
+    """The wrench is the weight, grows to it, and the fit by force gives the moduli."""
+    pull = simulated(truth, weight=0.08, frames=8)
+    assert pull.entry.drive == "force"
+    assert np.allclose(pull.wrenches[-1, :3], [0.0, 0.0, -0.08 * 9.80665])
+    assert np.allclose(pull.wrenches[0, :3], 0.0)
+    with pytest.raises(InputError, match="--weight"):
+        simulated(truth, weight=0.1, motion="dynamic")
+
+
+def test_a_clamped_grasp_twists_and_its_torque_tells_the_outer_moduli(truth, bench):
+    """The torque's derivatives equal central differences; with it E4 is known far better."""
+    pull = simulated(truth, mode="clamped", frames=8, grasp_fraction=0.85)
+    assert np.linalg.norm(pull.wrenches[-1, 3:]) > 1e-3
+    settings = EstimateSettings(poisson=0.36, hold_out=False, key_frames=4)
+    sensor = pull.entry.sensor.model_copy(update={
+        "position_sigma_m": 1e-3, "force_sigma_n": 0.02 * np.abs(pull.wrenches[:, :3]).max(),
+        "torque_sigma_nm": 0.02 * np.abs(pull.wrenches[:, 3:]).max()})
+    deaf = sensor.model_copy(update={"torque_sigma_nm": None})
+    deviations = []
+    for chosen in (sensor, deaf):
+        entry = pull.entry.model_copy(update={"sensor": chosen})
+        objective = bench.objective([replace(pull, entry=entry)], settings)
+        judged = identifiability(objective.evaluate(np.log(TRUTH), jacobian=True),
+                                 objective.space)
+        deviations.append(judged.deviations)
+        if chosen is deaf:
+            continue
+        exact = objective.evaluate(np.log(0.9 * np.array(TRUTH)), jacobian=True).jacobian
+        for column in range(4):
+            step = 2e-4 * np.eye(4)[column]
+            ahead, behind = (objective.evaluate(np.log(0.9 * np.array(TRUTH)) + sign * step
+                                                ).residual for sign in (1, -1))
+            slope = (ahead - behind) / 4e-4
+            # The last rows are the torque's.
+            assert np.linalg.norm((slope - exact[:, column])[-24:]) < 5e-3 * np.linalg.norm(
+                exact[-24:, column])
+    assert np.all(deviations[0] <= deviations[1])
+    assert deviations[0][3] < 0.7 * deviations[1][3]
