@@ -64,7 +64,7 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
                 if figure.axes and figure.axes[0].has_data()]
     assert len(captions) == 6
     parts = stored["young_deviation"]
-    assert parts["geometry"] is None and parts["mesh"] < 0.05
+    assert parts["geometry"] is None and max(parts["mesh"]) < 0.2
     assert "came without a deviation" in captions[0]
 
 

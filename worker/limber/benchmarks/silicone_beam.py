@@ -87,7 +87,7 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
     deviation = found["young_deviation"]
     low, high = found["young_interval_pa"][0]
     return BeamResult(float(found["young_pa"][0]), (float(low), float(high)),
-                      float(deviation["sensor"][0]), float(deviation["mesh"]),
+                      float(deviation["sensor"][0]), float(deviation["mesh"][0]),
                       float(measured), predicted_drop(branch, name, load))
 
 
