@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from limber.cli import call
-from limber.errors import InputError
+from limber.errors import Cancelled, InputError
 from limber.geometry.batch import reconstruct_folder
 from limber.geometry.cloud_files import read_points
 from limber.geometry.generated import generate_branch, write_generated
@@ -16,6 +16,9 @@ from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
 from limber.geometry.reconstruct import ReconstructSettings, reconstruct
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics import BranchModel, solve_static
+from limber.mechanics.simulate import SimulateSettings, simulate
+from limber.progress import Progress
 from limber.store import Branch
 
 KEYS = ("point_count", "node_count", "branch_count", "length_m", "radius_min_m", "radius_max_m",
@@ -87,7 +90,7 @@ def test_coffeetree(coffeetree, tmp_path):
     assert result["radius_max_m"] < 0.03
     assert result["watertight"] and result["surface_check"]["self_intersection_count"] == 0
     assert result["mesh_volume_m3"] == pytest.approx(result["surface_volume_m3"], rel=0.03)
-    assert 1000 < result["tet_count"] < 4000
+    assert 2000 < result["tet_count"] < 6000
 
 
 def test_own_skeleton_skips_ours(generated, tmp_path):
@@ -109,6 +112,35 @@ def test_left_out_twigs_become_masses(generated, tmp_path):
     whole = 900 * full["mesh_volume_m3"]
     rest = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
     assert rest == pytest.approx(whole, rel=0.04)
+
+
+def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
+    """Their weight hangs on the base, and on the gripper that holds the branch where it is."""
+    folder, _, full = generated
+    place = tmp_path / "w.branch"
+    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.1))
+    assert result["left_out_twigs"] == 2 and result["branch_count"] == full["branch_count"]
+    model = BranchModel.from_branch(Branch.open(place))
+    weight = np.linalg.norm(solve_static(model).require().base_force)
+    mass = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
+    assert weight == pytest.approx(9.80665 * mass, rel=0.01)
+    settings = SimulateSettings(kind="static", move=(0.0, 0.0, 1e-5), rest_shape=False)
+    held = np.array(simulate(place, settings)["grasp_force_n"])
+    with Branch.open(place).stage("reconstruct") as stage:
+        stage.path("point_masses.json").write_text("[]")
+    bare = np.array(simulate(place, settings, force=True)["grasp_force_n"])
+    assert 0.02 < np.linalg.norm(held - bare) / (9.80665 * result["left_out_mass_kg"]) < 2.0
+
+
+def test_twigs_that_are_meshed_again_weigh_once(generated, tmp_path):
+    """A later run that keeps all twigs takes their masses away."""
+    folder, _, _ = generated
+    place = tmp_path / "again.branch"
+    reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_order=0))
+    assert Branch.open(place).has("point_masses.json")
+    reconstruct(folder / "cloud.ply", place)
+    assert not Branch.open(place).has("point_masses.json")
+    assert not BranchModel.from_branch(Branch.open(place)).point_masses
 
 
 def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):
@@ -165,3 +197,29 @@ def test_mesh_a_box_in_millimetres(tmp_path):
     assert result["length_m"] == pytest.approx(0.1, rel=0.02)
     mesh = TetMesh.read(tmp_path / "b.branch" / "mesh.vtu")
     assert mesh.nodes[mesh.point_data["fixed"] == 1][:, 2].max() < 0.005
+
+
+STEPS = ("laplacian", "contracting", "connecting", "fitting axes", "skeleton", "surface",
+         "reconstructed")
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
+    """Stopped in any long step: Cancelled, and no half-made stage in the folder."""
+    folder, _, _ = generated
+    seen = []
+
+    def sink(fraction, message, numbers):
+        seen.append(message)
+        if message.startswith(step):
+            progress.cancel()
+
+    progress = Progress(sink)
+    target = tmp_path / "cancelled.branch"
+    with pytest.raises(Cancelled):
+        reconstruct(folder / "cloud.ply", target, progress=progress)
+        progress(1.0, "the last report has nothing after it that could stop")
+    assert any(message.startswith(step) for message in seen)
+    if step != "reconstructed":
+        assert not (target / "mesh.vtu").exists()
+        assert not (target / "skeleton.swc").exists()

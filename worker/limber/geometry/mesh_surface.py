@@ -99,6 +99,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         skeleton.write_swc(stage.path("skeleton.swc"))
         surface.write_ply(stage.path("surface.ply"))
         mesh.write(stage.path("mesh.vtu"))
+        stage.remove("point_masses.json")  # of an earlier scan in this folder
         up = np.array(settings.up) / np.linalg.norm(settings.up)
         quality = measure_quality(mesh, surface.volume, skeleton, surface)
         stage.result.update({

@@ -140,6 +140,8 @@ def write_geometry(stage: Any, skeleton: Skeleton, settings: ReconstructSettings
     mesh.write(stage.path("mesh.vtu"))
     if masses:
         stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n")
+    else:
+        stage.remove("point_masses.json")  # of an earlier run: its twigs are in the mesh now
     progress(1.0, "mesh", tets=mesh.tet_count)
     return _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
         "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses)}
