@@ -48,10 +48,12 @@ def command(run: Run, warm: bool) -> dict[str, Any]:
         "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
     }
     if warm:
+        from limber.geometry.warm_up import warm_up as warm_geometry
         from limber.mechanics.warm_up import warm_up as warm_mechanics
         from limber.planning.warm_up import warm_up as warm_planning
 
-        warm_mechanics(run.progress.part(0.0, 0.5))
+        warm_geometry(run.progress.part(0.0, 0.1))
+        warm_mechanics(run.progress.part(0.1, 0.5))
         warm_planning(run.progress.part(0.5, 1.0))
     return result
 

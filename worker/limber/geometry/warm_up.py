@@ -1,0 +1,20 @@
+"""Compiles the loops over surfaces once, so that no user waits for a compiler."""
+
+import numpy as np
+
+from limber.geometry.forks import smooth_forks
+from limber.geometry.skeleton import Skeleton
+from limber.geometry.surface_distance import distance_to_surface
+from limber.geometry.tubes import branch_surface
+from limber.progress import SILENT, Progress
+
+
+def warm_up(progress: Progress = SILENT) -> None:
+    """Make the surface of one fork; about 5 s where nothing is compiled yet."""
+    skeleton = Skeleton.from_edges(
+        np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.05, 0, 0.15]]),
+        np.array([-1, 0, 1, 1]), np.array([0.01, 0.01, 0.01, 0.005]))
+    progress(0.1, "compiling the surface's loops")
+    surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
+    distance_to_surface(skeleton.nodes, surface)
+    progress(1.0, "compiling the surface's loops")
