@@ -188,9 +188,10 @@ def sparse_times(starts, columns, values, field, product):
     """Write a matrix in compressed rows times a nodal field, shape [node_count, 3]."""
     for row in range(len(starts) - 1):
         x, y, z = 0.0, 0.0, 0.0
-        for p in range(starts[row], starts[row + 1]):
-            value, column = values[p], columns[p]
-            x += value * field[column, 0]
-            y += value * field[column, 1]
-            z += value * field[column, 2]
+        # Unsigned: numba looks whether a signed index counts from the end.
+        for p in range(np.uint64(starts[row]), np.uint64(starts[row + 1])):
+            value, node = values[p], np.uint64(columns[p])
+            x += value * field[node, 0]
+            y += value * field[node, 1]
+            z += value * field[node, 2]
         product[row, 0], product[row, 1], product[row, 2] = x, y, z

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numba
+import numpy as np
 import platformdirs
 
 
@@ -38,3 +39,8 @@ def compiled(function: Callable) -> Callable:
         return numba.njit(cache=True, **options)(function)
     finally:
         numba.config.CACHE_DIR = before
+
+
+def for_kernels(array: np.ndarray) -> np.ndarray:
+    """Return floats in C order that may be written to: kernels are compiled for no other kind."""
+    return np.require(array, float, "CW")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from limber.mechanics.compiled import for_kernels
 from limber.mechanics.factor import NotPositiveDefiniteError, make_factor
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import Material
@@ -96,9 +97,11 @@ class Equations:
         if viscous is not None:
             growth, memory = viscous.growth, layout.per_point(viscous.memory)
         mixed = increment is not None and model.material == Material.st_venant_kirchhoff
-        tangent_stiffness(displacement, increment if mixed else _NO_INCREMENT, layout.gradients,
-                          layout.weights, lam, mu, layout.nodes, int(model.material), growth,
-                          memory, layout.slots, layout.lengths, self._values)
+        tangent_stiffness(for_kernels(displacement),
+                          for_kernels(increment) if mixed else _NO_INCREMENT,
+                          layout.gradients, layout.weights, lam, mu, layout.nodes,
+                          int(model.material), growth, memory, layout.slots, layout.lengths,
+                          self._values)
         self._add_pins()
 
     def factorise(self) -> bool:

@@ -13,6 +13,7 @@ from limber.errors import InputError
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import elements
 from limber.mechanics.assembly import sparse_times, strain_changes, tangent_times
+from limber.mechanics.compiled import for_kernels
 from limber.mechanics.equations import Equations, Viscous
 from limber.mechanics.forces import ForceLayout, internal_force, largest_stretch, strains
 from limber.mechanics.grasp import Grasp
@@ -252,7 +253,7 @@ class BranchModel:
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         force, energies = np.empty((self.mesh.node_count, 3)), np.empty(self.mesh.tet_count)
         layout = data.layout
-        det = internal_force(np.ascontiguousarray(displacement, float), layout.gradients,
+        det = internal_force(for_kernels(displacement), layout.gradients,
                              layout.weights, layout.per_element(lam), layout.per_element(mu),
                              layout.nodes, int(self.material), growth, memory, force, energies)
         return InternalState(force, energies, float(det))
@@ -263,8 +264,8 @@ class BranchModel:
         data = self._data
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         product = np.empty((self.mesh.node_count, 3))
-        tangent_times(np.ascontiguousarray(displacement, float),
-                      np.ascontiguousarray(direction, float), data.gradients, data.weights,
+        tangent_times(for_kernels(displacement),
+                      for_kernels(direction), data.gradients, data.weights,
                       self.lame_lambda, self.lame_mu, data.tets, int(self.material), growth,
                       memory, product)
         return product
@@ -273,14 +274,14 @@ class BranchModel:
         """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12)."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
-        strains(np.ascontiguousarray(displacement, float), data.layout.gradients,
+        strains(for_kernels(displacement), data.layout.gradients,
                 data.layout.nodes, int(self.material), out)
         return out
 
     def largest_stretch(self, displacement: np.ndarray) -> tuple[float, int]:
         """Return the largest principal stretch of the mean deformation of an element, and which."""
         layout = self._data.layout
-        stretch, tet = largest_stretch(np.ascontiguousarray(displacement, float),
+        stretch, tet = largest_stretch(for_kernels(displacement),
                                        layout.mean_gradients, layout.nodes)
         return float(stretch), min(int(tet), self.mesh.tet_count - 1)
 
@@ -288,8 +289,8 @@ class BranchModel:
         """Return the derivative of :meth:`strains` along ``direction`` [m]."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
-        strain_changes(np.ascontiguousarray(displacement, float),
-                       np.ascontiguousarray(direction, float), data.gradients, data.tets,
+        strain_changes(for_kernels(displacement),
+                       for_kernels(direction), data.gradients, data.tets,
                        int(self.material), out)
         return out
 
@@ -325,7 +326,7 @@ class BranchModel:
         matrix = self.mass_matrix
         product = np.empty((self.mesh.node_count, 3))
         sparse_times(matrix.indptr, matrix.indices, matrix.data,
-                     np.ascontiguousarray(field, float), product)
+                     for_kernels(field), product)
         return product
 
     @property
