@@ -94,7 +94,7 @@ def _two():
 
 
 @pytest.mark.parametrize(("points", "complaint"), [
-    (_sphere(), "not branch-like"), (_wall(), "not branch-like"), (_two(), "two far-apart")])
+    (_sphere(), "not branch-like"), (_wall(), "not branch-like"), (_two(), "two plants")])
 def test_no_branch_is_refused_with_the_reason(points, complaint):
     """A ball, a wall, two plants far apart."""
     with pytest.raises(InputError, match=complaint):

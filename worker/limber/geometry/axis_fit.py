@@ -21,6 +21,7 @@ from limber.progress import SILENT, Progress
 _CANDIDATES = 6
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
+_PROBE = 128  # nodes between two whose radii are taken as independent of each other
 _TUKEY = 4.685  # 95 % efficiency for normal noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
@@ -387,12 +388,13 @@ def _uncertainty(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, matc
     system = _system(skeleton, nodes, radius, match, weight, noise)
     _, _, per_node = _data_terms(skeleton.parent, nodes, match, weight)
     factor = splu(system.matrix, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    variance = np.empty(len(nodes))
-    for begin in range(0, len(nodes), 256):
-        chosen = np.arange(begin, min(begin + 256, len(nodes)))
-        unit = np.zeros((4 * len(nodes), len(chosen)))
-        unit[4 * chosen + 3, np.arange(len(chosen))] = 1.0
-        variance[chosen] = factor.solve(unit)[4 * chosen + 3, np.arange(len(chosen))]
+    # Nodes so far apart say nothing about each other: the inverse's diagonal is read off one
+    # solve for all of them. Nodes of a run have consecutive numbers.
+    period = min(_PROBE, len(nodes))
+    unit = np.zeros((4 * len(nodes), period))
+    own = np.arange(len(nodes))
+    unit[4 * own + 3, own % period] = 1.0
+    variance = factor.solve(unit)[4 * own + 3, own % period]
     return noise * np.sqrt(np.maximum(variance, 0)), per_node > 2.0
 
 

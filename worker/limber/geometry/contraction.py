@@ -18,6 +18,7 @@ import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from limber.errors import WorkError
+from limber.geometry.recentring import recentred
 from limber.progress import SILENT, Progress
 
 NEIGHBOURS = 12
@@ -33,13 +34,16 @@ class Contraction:
     """What the contraction ended with.
 
     Attributes:
-        points: Contracted points [m], shape [n, 3], in the order of the input.
+        points: Contracted points [m], recentred against the scan, shape [n, 3], in the order of
+            the input.
         linearity: Share of the variance around each point that lies along one line, 1/3 to 1,
             shape [n]: 1 where the cloud has become a curve.
         iterations: Number of linear solves.
         status: ``contracted``, ``stalled`` (points no longer moved) or ``iteration limit``.
         history: One dict an iteration: ``moved`` [m], ``active`` (share of points not yet on a
             curve), ``seconds``.
+        drawn: Contracted points [m] before they were recentred: less right, but they tell
+            branches apart up to the fork, where circles mix them, shape [n, 3].
     """
 
     points: np.ndarray
@@ -47,6 +51,7 @@ class Contraction:
     iterations: int
     status: str
     history: list[dict[str, float]] = field(default_factory=list)
+    drawn: np.ndarray = field(default=None)
 
 
 def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: float = 0.95,
@@ -96,7 +101,9 @@ def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: fl
         if iteration > 3 and moved * scale < 0.1 * max(done["moved"] for done in history):
             status = "stalled"
             break
-    return Contraction(positions * scale + centre, linearity, len(history), status, history)
+    axes = recentred((points - centre) / scale, positions)
+    return Contraction(axes * scale + centre, linearity, len(history), status, history,
+                       drawn=positions * scale + centre)
 
 
 def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
@@ -120,8 +127,7 @@ def local_linearity(points: np.ndarray) -> np.ndarray:
     count = min(_LINE_NEIGHBOURS, len(points))
     _, near = cKDTree(points).query(points, k=count)
     offset = points[near] - points[near].mean(axis=1, keepdims=True)
-    moments = np.einsum("nij,nik->njk", offset, offset)
-    values = np.linalg.eigvalsh(moments)
+    values = np.linalg.eigvalsh(offset.transpose(0, 2, 1) @ offset)
     return values[:, 2] / np.maximum(values.sum(axis=1), 1e-300)
 
 

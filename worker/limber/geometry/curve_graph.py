@@ -6,11 +6,14 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import (
     breadth_first_order,
-    connected_components,
     dijkstra,
     minimum_spanning_tree,
 )
 from scipy.spatial import cKDTree
+
+from limber.geometry.pieces import Joined, join_pieces
+
+_Z = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass
@@ -25,6 +28,8 @@ class CurveGraph:
         bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m].
         split_off: Each piece that was left away: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
+        plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
+            [m], ``at``.
         owner: The node that each point belongs to, -1 where it was left away, shape [m].
     """
 
@@ -36,10 +41,12 @@ class CurveGraph:
     split_off: list[dict] = field(default_factory=list)
     loops: list[float] = field(default_factory=list)
     owner: np.ndarray = field(default=None)
+    plants: list[dict] = field(default_factory=list)
 
 
 def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float,
-                bridge_limit: float) -> CurveGraph:
+                bridge_limit: float, up: np.ndarray = _Z, join_plants: bool = False,
+                ) -> CurveGraph:
     """Cover contracted points by nodes and connect them to one tree.
 
     Args:
@@ -47,6 +54,8 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
         contracted: The same points after contraction [m], shape [n, 3].
         gap_factor: The paper's gamma: a step longer than so many median steps is a gap.
         bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
+        up: Which way is up, shape [3].
+        join_plants: Join even pieces that look like two plants.
     """
     links, spacing = neighbour_links(points)
     drawn = np.linalg.norm(points - contracted, axis=1)
@@ -54,8 +63,7 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     owner = _cover(contracted, np.maximum(0.8 * thickness, 1.5 * spacing))
     count = int(owner.max()) + 1
     support = np.bincount(owner, minlength=count)
-    nodes = np.stack([np.bincount(owner, contracted[:, k], count) for k in range(3)], axis=1)
-    nodes /= support[:, None]
+    nodes = _means(owner, contracted)
     radius = np.bincount(owner, thickness, count) / support
     edges = _node_links(owner, links)
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
@@ -63,7 +71,9 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     graph.edges, graph.loops = _spanning_forest(nodes, edges, length, radius)
     typical = float(np.median(np.linalg.norm(
         nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
-    kept = _join_pieces(graph, gap_factor * typical, bridge_limit)
+    joined = join_pieces(graph.nodes, graph.edges, radius, support, gap=gap_factor * typical,
+                         bridge_limit=bridge_limit, up=up, join_plants=join_plants)
+    kept = _keep_largest(graph, joined, gap_factor * typical)
     graph.owner = np.where(kept, np.cumsum(kept) - 1, -1)[owner]
     return graph
 
@@ -171,6 +181,11 @@ def _cover(contracted: np.ndarray, reach: np.ndarray) -> np.ndarray:
     return owner
 
 
+def _means(owner: np.ndarray, points: np.ndarray) -> np.ndarray:
+    support = np.bincount(owner)
+    return np.stack([np.bincount(owner, points[:, k]) for k in range(3)], axis=1) / support[:, None]
+
+
 def _node_links(owner: np.ndarray, links: np.ndarray) -> np.ndarray:
     pairs = np.sort(owner[links], axis=1)
     return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).reshape(-1, 2)
@@ -203,29 +218,26 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
     return kept, loops
 
 
-def _join_pieces(graph: CurveGraph, gap: float, bridge_limit: float) -> np.ndarray:
-    """Bridge pieces to the largest one, nearest first; what is too far is left away.
+def _keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
+    """Take the bridges of the largest piece; the others are left away.
 
     Returns:
         Whether each node was kept.
     """
-    while True:
-        count, label = connected_components(
-            _matrix(len(graph.nodes), graph.edges), directed=False)
-        if count == 1:
-            return np.ones(len(graph.nodes), bool)
-        weight = np.bincount(label, graph.support, count)
-        main = label == int(np.argmax(weight))
-        distance, near = cKDTree(graph.nodes[main]).query(graph.nodes[~main])
-        place = int(np.argmin(distance))
-        if distance[place] > bridge_limit:
-            _leave_away(graph, main, label)
-            return main
-        one, other = np.flatnonzero(main)[near[place]], np.flatnonzero(~main)[place]
-        graph.edges = np.vstack([graph.edges, [[one, other]]])
-        if distance[place] > gap:
+    weight = np.bincount(joined.label, graph.support)
+    main = joined.label == int(np.argmax(weight))
+    graph.edges = joined.edges
+    for one, other in joined.bridges[main[joined.bridges[:, 0]]]:
+        length = float(np.linalg.norm(graph.nodes[one] - graph.nodes[other]))
+        if length > gap:
             graph.bridges.append({"from": graph.nodes[one], "to": graph.nodes[other],
-                                  "length": float(distance[place])})
+                                  "length": length})
+    graph.plants = [{"points": int(weight[joined.label[pair]].min()),
+                     "distance": float(np.linalg.norm(np.subtract(*graph.nodes[pair]))),
+                     "at": graph.nodes[pair].mean(axis=0)} for pair in joined.plants]
+    if not main.all():
+        _leave_away(graph, main, joined.label)
+    return main
 
 
 def _leave_away(graph: CurveGraph, main: np.ndarray, label: np.ndarray) -> None:
