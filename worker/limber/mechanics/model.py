@@ -12,10 +12,17 @@ from scipy.sparse.csgraph import connected_components
 from limber.errors import InputError
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics import elements
-from limber.mechanics.assembly import sparse_times, strain_changes, tangent_times
 from limber.mechanics.compiled import for_kernels
 from limber.mechanics.equations import Equations, Viscous
-from limber.mechanics.forces import ForceLayout, internal_force, largest_stretch, strains
+from limber.mechanics.forces import (
+    ForceLayout,
+    internal_force,
+    largest_stretch,
+    sparse_times,
+    strain_changes,
+    strains,
+    tangent_times,
+)
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import (
     Material,
@@ -264,10 +271,11 @@ class BranchModel:
         data = self._data
         growth, memory = (1.0, _NO_MEMORY) if viscous is None else (viscous.growth, viscous.memory)
         product = np.empty((self.mesh.node_count, 3))
-        tangent_times(for_kernels(displacement),
-                      for_kernels(direction), data.gradients, data.weights,
-                      self.lame_lambda, self.lame_mu, data.tets, int(self.material), growth,
-                      memory, product)
+        layout = data.layout
+        tangent_times(for_kernels(displacement), for_kernels(direction), layout.gradients,
+                      layout.weights, layout.per_element(self.lame_lambda),
+                      layout.per_element(self.lame_mu), layout.nodes, int(self.material), growth,
+                      memory, self.mesh.tet_count, product)
         return product
 
     def strains(self, displacement: np.ndarray) -> np.ndarray:
@@ -289,9 +297,8 @@ class BranchModel:
         """Return the derivative of :meth:`strains` along ``direction`` [m]."""
         data = self._data
         out = np.empty((*data.weights.shape, 6))
-        strain_changes(for_kernels(displacement),
-                       for_kernels(direction), data.gradients, data.tets,
-                       int(self.material), out)
+        strain_changes(for_kernels(displacement), for_kernels(direction), data.layout.gradients,
+                       data.layout.nodes, int(self.material), out)
         return out
 
     @property

@@ -40,7 +40,7 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
     """Add the tangent stiffness [N/m] of all elements to ``values``.
 
     Args:
-        displacement: See limber.mechanics.assembly.
+        displacement: See limber.mechanics.forces.
         increment: The last increment of the displacement; the stress of the geometric part is
             then taken at the strain less dH^T dH / 2, dH the increment's gradient: the stress
             that the last linearisation predicted (mixed integration points, Magisano, Leonetti
@@ -48,7 +48,7 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
         gradients, weights: Shapes [batch, q, n, 3, LANES] and [batch, q, LANES].
         lame_lambda, lame_mu: Shape [batch, LANES].
         nodes: Shape [batch, n, LANES].
-        growth, memory: See limber.mechanics.assembly; memory of shape [batch, q, 6, LANES].
+        growth, memory: See limber.mechanics.forces; memory of shape [batch, q, 6, LANES].
         slots, lengths: Shape [batch, pairs, LANES]; pair (a, b <= a) has number a (a+1)/2 + b.
         values: Lower triangle by columns, with a few numbers of scratch behind its end.
     """
@@ -88,7 +88,7 @@ def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, 
             if has_strain:
                 green_strain(F, E)
                 if mixed:
-                    _gradient(rate, flat[batch, q], node_count, D)
+                    gradient(rate, flat[batch, q], node_count, D)
                     _subtract_half_square(D, E)
                 for k in range(6 * LANES):
                     E[k] *= factor
@@ -132,7 +132,8 @@ def gather(field, nodes, out):
 
 
 @compiled
-def _gradient(values, gradients, node_count, out):
+def gradient(values, gradients, node_count, out):
+    """Write the gradient of a nodal field, by rows."""
     if node_count == 10:
         quadratic_gradient(values, gradients, out)
     else:
@@ -142,7 +143,7 @@ def _gradient(values, gradients, node_count, out):
 @compiled
 def deformation(values, gradients, node_count, F):
     """Write the deformation gradient of a nodal displacement, by rows."""
-    _gradient(values, gradients, node_count, F)
+    gradient(values, gradients, node_count, F)
     for l in range(LANES):
         F[l] += 1.0
         F[4 * LANES + l] += 1.0
