@@ -115,6 +115,7 @@ class _Fork:
     others: tuple[np.ndarray, ...]
     excess: np.ndarray
     base: np.ndarray
+    wide: float  # how far from the root's middle the cut may matter [m]
     rounding: float
     axis: np.ndarray  # the stretch's points [m] and radii [m], shape [k, 4]
     end: float  # where along the twig the fillet fades out, if the two do not part
@@ -132,10 +133,14 @@ class _Fork:
         first = np.concatenate([[0], np.cumsum([len(other) for other in others])])
         shape = np.array([self.rounding, _REACH, _RIM, _MARGIN, self.end])
         stacked = np.vstack(others)
+        # The cut is as wide as the root; a twig may well hang down beside it.
+        root = self.base[0]
+        beside = np.linalg.norm(np.maximum(np.maximum(low - root, root - high), 0)) > self.wide
+        base = self.base - np.outer([1e6 * self.wide, 0], self.base[1]) if beside else self.base
 
         def level(points: np.ndarray) -> np.ndarray:
             return fillet_level(np.ascontiguousarray(points), twig, stacked, first, self.excess,
-                                self.base, shape)
+                                base, shape)
 
         made = level_surface(level, low, high, step)
         if len(made.faces) == 0:
@@ -165,14 +170,15 @@ def _forks(skeleton: Skeleton, sides: int | None, spacing: float) -> list[_Fork]
                 and np.linalg.norm(starts[other] - starts[run]) < reach]
         others = [parent, *near, *([carrier[parent]] if carrier[parent] >= 0 else [])]
         fork = _fork(run, axes[run], cones[run], tuple(cones[other] for other in others),
-                     excess[[run, *others]], base)
+                     excess[[run, *others]], base, 1.5 * float(radius[0]))
         if fork is not None:
             forks.append(fork)
     return forks
 
 
 def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
-          others: tuple[np.ndarray, ...], excess: np.ndarray, base: np.ndarray) -> _Fork | None:
+          others: tuple[np.ndarray, ...], excess: np.ndarray, base: np.ndarray, wide: float,
+          ) -> _Fork | None:
     """Where a twig comes out of what it grows from; None if it stays within."""
     along = np.append(twig[:, 8], twig[-1, 8] + twig[-1, 9])
     count = max(int(4 * along[-1] / axis[1].mean()), 8)
@@ -197,7 +203,7 @@ def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
     stretch = np.column_stack([points, radius])[begin:end + 1]
     if fades:
         stretch = stretch[place[begin:end + 1] <= longest + 2 * radius[at]]
-    return _Fork(run, twig, others, excess, base, rounding, stretch,
+    return _Fork(run, twig, others, excess, base, wide, rounding, stretch,
                  float(longest) if fades else np.inf)
 
 

@@ -66,7 +66,7 @@ def fillet_level(points: np.ndarray, twig: np.ndarray, others: np.ndarray, first
         first: Where each other's cones begin, and their total number, shape [k + 1].
         excess: By how much the corners of the polygons stand over the circles, in radii; the
             twig's, then the others', shape [k + 1].
-        base: A point [m] and the normal of the flat cut at the root, shape [2, 3]; normal 0: none.
+        base: A point [m] on the flat cut at the root and its normal, upwards, shape [2, 3].
         shape: Radius of the fillet [m]; how far it reaches and where its rim is lowest, in such
             radii; how far it lies over and under the cylinders, likewise; and where along the twig
             it ends [m] (infinite: where the two are apart).
