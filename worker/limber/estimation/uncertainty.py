@@ -75,8 +75,9 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
 def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Integrated autocorrelation of residuals over the frames, all points and axes together.
 
-    1 + 2 sum of the correlations at growing lags, up to the first that is lost in its own noise
-    (Sokal's estimate of how many samples of a sequence are worth one independent sample).
+    1 + 2 sum of the correlations at growing lags, up to the first that is lost in its own noise,
+    or lies well past what is found so far (Sokal's estimate of how many samples of a sequence are
+    worth one independent sample).
 
     Args:
         series: Per pull, residuals of points [f, m, 3] and of force [f, 3], NaN where none.
@@ -95,10 +96,10 @@ def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
             count[lag] += np.sum(known[:len(known) - lag] & known[lag:])
     if len(product) < 3 or product[0] <= 0:
         return 1.0
-    correlation = (product / np.maximum(count, 1)) / (product[0] / count[0])
+    correlation = product / product[0]
     total = 1.0
     for lag in range(1, len(correlation)):
-        if correlation[lag] < 2.0 / np.sqrt(count[lag]):
+        if correlation[lag] < 2.0 / np.sqrt(count[lag]) or lag > 2.5 * total:
             break
         total += 2.0 * correlation[lag]
     return float(total)

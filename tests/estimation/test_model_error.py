@@ -1,0 +1,89 @@
+"""What residuals cannot show: thickness and mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import Bench
+from limber.estimation.grasping import grasp_on
+from limber.estimation.model_error import (
+    ModelError,
+    geometry_error,
+    mesh_error,
+    refined,
+    total_interval,
+)
+from limber.estimation.points import point_operator
+from limber.estimation.recording import GraspEntry
+from limber.estimation.uncertainty import repeated
+from limber.geometry.skeleton_files import write_cylinders
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics import solve_static
+
+YOUNG = np.array([40e6, 22e6, 12e6, 3e6])
+
+
+def test_radii_that_are_unsure_make_moduli_four_times_as_unsure(tmp_path, small, small_bench):
+    """2 % at the base and 5 % at the tip: 8 % to 20 %, growing outwards; without deviations None.
+    """
+    skeleton = small.skeleton
+    path = tmp_path / "skeleton.csv"
+    write_cylinders(skeleton, path)
+    assert geometry_error(path, small_bench.mesh, small_bench.weights) is None
+    share = np.linspace(0.02, 0.05, skeleton.node_count)
+    write_cylinders(replace(skeleton, radius_sigma=share * skeleton.radius), path)
+    found = geometry_error(path, small_bench.mesh, small_bench.weights)
+    assert np.all(np.diff(found) > 0) and found[0] > 0.08 and found[-1] < 0.20
+
+
+def test_a_refined_mesh_is_the_same_body(small_bench):
+    """Eight times the tetrahedra, the same volume, the old nodes first, the base still fixed."""
+    mesh = small_bench.mesh
+    fine = refined(mesh)
+    assert fine.tet_count == 8 * mesh.tet_count and fine.is_quadratic
+    assert np.allclose(fine.nodes[:mesh.node_count], mesh.nodes)
+    assert fine.volumes.min() > 0
+    assert fine.volumes.reshape(-1, 8).sum(axis=1) == pytest.approx(mesh.volumes, rel=1e-9)
+    base = fine.nodes[fine.point_data["fixed"] == 1]
+    assert base[:, 2].max() < 1e-3 and len(base) > (mesh.point_data["fixed"] == 1).sum()
+
+
+def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
+    """A mesh of few long elements is too stiff; by how much is told within a factor of two."""
+    bench = Bench(small, slice_length=4.0, sides=6)
+    grasp = grasp_on(bench.mesh, GraspEntry(
+        point_m=tuple(small.skeleton.point_at(0.9)), radius_m=0.012, mode="pinned"))
+    operator = point_operator(bench.mesh, bench.points)
+    found = mesh_error(bench.model, grasp, operator, bench.weights, YOUNG)
+    model = bench.model.with_parameters(young=bench.weights @ YOUNG)
+    much = refined(refined(bench.mesh))
+    finest = BranchModel(much, young=np.repeat(bench.weights @ YOUNG, 64), poisson=0.35,
+                         density=900.0, gravity=None)
+    moved = [operator @ solve_static(each, grasp=grasp, grasp_force=(1e-6, 0.0, 0.0)).require(
+    ).displacement[:bench.mesh.node_count].ravel() for each in (model, finest)]
+    true = float(np.log(moved[1] @ moved[0] / (moved[0] @ moved[0])))
+    assert true > 0 and 0.5 * true < found.mean() < 2.0 * true
+
+
+def test_parts_add_up_in_squares():
+    """3 % by sensors, 4 % by radii and none by the mesh: 5 %, and the interval is 1.96 of that."""
+    error = ModelError(np.array([0.04]), np.array([0.0]))
+    assert error.total(np.array([0.03])) == pytest.approx([0.05])
+    sensor = 1e7 * np.exp([[-1.96 * 0.03, 1.96 * 0.03]])
+    interval = total_interval(np.array([1e7]), sensor, error)
+    assert np.log(interval / 1e7) == pytest.approx(np.array([[-0.098, 0.098]]))
+    assert total_interval(np.array([1e7]), sensor, ModelError()) == pytest.approx(sensor)
+
+
+def test_errors_that_last_count_as_fewer_frames():
+    """White noise repeats nothing; a first-order process of 0.8 repeats itself ninefold."""
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((100, 4, 3))
+    nothing = np.full((100, 3), np.nan)
+    assert repeated([(white, nothing)]) < 1.3
+    lasting = np.empty_like(white)
+    lasting[0] = white[0]
+    for frame in range(1, 100):
+        lasting[frame] = 0.8 * lasting[frame - 1] + 0.6 * white[frame]
+    assert 4 < repeated([(lasting, nothing)]) < 12
