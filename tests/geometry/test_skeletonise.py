@@ -134,3 +134,15 @@ def test_thinning_keeps_the_limit_and_the_extent():
     chosen = thinned(points, 2000)
     assert 1000 < len(chosen) <= 2000
     assert np.ptp(points[chosen][:, 2]) > 0.99
+
+
+def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch):
+    """One solve for nodes far apart gives the same deviations as one solve for each node."""
+    points, root = forked_branch.cloud.points, forked_branch.skeleton.nodes[0]
+    quick = skeletonise(points, root=root).skeleton
+    monkeypatch.setattr("limber.geometry.axis_fit._PROBE", 10**9)
+    exact = skeletonise(points, root=root).skeleton
+    np.testing.assert_allclose(quick.radius_sigma, exact.radius_sigma, rtol=0.02)
+    monkeypatch.setattr("limber.geometry.axis_fit._PROBE", 2)
+    near = skeletonise(points, root=root).skeleton
+    assert not np.allclose(near.radius_sigma, exact.radius_sigma, rtol=0.02)
