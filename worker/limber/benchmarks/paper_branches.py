@@ -1,6 +1,7 @@
 """The paper's three branches: its table of E and nu as truth, on geometry of that size."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -124,11 +125,13 @@ class Bench:
         return Objective(forwards, ParameterSpace.separate(start, extra),
                          force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])
 
-    def fit(self, pulls: list[Pull], settings: EstimateSettings) -> Estimate:
-        """Fit as ``limber estimate`` does; warnings are in the result."""
+    def fit(self, pulls: list[Pull], settings: EstimateSettings, *, cache: Path | None = None,
+            ) -> Estimate:
+        """Fit as ``limber estimate`` does; warnings are in the result, bases in ``cache``."""
         objective = self.objective(pulls, settings)
         messages: list[str] = []
-        found = fit_pulls(objective, objective.space.base, settings, messages.append)
+        found = fit_pulls(objective, objective.space.base, settings, messages.append,
+                          cache=cache, digest=self.branch.name)
         found.warnings = messages
         return found
 
