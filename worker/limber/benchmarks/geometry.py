@@ -15,12 +15,12 @@ from limber.benchmarks.table import Row
 from limber.geometry.axis_fit import median_radii
 from limber.geometry.cloud_files import read_points
 from limber.geometry.contraction import contract
+from limber.geometry.forks import smooth_forks
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.skeleton_files import read_cylinders
 from limber.geometry.skeletonise import skeletonise
 from limber.geometry.surface import Surface
-from limber.geometry.surface_checks import check_surface
 from limber.geometry.tetrahedra import mesh_branch
 from limber.geometry.tubes import branch_surface
 from limber.progress import Progress
@@ -106,8 +106,8 @@ def _generated(count: int, progress: Progress, out: Path | None) -> list[Row]:
             result = skeletonise(branch.cloud.points, root=branch.skeleton.nodes[0])
             score = score_skeleton(branch.skeleton, result.skeleton) | {"seed": seed}
             list_of_scores.append(score)
-            surface = branch_surface(result.skeleton)
-            valid += check_surface(surface).valid
+            surface, check, _ = smooth_forks(branch_surface(result.skeleton), result.skeleton)
+            valid += check.valid  # the surface that the user gets, with its fillets
             if view == "round":
                 meshed = mesh_branch(result.skeleton).mesh
                 volumes.append(meshed.volumes.sum() / branch.surface.volume - 1)
