@@ -194,7 +194,8 @@ def _interval_caption(estimate: dict[str, Any]) -> str:
     told = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
             (("sensor", "sensors"), ("geometry", "radii of the scan"), ("mesh", "mesh"))
             if parts.get(key) is not None]
-    missing = "" if parts.get("geometry") is not None or not parts else (
+    missing = "" if not parts else (
+        " Where the scan's axis runs is taken as exact." if parts.get("geometry") is not None else
         " The radii came without a deviation: what they are off by is not in the interval.")
     return ("Young's modulus along the branch with its 95 % interval"
             + (f"; largest standard deviation by {', '.join(told)}" if told else "")
