@@ -414,7 +414,17 @@ def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
         "density": values.density, "loss_m2": found.fit.evaluation.loss,
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "held_out": found.held_out,
-        "variance_factor": sure.variance_factor, "warnings": found.warnings}
+        "variance_factor": sure.variance_factor, "warnings": found.warnings,
+        "forward": settings.forward} | _reduced_error(found)
+
+
+def _reduced_error(found: Estimate) -> dict[str, Any]:
+    """What the reduced model was off by before its correction by the full one."""
+    errors = [forward.error for forward in found.objective.forwards if hasattr(forward, "error")]
+    if not errors:
+        return {}
+    position, force = np.max(errors, axis=0)
+    return {"reduced_error_m": position, "reduced_error_force_share": force}
 
 
 def _details(found: Estimate, subject: Subject, pulls: list[Any]) -> dict[str, Any]:

@@ -43,7 +43,7 @@ PRIOR_DEVIATION = 0.4
 
 def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
            progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
-           training_count: int = 100) -> dict[str, Any]:
+           training_count: int = 60) -> dict[str, Any]:
     """Estimate frame by frame from the first pull that is named (or the only one).
 
     A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
@@ -56,7 +56,7 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
         InputError: no such pull, or one without markers.
     """
     branch = Branch.open(branch_folder)
-    name = pull_names(branch, settings)[0]
+    name = _name(branch, settings)
     subject = subject_of(branch, settings)
     folder = branch.path(f"pulls/{name}")
     size = _size(folder)
@@ -106,6 +106,13 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
             json.dumps(plain(result | _history(states)), indent=1), encoding="utf-8")
         stage.result.update(result)
     return stage.result
+
+
+def _name(branch: Branch, settings: EstimateSettings) -> str:
+    """The pull to follow; one that a recorder writes is not in the branch's manifest."""
+    if settings.pull and (branch.folder / "pulls" / settings.pull[0] / "pull.toml").is_file():
+        return settings.pull[0]
+    return pull_names(branch, settings)[0]
 
 
 @dataclass(frozen=True)

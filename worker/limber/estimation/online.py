@@ -22,7 +22,7 @@ from limber.estimation.online_exact import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
 from limber.estimation.points import point_operator
 from limber.estimation.recording import GraspEntry
-from limber.mechanics.reduced import ReducedModel, ReducedState
+from limber.mechanics.reduced import ReducedModel, ReducedState, ReducedStaticSettings
 
 STEP_LIMIT = 0.7
 """Largest change of a log E by one frame."""
@@ -35,10 +35,14 @@ UNCHECKED_ERROR = 0.3
 """Error of the reduced model over the noise of a measurement, until it is measured."""
 COVERED = 0.1
 """Part of the way that lies between frames of the full model at the end."""
+QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
+"""A pose that takes more is out of the basis' reach, and another basis is on its way."""
 FINAL_FRAMES = 300
 """So many frames at most are linearised again when the pull is over."""
 STALE = 0.25
 """Change of a log E after which a frame of the full model is solved again at the end."""
+IDLE_DEVIATION = 0.3
+"""Nothing is called idle before every log E is known to this: a pull begins slowly."""
 IDLE_GAIN = 0.01
 """Part by which the last tenth of the frames narrows an interval, below which it is idle."""
 
@@ -88,7 +92,7 @@ class OnlineState:
 @dataclass
 class _Kept:
     frame: OnlineFrame
-    state: ReducedState
+    state: ReducedState | None
     centre: np.ndarray
     normal: np.ndarray
     gradient: np.ndarray
@@ -155,6 +159,7 @@ class OnlineEstimator:
         self._surprises: list[float] = []
         self._lost: list[OnlineFrame] = []
         self._past: list[OnlineFrame] = []
+        self._retry: list[OnlineFrame] = []
         self._untrusted = self._since_basis = 0
 
     def _use(self, reduced: ReducedModel) -> None:
@@ -199,7 +204,9 @@ class OnlineEstimator:
         self._keep(kept)
         self._step()
         self._ask()
-        if len(self._kept) > 1 and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
+        if self._retry and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
+            self._try_again()
+        elif len(self._kept) > 1 and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
             self._relinearise()
             self._step()
         return self._state(frame.time, kept.residual, kept.state.trusted)
@@ -210,13 +217,16 @@ class OnlineEstimator:
             return None
         if self._exact is not None:
             self._await()
+            while self._retry:
+                self._try_again()
             # A basis that knows these moduli and poses first, then its corrections.
             for _ in range(2):
                 if not (self._is_away() or self._lost or self._untrusted):
                     break
                 self._making = self._exact.basis(self._spread_poses(), self.log_young.copy())
                 self._await()
-                self._step()
+                while self._retry:
+                    self._try_again()
             for _ in range(3 * int(1 / COVERED)):
                 if not self._ask(whole=True):
                     break
@@ -225,10 +235,20 @@ class OnlineEstimator:
         last = self._kept[-1]
         return self._state(last.frame.time, last.residual, last.state.trusted)
 
+    def _try_again(self) -> None:
+        """Take up a frame that the basis before did not know."""
+        frame = self._retry.pop(0)
+        found = self._linearised(frame, None)
+        if found is None:
+            self._lost.append(frame)
+        else:
+            self._keep(found)
+            self._step()
+
     def _linearise_all(self) -> None:
         """Put in place of what was merged on the way the frames themselves, as seen from now."""
         states = {id(kept.frame): kept.state for kept in self._kept}
-        frames = sorted([*(kept.frame for kept in self._kept), *self._past],
+        frames = sorted([*(kept.frame for kept in self._kept), *self._past, *self._lost],
                         key=lambda frame: frame.time)
         chosen = np.unique(np.linspace(0, len(frames) - 1, FINAL_FRAMES).round().astype(int))
         weight = len(frames) / len(chosen)
@@ -237,7 +257,7 @@ class OnlineEstimator:
             before, kept, state = self.log_young.copy(), [], None
             for index in chosen:
                 frame = frames[index]
-                found = self._linearised(frame, states.get(id(frame), state))
+                found = self._linearised(frame, states.get(id(frame)) or state)
                 if found is not None:
                     state = states[id(frame)] = found.state
                     kept.append(replace(found, normal=weight * found.normal,
@@ -274,15 +294,10 @@ class OnlineEstimator:
                 self.refresh_count += 1
                 self._corrections.clear()
                 self._last, self._untrusted, self._since_basis = None, 0, 0
-                for index, old in enumerate(self._kept):
-                    self._kept[index] = self._linearised(old.frame, None) or old
-                lost, self._lost = self._lost, []
-                for frame in lost:
-                    again = self._linearised(frame, None)
-                    if again is None:
-                        self._lost.append(frame)
-                    else:
-                        self._keep(again)
+                # What is known stays known; its coordinates belong to the old basis.
+                for old in self._kept:
+                    old.state = None
+                self._retry, self._lost = self._retry + self._lost, []
         if self._asked is None or not self._asked[1].done():
             return
         (kept, future), self._asked = self._asked, None
@@ -311,7 +326,10 @@ class OnlineEstimator:
             near = np.linalg.norm(poses - known.frame.pose[:3], axis=1)
             if np.abs(known.centre - self.log_young).max() < STALE:
                 far = np.minimum(far, near)
+        far[[kept.state is None for kept in self._kept]] = -1.0
         index = int(np.argmax(far))
+        if far[index] < 0:
+            return False
         if far[index] < COVERED * np.linalg.norm(np.ptp(poses, axis=0)):
             return False
         chosen = self._kept[index]
@@ -346,7 +364,7 @@ class OnlineEstimator:
         """The reduced model's state, rows of points and force, and their derivatives."""
         model = self.reduced.with_young(np.exp(log_young))
         state = model.solve_static(pose_on(self.reduced.grasp, self._entry, frame.pose),
-                                   start=start)
+                                   start=start, settings=QUICK)
         if not state.converged:
             return None
         slopes = model.sensitivities(state)
@@ -372,6 +390,7 @@ class OnlineEstimator:
 
     def _keep(self, new: _Kept) -> None:
         self._kept.append(new)
+        self._kept.sort(key=lambda kept: kept.frame.time)
         if len(self._kept) <= self._kept_count:
             return
         # The frame whose pose is nearest to its neighbours' says least of its own: it is merged.
@@ -419,9 +438,11 @@ class OnlineEstimator:
         """By the noise alone: what the full model says now and then is no frame's doing."""
         widths = self._merged.widths
         widths.append(np.sqrt(np.diag(np.linalg.inv(self._normal_gradient()[0]))))
-        if len(widths) < 30:
+        unknown = self._lost or self._retry or self._is_strange()
+        if len(widths) < 30 or (self._exact is not None and unknown):
             return False
-        return bool(np.max(1 - widths[-1] / widths[-1 - len(widths) // 10]) < IDLE_GAIN)
+        return bool(np.max(1 - widths[-1] / widths[-1 - len(widths) // 10]) < IDLE_GAIN
+                    and widths[-1].max() < IDLE_DEVIATION)
 
 
 def _stacked(found: ExactFrame) -> tuple[np.ndarray, np.ndarray]:

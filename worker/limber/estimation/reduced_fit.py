@@ -215,10 +215,6 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
         # The basis was made around moduli too far off: once more, around what came out.
         reduction.build(values, progress)
     reduction.keep()
-    worst = np.max([forward.error for forward in corrected.forwards], axis=0)
-    tell(f"Fitted on the reduced model ({basis.size} coordinates), corrected by the full one: "
-         f"before correction it was off by up to {1e3 * worst[0]:.2g} mm and "
-         f"{100 * worst[1]:.2g} % of the force.")
     return fit, corrected
 
 
