@@ -189,7 +189,8 @@ def _reduced(bench: Bench, pull: Pull, found: Estimate) -> tuple[float, float, f
 def _online(bench: Bench, earlier: Pull, pull: Pull, found: Estimate,
             ) -> tuple[np.ndarray, float]:
     """Follow a pull at its own pace, with what a rough fit of an earlier one gave to start with."""
-    subject = Subject(bench.mesh, bench.branch.skeleton, bench.points, bench.weights,
+    mesh = bench.mesh.with_data(cell_data={"young": np.full(bench.mesh.tet_count, 1e7)})
+    subject = Subject(mesh, bench.branch.skeleton, bench.points, bench.weights,
                       bench.model, Values(np.full(4, 1e7), 0.35, 900.0))
     begun = begin(earlier, subject, SETTINGS, SILENT, 120)
     frames, seconds = frames_of(pull), []
