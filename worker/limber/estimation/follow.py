@@ -13,6 +13,7 @@ from limber.errors import Cancelled, InputError
 from limber.estimation.alignment import frames_of
 from limber.estimation.checks import clean
 from limber.estimation.grasping import grasp_on
+from limber.estimation.model_error import ModelError, geometry_error, total_interval
 from limber.estimation.objective import Objective
 from limber.estimation.online import OnlineEstimator, OnlineFrame, OnlineState
 from limber.estimation.online_exact import Beside, FullBranch, Here
@@ -98,7 +99,7 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     if estimator.refresh_count:
         warn(f"{name}: the moduli left what the reduced model knew; it was made again "
              f"{estimator.refresh_count} times on the way.")
-    result = _result(name, states, slowest) | {
+    result = _result(name, states, slowest) | _with_radii(branch, subject, states[-1]) | {
         "frame_count": estimator.frame_count, "stopped": stopped,
         "model_error": estimator.model_error, "refresh_count": estimator.refresh_count}
     with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
@@ -106,6 +107,15 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
             json.dumps(plain(result | _history(states)), indent=1), encoding="utf-8")
         stage.result.update(result)
     return stage.result
+
+
+def _with_radii(branch: Branch, subject: Subject, last: OnlineState) -> dict[str, Any]:
+    """The last interval together with what the scan's radii leave open, as an estimate's."""
+    if not branch.has("skeleton.csv"):
+        return {}
+    radii = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
+    return {"young_interval_sensor_pa": last.interval, "young_interval_pa": total_interval(
+        last.young, last.interval, ModelError(geometry=radii))}
 
 
 def _name(branch: Branch, settings: EstimateSettings) -> str:
