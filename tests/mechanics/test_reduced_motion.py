@@ -7,9 +7,13 @@ from limber.errors import InputError
 from limber.geometry.cylinder_mesh import straight_beam
 from limber.mechanics import BranchModel, Grasp, RayleighDamping, solve_static
 from limber.mechanics.dynamics import NewmarkSettings, simulate_dynamics
-from limber.mechanics.reduced import ReducedSettings, build_reduced
+from limber.mechanics.reduced import ReducedSettings, build_reduced, reduce_snapshots
 from limber.mechanics.reduced_dynamics import ReducedStepper, simulate_reduced
-from limber.mechanics.reduced_refresh import RefreshingModel
+from limber.mechanics.reduced_refresh import (
+    RefreshingModel,
+    estimate_error,
+    estimate_motion_error,
+)
 from limber.mechanics.reduced_training import Snapshots, TrainingSettings
 
 YOUNG = np.array([1e8])
@@ -65,13 +69,14 @@ def test_second_order_in_the_step(grasp, trained):
     reduced, ends = trained[0], []
     times, poses = pull(grasp, [-0.01, 0.02, 0.0], 9)
     poses = poses + np.array([0.03, 0, -0.012, 0, 0, 0])
-    for step in (0.0025, 0.00125, 0.000625, 0.00015625):
+    for step in (0.0025, 0.0003125, 0.000078125):
         settings = NewmarkSettings(max_step=step, tolerance=1e-9)
         ends.append(simulate_reduced(reduced, poses=poses, times=times, settings=settings))
-    last = [reduced.displacement_of(run.coordinates[4]) for run in ends]
-    errors = [np.linalg.norm(end - last[-1]) for end in last[:-1]]
-    rates = np.log2(np.array(errors[:-1]) / errors[1:])
-    assert rates[-1] == pytest.approx(2.0, abs=0.25)
+    # All frames: at a single instant an error may happen to cross zero.
+    paths = [np.array([reduced.displacement_of(q) for q in run.coordinates]) for run in ends]
+    errors = [np.linalg.norm(path - paths[-1]) for path in paths[:-1]]
+    # Over three halvings: free ends that vibrate quickly are resolved by the finer steps alone.
+    assert np.log2(errors[0] / errors[1]) / 3 == pytest.approx(2.0, abs=0.3)
 
 
 def test_motion_comes_to_the_static_state(grasp, trained):
@@ -158,3 +163,23 @@ def test_snapshots_go_through_plain_arrays(trained):
     again = Snapshots.from_arrays(arrays)
     assert len(again) == len(trained[1])
     np.testing.assert_array_equal(again.pose_tangents, trained[1].pose_tangents)
+
+
+def test_error_estimate_sees_inertia(model, grasp, trained):
+    """At rest it is the static estimate; a model for statics alone fails under inertia loads."""
+    snapshots = trained[1]
+    weights = np.ones((model.mesh.tet_count, 1))
+    still = reduce_snapshots(model, grasp, weights, YOUNG, snapshots.without_vibrations(),
+                             ReducedSettings(size=30, vibration_count=0, field_count=60))
+    state = still.solve_static(snapshots.poses[3])
+    resting = ReducedStepper(still, state)
+    resting.strain_energy = state.strain_energy
+    at_rest = estimate_motion_error(model, weights, still, resting)
+    static = estimate_error(model, weights, still, state)
+    assert at_rest.position == pytest.approx(static.position, rel=1e-6)
+    assert at_rest.energy == pytest.approx(static.energy, rel=1e-6)
+    # Shaken: the free end lags behind, which states at rest never did.
+    resting.state.acceleration = resting.state.acceleration.copy()
+    resting.state.acceleration[:3] = [60.0, 0, 0]
+    shaken = estimate_motion_error(model, weights, still, resting)
+    assert shaken.position > 3 * static.position

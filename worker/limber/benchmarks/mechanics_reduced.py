@@ -31,10 +31,10 @@ from limber.store import Branch
 
 LENGTH = 0.6
 YOUNG = 5e7
-KNOWN = ReducedSettings(size=56, vibration_count=6, field_count=100)
-CHANGED = ReducedSettings(size=64, vibration_count=0, field_count=105)
+KNOWN = ReducedSettings(size=62, vibration_count=1, field_count=100)
+CHANGED = ReducedSettings(size=66, vibration_count=0, field_count=110)
 CLAMPED = ReducedSettings(size=90, vibration_count=0, field_count=140)
-SESSION = ("--mode", "pinned", "--grasps", "2", "--size", "56", "--fields", "100")
+SESSION = ("--mode", "pinned", "--grasps", "2", "--size", "62", "--fields", "100")
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class _Bench:
         young = np.repeat(self.branch.young[None], count, axis=0)
         if spread > 1:
             young = young * spread ** rng.uniform(-1, 1, young.shape)
-        return self.trainer.take(poses, young, known, vibration_every=0 if known else 12,
+        return self.trainer.take(poses, young, known, vibration_every=0 if known else 4,
                                  vibration_count=4, progress=progress)
 
     def test(self, count: int, change: bool, known: Snapshots, progress: Progress) -> Snapshots:

@@ -39,7 +39,7 @@ from limber.mechanics.reduced_training import (
 )
 from limber.progress import SILENT, Progress
 
-FORMAT = 1
+FORMAT = 2
 _NO_INCREMENT = np.empty(0)
 _LEADING = 20
 """Modes that tell whether a state is like those of the training."""
@@ -186,7 +186,7 @@ class ReducedModel:
     def __post_init__(self) -> None:
         self.held = GraspCoordinates(self.grasp)
         self.young = self.control_young
-        self._largest = np.abs(self.basis.states).max(axis=0)
+        self._largest = self.basis.reach
         # The leading modes: those of vibrations are not in the states, the last are small.
         modes = np.arange(self.size) >= self.basis.lift_count
         self._known = np.flatnonzero(modes & (self._largest > 0))[:_LEADING]
@@ -230,14 +230,18 @@ class ReducedModel:
         return energy, gradient.copy()
 
     def tangent(self, q: np.ndarray, increment: np.ndarray | None = None,
+                velocity: np.ndarray | None = None, by_rate: float = 0.0,
                 ) -> tuple[float, np.ndarray, np.ndarray]:
         """Return energy, force and tangent (lower triangle); arrays are overwritten next time.
 
-        With ``increment`` the geometric stiffness is that of the mixed-integration-point Newton.
+        With ``increment`` the geometric stiffness is that of the mixed-integration-point Newton;
+        with ``velocity``, which changes by ``by_rate`` [1/s] with q, the stiffness damping acts.
         """
         work = self._work
         dq = _NO_INCREMENT if increment is None else increment
-        energy = evaluate_strain(self.linear, self.quadratic, q, dq, work.strain, work.jacobian,
+        moving = _NO_INCREMENT if velocity is None else velocity
+        energy = evaluate_strain(self.linear, self.quadratic, q, dq, moving,
+                                 self.damping.stiffness, by_rate, work.strain, work.jacobian,
                                  work.gradient, work.tangent)
         return energy, work.gradient, work.tangent
 
@@ -393,7 +397,7 @@ class ReducedModel:
             "format": FORMAT, "grasp_nodes": self.grasp.nodes, "grasp_weights": self.grasp.weights,
             "grasp_centre": self.grasp.centre, "grasp_mode": self.grasp.mode, "rest": self.rest,
             "columns": self.basis.columns, "lift_count": self.basis.lift_count,
-            "states": self.basis.states, "captured": self.basis.captured,
+            "states": self.basis.states, "captured": self.basis.captured, "reach": self.basis.reach,
             **{f"polynomial_{k}": v for k, v in vars(self.polynomial).items()},
             "load": self.load, "mass": self.mass,
             "damping": [self.damping.mass, self.damping.stiffness],
@@ -422,7 +426,7 @@ class ReducedModel:
         grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
                       str(arrays["grasp_mode"]))
         basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
-                      float(arrays["captured"]))
+                      float(arrays["captured"]), arrays["reach"])
         polynomial = StrainPolynomial(*(arrays[f"polynomial_{name}"] for name in
                                         ("linear", "quadratic", "by_lambda", "by_mu")),
                                       float(arrays["polynomial_poisson"]))

@@ -19,6 +19,10 @@ from limber.mechanics.reduced_training import Snapshots
 
 TANGENT_SHARE = 0.25
 """Weight of tangents beside states; they stand for the change by the steps below."""
+SWING_SHARE = 0.1
+"""Weight of swung states beside those at rest: they are for motion, which is less exact."""
+SWING_STRAIN_SHARE = 0.05
+"""The same among the strain fields."""
 MOVE_STEP = 0.05
 """Step of a tangent to the position, as part of the extent."""
 TURN_STEP = 0.15
@@ -82,12 +86,14 @@ class Basis:
         lift_count: Number of lifts.
         states: Coordinates of the training states, shape [s, size].
         captured: Part of the snapshots' H1 energy that the basis holds.
+        reach: Largest size of each coordinate in training, swung states included, shape [size].
     """
 
     columns: np.ndarray
     lift_count: int
     states: np.ndarray
     captured: float
+    reach: np.ndarray
 
     @property
     def size(self) -> int:
@@ -116,7 +122,9 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     lifts = elastic_lifts(model, coordinates)
     lifts = lifts + _regressed(held, snapshots.displacement - _span(lifts, held))
     rest = snapshots.displacement - _span(lifts, held)
-    columns = np.concatenate([rest, *_tangent_columns(model, coordinates, snapshots, lifts)])
+    swung = SWING_SHARE * (snapshots.swings - _span(lifts, held[snapshots.swing_states]))
+    columns = np.concatenate([rest, *_tangent_columns(model, coordinates, snapshots, lifts),
+                              swung])
     columns = _let_go(grasp, lifts, columns)
     heavy = _apply(metric, columns)
     gram = columns.reshape(len(columns), -1) @ heavy.reshape(len(columns), -1).T
@@ -132,9 +140,13 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     own = heavy[:len(rest)].reshape(len(rest), -1) @ modes.reshape(wanted, -1).T
     vibrations = _let_go(grasp, lifts, snapshots.vibrations.astype(float))
     beside = _beside(metric, modes, vibrations, vibration_count)
-    return Basis(np.concatenate([lifts, modes, beside]), count,
-                 np.hstack([held, own, np.zeros((len(held), len(beside)))]),
-                 float(values[:wanted].sum() / values[values > 0].sum()))
+    states = np.hstack([held, own, np.zeros((len(held), len(beside)))])
+    flat = heavy.reshape(len(columns), -1)[len(columns) - len(swung):]
+    swinging = flat @ modes.reshape(wanted, -1).T / SWING_SHARE
+    reach = np.abs(states).max(axis=0)
+    reach[count:count + wanted] = np.abs(np.vstack([own, swinging])).max(axis=0)
+    return Basis(np.concatenate([lifts, modes, beside]), count, states,
+                 float(values[:wanted].sum() / values[values > 0].sum()), reach)
 
 
 def _let_go(grasp: Grasp, lifts: np.ndarray, fields: np.ndarray) -> np.ndarray:

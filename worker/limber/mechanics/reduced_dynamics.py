@@ -152,13 +152,12 @@ class ReducedStepper:
             acceleration = by_mass * moved - old.velocity / (settings.beta * step) \
                 - (1 / (2 * settings.beta) - 1) * old.acceleration
             velocity[:count], acceleration[:count] = held_velocity, held_acceleration
-            energy, force, tangent = model.tangent(q)
+            energy, force, tangent = model.tangent(
+                q, velocity=velocity if viscous else None, by_rate=by_rate)
             inertia = model.mass @ (acceleration + massive * velocity)
             # Lower triangle alone is filled: the columns of the grasp are whole below it.
             force, coupling = force.copy(), tangent[free, :count] + mass_coupling
             tangent = tangent[free, free] + mass_part
-            if viscous:
-                force, tangent = self._add_viscous(force, tangent, velocity, by_rate, free)
             self.out = force + inertia - self.load
             right = -self.out[free]
             if jump is not None:
@@ -186,14 +185,6 @@ class ReducedStepper:
                 return True
             last = gain
         return False
-
-    def _add_viscous(self, force: np.ndarray, tangent: np.ndarray, velocity: np.ndarray,
-                     by_rate: float, free: slice) -> tuple[np.ndarray, np.ndarray]:
-        """Add the force of the strain rate, and its main part (J^T J) to the tangent."""
-        jacobian, viscous = self.model.jacobian, self.model.damping.stiffness
-        force = force + viscous * (jacobian.T @ (jacobian @ velocity))
-        own = jacobian[:, free]
-        return force, tangent + (viscous * by_rate) * (own.T @ own)
 
     def reaction(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return force [N] and torque [Nm] of the gripper on the branch after the last step."""

@@ -21,6 +21,7 @@ from limber.mechanics.reduced import (
     build_reduced,
     reduce_snapshots,
 )
+from limber.mechanics.reduced_dynamics import ReducedStepper
 from limber.mechanics.reduced_training import Snapshots, Trainer
 from limber.mechanics.statics import StaticResult
 from limber.progress import SILENT, Progress
@@ -50,7 +51,7 @@ class ErrorEstimate:
 
 def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedModel,
                    state: ReducedState) -> ErrorEstimate:
-    """Return the error of a reduced state by correcting it with the full model.
+    """Return the error of a reduced static state by correcting it with the full model.
 
     Later corrections take their geometric stiffness from the one before (mixed integration
     points): the strain noise of the basis would spoil a plain tangent. Four at most: a free end
@@ -61,8 +62,29 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
         weights: From control points to tetrahedra.
     """
     full = model.with_young(weights @ state.young)
+    return _corrected(full, reduced, reduced.displacement(state), state.strain_energy,
+                      full.weight_force)
+
+
+def estimate_motion_error(model: BranchModel, weights: np.ndarray, reduced: ReducedModel,
+                          stepper: ReducedStepper) -> ErrorEstimate:
+    """Return the error of a reduced model in motion at the instant its stepper has reached.
+
+    The full model is put in balance with the inertia loads of the reduced motion (d'Alembert):
+    what the basis cannot do under them shows, a free end that swings for one. What went wrong
+    in the time before does not, and the damping of the strain rate is left out.
+    """
+    full = model.with_young(weights @ reduced.young)
+    moving = stepper.state
+    slowed = reduced.displacement_of(moving.acceleration + full.damping.mass * moving.velocity)
+    load = full.weight_force - full.mass_matrix @ slowed
+    return _corrected(full, reduced, reduced.displacement_of(moving.coordinates),
+                      stepper.strain_energy, load)
+
+
+def _corrected(full: BranchModel, reduced: ReducedModel, start: np.ndarray, strain_energy: float,
+               load: np.ndarray) -> ErrorEstimate:
     equations = full.equations([reduced.grasp])
-    start = reduced.displacement(state)
     now = full.internal(start)
     u, increment, certain, first = start, None, False, now
     for _ in range(_CORRECTIONS):
@@ -72,11 +94,11 @@ def estimate_error(model: BranchModel, weights: np.ndarray, reduced: ReducedMode
         except NotPositiveDefiniteError:
             certain = False
             break
-        increment = equations.solve(equations.free_part(full.weight_force - now.force))
+        increment = equations.solve(equations.free_part(load - now.force))
         u = u + increment
         now = full.internal(u)
     off = float(np.linalg.norm(u - start, axis=1).max()) / full.extent
-    energy = state.strain_energy / max(now.strain_energy, 1e-12) - 1
+    energy = strain_energy / max(now.strain_energy, 1e-12) - 1
     return ErrorEstimate(off, energy, first.min_det_f,
                          bool(certain and np.isfinite(off + energy)), u)
 

@@ -22,7 +22,13 @@ from limber.errors import InputError
 from limber.mechanics.compiled import compiled
 from limber.mechanics.materials import Material, lame
 from limber.mechanics.model import BranchModel
-from limber.mechanics.reduced_basis import TANGENT_SHARE, VIBRATION_STEP, Basis, tangent_steps
+from limber.mechanics.reduced_basis import (
+    SWING_STRAIN_SHARE,
+    TANGENT_SHARE,
+    VIBRATION_STEP,
+    Basis,
+    tangent_steps,
+)
 from limber.mechanics.reduced_training import Snapshots
 
 _CHUNK_POINTS = 1000
@@ -76,12 +82,15 @@ class StrainPolynomial:
 
 
 @compiled
-def evaluate_strain(linear, quadratic, q, increment, strain, jacobian, gradient, tangent):
+def evaluate_strain(linear, quadratic, q, increment, velocity, damping, by_rate, strain, jacobian,
+                    gradient, tangent):
     """Evaluate whitened strain, force and tangent; return the energy [J].
 
     Writes strain e [m], its derivative J [m, size], the force J^T e [size] and the lower triangle
     of the tangent [size, size]. With an ``increment`` (else empty) the geometric part takes the
-    strain that the last linearisation predicted (mixed integration points).
+    strain that the last linearisation predicted (mixed integration points). With a ``velocity``
+    (else empty) the stress ``damping`` [s] times the rate of the strain is added to force and
+    tangent; ``by_rate`` [1/s] is the change of the velocity with q.
     """
     count, size = linear.shape
     gradient[:] = 0.0
@@ -114,11 +123,17 @@ def evaluate_strain(linear, quadratic, q, increment, strain, jacobian, gradient,
             row[i] = linear[a, i] + 2.0 * row[i]
         strain[a] = value
         energy += 0.5 * value * value
-        geometric = 2.0 * (value - predicted)
+        viscous, growth = 0.0, 1.0
+        if len(velocity):
+            growth += damping * by_rate
+            for i in range(size):
+                viscous += damping * row[i] * velocity[i]
+        geometric = 2.0 * (value + viscous - predicted)
         at = 0
         for i in range(size):
             ri = row[i]
-            gradient[i] += ri * value
+            gradient[i] += ri * (value + viscous)
+            ri *= growth
             for j in range(i + 1):
                 tangent[i, j] += ri * row[j] + geometric * form[at + j]
             at += i + 1
@@ -149,8 +164,8 @@ def compile_kernels() -> None:
     """Call every kernel once; the compiled code stays in the user's cache folder."""
     linear, quadratic, q, strain = np.eye(2), np.ones((2, 3)), np.ones(2), np.empty(2)
     for increment in (np.empty(0), q):
-        evaluate_strain(linear, quadratic, q, increment, strain, np.empty((2, 2)), np.empty(2),
-                        np.empty((2, 2)))
+        evaluate_strain(linear, quadratic, q, increment, increment, 0.0, 0.0, strain,
+                        np.empty((2, 2)), np.empty(2), np.empty((2, 2)))
     strain_only(linear, quadratic, q, strain)
     gradient = np.zeros((1, 3, 3, 1))
     _green_change(gradient, gradient, np.zeros(1, np.int64), np.ones(1), np.empty((1, 6, 1)))
@@ -257,14 +272,19 @@ def _green_change(H, D, owners, scales, strain):
 
 @dataclass(frozen=True)
 class _Sources:
-    """States, and changes with the state that each belongs to, whose strains are true ones."""
+    """States, and changes with the state that each belongs to, whose strains are true ones.
+
+    The first ``rest_count`` states are at rest, the others swung out and weigh less.
+    """
 
     states: np.ndarray
+    rest_count: int
     changes: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
     def strains(self, points: _Points, chunk: slice) -> np.ndarray:
         H = points.gradient(self.states, chunk)
         parts = [_green(H)]
+        parts[0][:, :, self.rest_count:] *= SWING_STRAIN_SHARE
         for fields, owners, scales in self.changes:
             if not len(fields):
                 continue
@@ -282,7 +302,8 @@ def _strain_sources(model: BranchModel, snapshots: Snapshots) -> _Sources:
     steps = 2 * TANGENT_SHARE * tangent_steps(model, snapshots)
     moved, moved_owner = flat(snapshots.pose_tangents)
     stiffer, stiffer_owner = flat(snapshots.young_tangents)
-    return _Sources(snapshots.displacement, [
+    return _Sources(np.concatenate([snapshots.displacement, snapshots.swings]),
+                    len(snapshots), [
         (moved, moved_owner, np.tile(steps, len(snapshots))),
         (stiffer, stiffer_owner, np.full(len(stiffer), 2 * TANGENT_SHARE)),
         (snapshots.vibrations, snapshots.vibration_states,

@@ -23,6 +23,10 @@ _YOUNG_SCALE = 0.1
 _TIP_TURNS = 1.3
 """How much a cantilever's end turns per turn of its chord: between 1 (stiff) and 1.5 (small)."""
 
+_SWING = 0.14
+"""How far the lowest vibration swings a state out, as part of the extent; higher ones less."""
+_SWING_COUNT = 3
+
 
 @dataclass(frozen=True)
 class TrainingSettings:
@@ -34,8 +38,8 @@ class TrainingSettings:
         turn: Largest rotation of a clamped grasp away from the natural one [rad].
         young_spread: Young's modulus at each control point is sampled between 1/spread and
             spread times its value for every second grasp; 1: it is known and stays.
-        vibration_every: At every so many states the lowest vibrations are added, which motion
-            in time needs; 0: none.
+        vibration_every: At every so many states the lowest vibrations are added, and states
+            swung out along them, which motion in time needs; 0: none.
         vibration_count: How many of them.
         seed: Of the sampling.
     """
@@ -44,7 +48,7 @@ class TrainingSettings:
     reach: float = 0.38
     turn: float = 0.3
     young_spread: float = 4.0
-    vibration_every: int = 12
+    vibration_every: int = 6
     vibration_count: int = 4
     seed: int = 0
 
@@ -73,6 +77,9 @@ class Snapshots:
         vibrations: Lowest modes about some of the states, scaled to a largest motion of 1 m,
             shape [v, node_count, 3].
         vibration_states: The states they belong to, shape [v].
+        swings: States with free ends swung out far along vibrations, held at rest there by the
+            loads that bend them so [m], shape [w, node_count, 3].
+        swing_states: The states they belong to, shape [w].
         failed: Number of wanted grasps that found no equilibrium.
     """
 
@@ -85,6 +92,8 @@ class Snapshots:
     young_tangents: np.ndarray
     vibrations: np.ndarray
     vibration_states: np.ndarray
+    swings: np.ndarray
+    swing_states: np.ndarray
     failed: int = 0
 
     def __len__(self) -> int:
@@ -107,15 +116,17 @@ class Snapshots:
     def without_vibrations(self) -> "Snapshots":
         """Return the same for statics alone."""
         return replace(self, vibrations=self.vibrations[:0],
-                       vibration_states=self.vibration_states[:0])
+                       vibration_states=self.vibration_states[:0], swings=self.swings[:0],
+                       swing_states=self.swing_states[:0])
 
     def joined(self, other: "Snapshots") -> "Snapshots":
         """Return these snapshots and those of ``other``."""
         parts = {name: np.concatenate([getattr(self, name), getattr(other, name)])
                  for name in ("poses", "young", "displacement", "energy", "force",
-                              "pose_tangents", "young_tangents", "vibrations")}
-        states = np.concatenate([self.vibration_states, other.vibration_states + len(self)])
-        return Snapshots(**parts, vibration_states=states, failed=self.failed + other.failed)
+                              "pose_tangents", "young_tangents", "vibrations", "swings")}
+        for name in ("vibration_states", "swing_states"):
+            parts[name] = np.concatenate([getattr(self, name), getattr(other, name) + len(self)])
+        return Snapshots(**parts, failed=self.failed + other.failed)
 
 
 def sample_poses(model: BranchModel, grasp: Grasp, count: int, rng: np.random.Generator,
@@ -225,7 +236,10 @@ class Trainer:
         left = list(range(len(poses)))
         rows: list[dict[str, np.ndarray]] = []
         vibrations: list[np.ndarray] = []
+        swings: list[np.ndarray] = []
         owners: list[int] = []
+        swung: list[int] = []
+        rng = np.random.default_rng(len(poses))
         at_pose, at_young = self.grasp.rest_pose, self.control_young
         while left:
             progress(1 - len(left) / len(poses), "solving training grasps", solved=len(rows))
@@ -239,13 +253,18 @@ class Trainer:
             starts.append((at_pose, at_young, result.displacement))
             rows.append(self._differentiated(result, at_pose, at_young))
             if vibration_every and (len(rows) - 1) % vibration_every == 0:
-                vibrations += list(self._vibrations(vibration_count))
-                owners += [len(rows) - 1] * vibration_count
+                modes = self._vibrations(vibration_count)
+                vibrations += list(modes)
+                owners += [len(rows) - 1] * len(modes)
+                found = self._swings(result.displacement, modes.astype(float), at_pose, at_young,
+                                     rng)
+                swings += found
+                swung += [len(rows) - 1] * len(found)
         if not rows:
             raise ConvergenceError(
                 f"None of {len(poses)} training grasps has an equilibrium.",
                 "They may lie out of reach.", "Use a smaller reach, or another grasp point.")
-        return self._snapshots(rows, vibrations, owners, len(poses) - len(rows))
+        return self._snapshots(rows, (vibrations, owners), (swings, swung), len(poses) - len(rows))
 
     def differentiate(self, poses: np.ndarray, young: np.ndarray,
                       displacements: np.ndarray) -> Snapshots:
@@ -260,14 +279,18 @@ class Trainer:
             result = solve_static(model, grasp=self.grasp, pose=pose, start=displacement,
                                   settings=self.solver)
             rows.append(self._differentiated(result, pose, modulus))
-        return self._snapshots(rows, [], [], 0)
+        return self._snapshots(rows, ([], []), ([], []), 0)
 
-    def _snapshots(self, rows: list[dict[str, np.ndarray]], vibrations: list[np.ndarray],
-                   owners: list[int], failed: int) -> Snapshots:
+    def _snapshots(self, rows: list[dict[str, np.ndarray]],
+                   vibrations: tuple[list[np.ndarray], list[int]],
+                   swings: tuple[list[np.ndarray], list[int]], failed: int) -> Snapshots:
         columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         shape = (-1, self.model.mesh.node_count, 3)
-        return Snapshots(**columns, vibrations=np.array(vibrations, np.float32).reshape(shape),
-                         vibration_states=np.array(owners, np.int64), failed=failed)
+        for name, (fields, owners), kind in (("vibration", vibrations, np.float32),
+                                             ("swing", swings, float)):
+            columns[f"{name}s"] = np.array(fields, kind).reshape(shape)
+            columns[f"{name}_states"] = np.array(owners, np.int64)
+        return Snapshots(**columns, failed=failed)
 
     def _nearest(self, pose: np.ndarray, young: np.ndarray,
                  starts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
@@ -310,6 +333,27 @@ class Trainer:
             arm = model.mesh.nodes[self.grasp.nodes] + u[self.grasp.nodes] - pose[:3]
             held[self.grasp.nodes] = np.cross(np.eye(3)[axis - 3], arm)
         return held + self._equations.solve(-model.tangent_times(u, held))
+
+    def _swings(self, state: np.ndarray, modes: np.ndarray, pose: np.ndarray, young: np.ndarray,
+                rng: np.random.Generator) -> list[np.ndarray]:
+        """Return states swung out from one along its vibrations, as far as motion does.
+
+        A vibration as it is would stretch what turns far; bent there by its own inertia load
+        (omega^2 M times the mode) the branch keeps its length.
+        """
+        model = self.model.with_young(self.weights @ young)
+        mass, found = model.mass_matrix, []
+        rate = np.array([(mode * model.tangent_times(state, mode)).sum()
+                         / (mode * (mass @ mode)).sum() for mode in modes])
+        for _ in range(_SWING_COUNT):
+            size = _SWING * model.extent * rng.uniform(-1, 1, len(modes)) * np.sqrt(
+                rate.min() / rate)
+            load = np.tensordot(size * rate, np.array([mass @ mode for mode in modes]), 1)
+            swung = solve_static(model, grasp=self.grasp, pose=pose, nodal_forces=load,
+                                 start=state, settings=self.solver)
+            if swung.converged:
+                found.append(swung.displacement)
+        return found
 
     def _vibrations(self, count: int) -> np.ndarray:
         """Lowest modes about the state whose tangent was factorised last, by subspace iteration."""

@@ -58,7 +58,7 @@ def settings_of(options: argparse.Namespace) -> ReducedSettings:
     """Return the reduced model's settings of command-line options."""
     training = TrainingSettings(grasp_count=options.grasps, young_spread=options.young_spread)
     return ReducedSettings(size=options.size, field_count=options.fields, training=training,
-                           vibration_count=6 if options.young_spread == 1 else 0)
+                           vibration_count=1 if options.young_spread == 1 else 0)
 
 
 def load_branch(options: argparse.Namespace) -> tuple[BranchModel, Grasp]:
