@@ -385,7 +385,7 @@ def bench_mesh(spacing: float) -> TetMesh:
 
 
 def _sized_mesh(tet_count: int) -> TetMesh:
-    """Return the branch with about so many quadratic tetrahedra."""
+    """Return the branch with so many quadratic tetrahedra, or the fewest above."""
     spacings = np.geomspace(0.15, 6, 24)
     low, high = 0, len(spacings) - 1
     meshes = {}
@@ -393,7 +393,8 @@ def _sized_mesh(tet_count: int) -> TetMesh:
         middle = (low + high) // 2
         meshes[middle] = bench_mesh(float(spacings[middle]))
         low, high = (middle, high) if meshes[middle].tet_count > tet_count else (low, middle)
-    return min(meshes.values(), key=lambda m: abs(m.tet_count - tet_count))
+    enough = [mesh for mesh in meshes.values() if mesh.tet_count >= tet_count]
+    return min(enough, key=lambda mesh: mesh.tet_count)
 
 
 def least_seconds(work: Callable[[], object], count: int = 15) -> float:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from limber.progress import BarSink, Progress
+from limber.store import plain
 
 NAMES = ("geometry", "mechanics", "estimation", "planning")
 
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     show(rows)
     print(f"{options.name}: {time.perf_counter() - started:.0f} s")
     if options.json:
-        print(json.dumps({"bench": options.name, "rows": [asdict(row) for row in rows]}))
+        print(json.dumps({"bench": options.name, "rows": [plain(asdict(row)) for row in rows]}))
     return 0
 
 
