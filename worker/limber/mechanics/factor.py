@@ -32,7 +32,6 @@ class CholmodFactor:
     def __init__(self, rows: np.ndarray, columns: np.ndarray, size: int):
         from cvxopt import matrix, spmatrix
 
-        one_thread()
         self._matrix = spmatrix(1.0, matrix(rows.astype(np.int64)),
                                 matrix(columns.astype(np.int64)), (size, size))
         # A numpy view on cvxopt's own memory: one copy less for each factorisation.
@@ -96,7 +95,11 @@ class SuperLuFactor:
 
 
 def make_factor(pattern: "Pattern") -> SupernodalFactor | CholmodFactor | SuperLuFactor:
-    """Return the fastest factor for a pattern that is installed."""
+    """Return the fastest factor for a pattern that is installed; one thread from now on.
+
+    The pattern's order of elimination has loaded cvxopt, the last of the libraries to limit.
+    """
+    one_thread()
     fronts = make_fronts(pattern.node_starts, pattern.node_rows)
     if fronts.flops <= _MOST_FLOPS:
         return SupernodalFactor(fronts)
