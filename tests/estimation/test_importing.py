@@ -43,12 +43,14 @@ def source(tmp_path, plain_pull):
 def test_markers_in_millimetres_and_gram_force(branch_folder, source, plain_pull):
     """Units are converted at the door; the pull in the folder is in metres and newtons."""
     result = import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(
-        robot=str(source / "robot.csv"), unit="mm", force_unit="gf", time_offset=0.05))
+        robot=str(source / "robot.csv"), unit="mm", force_unit="gf", time_offset=0.05,
+        torque_sigma=0.002))
     assert result["frame_count"] == 60 and result["point_count"] == 2
     pull = read_pull(branch_folder / "pulls" / "m")
     assert np.allclose(pull.observations.positions, plain_pull.observations.positions, atol=1e-6)
     assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-6)
     assert pull.entry.time_offset_s == 0.05
+    assert pull.entry.sensor.torque_sigma_nm == 0.002
     assert pull.entry.grasp.point_m == (0.0, 0.0, 0.5)
 
 

@@ -87,6 +87,9 @@ class ImportSettings(BaseModel):
         None, gt=0, description="Noise of positions [m]; without it 1 mm, under a steady load "
         "what the recording shows.")
     force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
+    torque_sigma: float | None = Field(
+        None, gt=0, description="Noise of torques about the pose's position [N m]; a clamped "
+        "gripper's torque is used only where this is known.")
     yolo_weights: str | None = Field(
         None, description="Weights file of a YOLO segmentation model of your own, for masks of "
         "an RGB-D folder's colour images (needs ultralytics).")
@@ -364,5 +367,6 @@ def _entry(observation: Any, source: Path, settings: ImportSettings, branch: Bra
         gravity_m_s2=branch.gravity if settings.own_weight else None,
         time_offset_s=settings.time_offset or 0.0, source=source.name,
         grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=mode),
-        sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma),
+        sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma,
+                           torque_sigma_nm=settings.torque_sigma),
         rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))
