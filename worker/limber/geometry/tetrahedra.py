@@ -29,7 +29,7 @@ class MeshSettings(BaseModel):
         "auto", description="auto: sweep along the axes, and fTetWild where that cannot join a "
         "twig; ftetwild falls back to the sweep.")
     mesh_sides: int = Field(
-        8, ge=4, le=24, description="Sides of the cross-sections that fTetWild fills; the sweep's have six.")
+        8, ge=4, le=24, description="Sides of the sections that fTetWild fills; the sweep has 6.")
     mesh_spacing: float = Field(
         2.5, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
     mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's time limit [s].")
