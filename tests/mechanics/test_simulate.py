@@ -211,3 +211,65 @@ def test_series_reads_back_elsewhere(folder):
     assert read.points == pytest.approx(own.nodes + read.point_data["displacement"], abs=1e-9)
     assert {"young", "energy_density", "principal_strain", "principal_stress",
             "det_f"} <= set(read.cell_data)
+
+
+def _frames(folder, name="simulate"):
+    return json.loads((folder / "frames" / f"{name}.json").read_text())
+
+
+def test_a_second_gripper_props_the_branch(folder):
+    """A load at half the length, the tip held: the prop carries 5/16 of it (beam theory)."""
+    simulate(folder, SimulateSettings(
+        kind="static", gravity=False, frame_rate=1, grasp_mode="pinned", grasp_radius=0.008,
+        load_at=((0, 0, 0.15, 0.1, 0, 0),), hold_at=((0, 0, 0.3),)))
+    held = np.array(_frames(folder)["hold_forces_n"])
+    assert held.shape == (2, 1, 3)
+    assert held[0] == pytest.approx(np.zeros((1, 3)), abs=1e-9)
+    assert held[-1, 0, 0] == pytest.approx(-0.1 * 5 / 16, rel=0.03)
+
+
+def test_pose_and_hold_together_in_motion(folder):
+    """One gripper moves, another holds: forces of both are given, the held place stays."""
+    simulate(folder, SimulateSettings(
+        move=(0.003, 0, 0), hold_at=((0, 0, 0.3),), grasp_point=(0, 0, 0.15), duration=0.1,
+        hold=0.05, grasp_mode="pinned", gravity=False))
+    frames = _frames(folder)
+    assert np.shape(frames["hold_forces_n"]) == (frames["frame_count"], 1, 3)
+    assert frames["grasp_forces_n"][-1][0] > 0 > frames["hold_forces_n"][-1][0][0]
+    mesh = TetMesh.read(folder / "mesh.vtu")
+    surface = np.unique(mesh.surface_faces())
+    tip = np.linalg.norm(mesh.nodes[surface] - [0, 0, 0.3], axis=1) < 0.01
+    positions, _, _ = read_pc2(folder / "frames" / "simulate.pc2")
+    assert np.abs((positions[-1] - mesh.nodes[surface])[tip].mean(axis=0)).max() < 3e-4
+
+
+def test_a_load_grows_as_a_grasp_force_does(folder):
+    """The same force by --load-at and by --grasp-force: the same motion."""
+    place = {"grasp_point": (0, 0, 0.2), "duration": 0.1, "hold": 0.1, "gravity": False,
+             "grasp_mode": "pinned"}
+    simulate(folder, SimulateSettings(grasp_force=(0.5, 0, 0), name="force", **place))
+    simulate(folder, SimulateSettings(load_at=((0, 0, 0.2, 0.5, 0, 0),), name="load", **place))
+    assert _frames(folder, "load")["energies_j"] == pytest.approx(
+        _frames(folder, "force")["energies_j"], rel=1e-6)
+    assert _frames(folder, "load")["energies_j"][-1] > 0
+
+
+def test_a_hung_mass_presses_the_branch(folder):
+    """One kilogram at the tip of an upright beam: shorter by m g L / (E A) from the start."""
+    assert call(["simulate", str(folder), "--kind", "static", "--mass-at", "0", "0", "0.3", "0.4",
+                 "--mass-at", "0", "0", "0.3", "0.6", "--frame-rate", "1", "--progress", "none",
+                 "--young", "5e8", "--no-rest-shape", "--grasp-force", "0", "0", "0"]) == 0
+    mesh = TetMesh.read(folder / "mesh.vtu")
+    surface = np.unique(mesh.surface_faces())
+    positions, _, _ = read_pc2(folder / "frames" / "simulate.pc2")
+    middle = np.abs(mesh.nodes[surface, 2] - 0.24) < 1e-6
+    moved = (positions[0] - mesh.nodes[surface])[middle, 2].mean()
+    own = 900 * 1e-4 * 9.80665 * (0.3 - 0.12) * 0.24 / (5e8 * 1e-4)
+    assert moved == pytest.approx(-9.80665 * 0.24 / (5e8 * 1e-4) - own, rel=0.03)
+
+
+def test_holds_that_overlap_are_refused(folder, capsys):
+    """A hold on the grasp itself: exit code 2."""
+    assert call(["simulate", str(folder), "--hold-at", "0", "0", "0.2", "--move", "0.01", "0", "0",
+                 "--progress", "none"]) == 2
+    assert "overlap" in "".join(capsys.readouterr())

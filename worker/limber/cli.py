@@ -128,7 +128,8 @@ def settings_options(model: type[BaseModel]) -> Callable[[Callable], Callable]:
     """Add one option for each field of a settings model; the function gets ``settings=model(...)``.
 
     A field's description is its help text, its default the option's. ``bool`` fields become
-    ``--name/--no-name``, ``tuple[float, float, float]`` take three values.
+    ``--name/--no-name``, ``tuple[float, float, float]`` take three values, a tuple of
+    such tuples may be given several times (``json_schema_extra={"metavar": ...}`` names them).
     """
     def wrap(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -237,11 +238,17 @@ def _option(name: str, field: Any) -> Callable:
         return click.option(flag, name, type=click.Choice(typing.get_args(kind)), **common)
     if typing.get_origin(kind) is tuple:
         items = typing.get_args(kind)
+        metavar = (field.json_schema_extra or {}).get("metavar")
+        if items[-1] is Ellipsis and typing.get_origin(items[0]) is tuple:
+            parts = typing.get_args(items[0])
+            return click.option(flag, name, nargs=len(parts), type=parts[0], multiple=True,
+                                metavar=metavar, **common)
         if items[-1] is Ellipsis:
             # Given twice it adds up: the last one alone would drop the others without a word.
             return click.option(flag, name, callback=_listed, metavar="A,B,...", multiple=True,
                                 **common)
-        metavar = "X Y Z" if len(items) == 3 else None
+        if len(items) == 3:
+            metavar = "X Y Z"
         return click.option(flag, name, nargs=len(items), type=items[0], metavar=metavar, **common)
     return click.option(flag, name, type=kind, **common)
 

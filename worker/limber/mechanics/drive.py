@@ -22,7 +22,6 @@ class Drive:
         times: Of the frames [s].
         grasps: All of them; single: whether one was given by itself.
         path: The grasps' motion; None where they do not follow poses.
-        load: Gravity and nodal forces [N], shape [node_count, 3].
         equations: With the grasps held that follow poses.
 
     Raises:
@@ -42,21 +41,21 @@ class Drive:
                                  "A grasp follows poses or exerts a force, not both.",
                                  "Leave one out.")
             self.path = PosePath(self.grasps, model.mesh.nodes, self.times, poses)
-        self.load = model.weight_force
-        if nodal_forces is not None:
-            self.load = self.load + checked_forces(nodal_forces, (model.mesh.node_count, 3))
+        self._weight = model.weight_force
+        self._nodal_forces = self._checked_nodal_forces(nodal_forces)
         self._grasp_forces = self._checked_grasp_forces(grasp_forces)
         self.equations: Equations = model.equations(self.grasps if self.path else ())
         self._known: tuple[float, tuple] | None = None
 
     def load_at(self, instant: float) -> np.ndarray:
         """Return nodal loads [N] at a time."""
+        load = self._weight.copy()
+        if self._nodal_forces is not None:
+            load += self._between(self._nodal_forces, instant)
         if self._grasp_forces is None:
-            return self.load
-        load = self.load.copy()
+            return load
         for number, grasp in enumerate(self.grasps):
-            force = [np.interp(instant, self.times, self._grasp_forces[:, number, axis])
-                     for axis in range(3)]
+            force = self._between(self._grasp_forces[:, number], instant)
             load[grasp.nodes] += grasp.weights[:, None] * force
         return load
 
@@ -68,9 +67,9 @@ class Drive:
         """
         pose = self.path.poses[0] if self.path else None
         force = None if self._grasp_forces is None else self._grasp_forces[0]
-        extra = self.load - self.model.weight_force
+        loads = None if self._nodal_forces is None else self._nodal_forces[0]
         return solve_static(self.model, grasp=self.grasps or None, pose=pose, grasp_force=force,
-                            nodal_forces=extra if extra.any() else None).require()
+                            nodal_forces=loads).require()
 
     def moves(self, state: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
         """Return how held nodes and pinned means have to move to where the path is.
@@ -110,6 +109,24 @@ class Drive:
         if self._known is None or self._known[0] != instant:
             self._known = (instant, self.path.at(instant))
         return self._known[1]
+
+    def _between(self, values: np.ndarray, instant: float) -> np.ndarray:
+        """Return values of the frames, shape [frames or 1, ...], linearly at a time."""
+        if len(values) == 1:
+            return values[0]
+        after = int(np.clip(np.searchsorted(self.times, instant), 1, len(self.times) - 1))
+        first, last = self.times[after - 1:after + 1]
+        part = np.clip((instant - first) / (last - first), 0.0, 1.0)
+        return (1.0 - part) * values[after - 1] + part * values[after]
+
+    def _checked_nodal_forces(self, forces: np.ndarray | None) -> np.ndarray | None:
+        if forces is None:
+            return None
+        shape = (self.model.mesh.node_count, 3)
+        forces = np.asarray(forces, float)
+        if forces.ndim < 3:
+            return checked_forces(forces, shape)[None]
+        return checked_forces(forces, (len(self.times), *shape))
 
     def _checked_grasp_forces(self, forces: np.ndarray | None) -> np.ndarray | None:
         if forces is None:

@@ -49,7 +49,8 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
             between frames a cubic spline that starts at rest.
         grasp_forces: Force [N] of the gripper instead, shape [frames, 3] ([frames, g, 3]),
             linear between frames.
-        nodal_forces: Constant loads [N], shape [node_count, 3], besides gravity.
+        nodal_forces: Loads [N] besides gravity: constant, shape [node_count, 3], or linear between
+            frames, shape [frames, node_count, 3].
         times: Of the frames [s], ascending, shape [frames].
         start: State at the first time: ``equilibrium`` under the loads and pose of that time,
             ``rest`` (undeformed), a static result, displacements, or the last state of another

@@ -225,6 +225,12 @@ class BranchModel:
             for point, (node, _) in zip(self.point_masses, self._added, strict=True))
         return other
 
+    def with_point_masses(self, masses: Iterable[PointMass]) -> "BranchModel":
+        """Return the model with more masses hanging on it."""
+        other = copy.copy(self)
+        other.point_masses, other._mass = (*self.point_masses, *masses), {}
+        return other
+
     def without_point_masses(self) -> "BranchModel":
         """Return the model with nothing hanging on it."""
         if not self.point_masses:

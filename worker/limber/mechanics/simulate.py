@@ -8,18 +8,24 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import ConvergenceError, InputError
-from limber.mechanics.dynamics import NewmarkSettings, simulate_dynamics
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics.dynamics import NewmarkSettings
 from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import BranchModel
+from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.pull import Motion, Pull, dynamic_motion, static_motion
 from limber.mechanics.rest_shape import unloaded_rest_shape
-from limber.mechanics.statics import StaticResult, follow_poses, solve_static
+from limber.mechanics.statics import solve_static
 from limber.mechanics.strain import strain_state
 from limber.progress import SILENT, Progress
 from limber.store import Branch, write_atomically
 
 STAGE = "simulate"
+
+Point = tuple[float, float, float]
+PointLoad = tuple[float, float, float, float, float, float]
+PlacedMass = tuple[float, float, float, float]
 
 _PROBE = 1e-6
 # Of the way from base to grasp: how far a branch is bent when nothing is asked for.
@@ -43,13 +49,32 @@ class SimulateSettings(BaseModel):
         None, description="Pull the grasp with a force X Y Z [N] instead of moving it.")
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Grasp at X Y Z [m] instead of where the mesh marks it.")
-    grasp_radius: float = Field(0.01, gt=0, description="Radius of that grasp [m].")
+    grasp_radius: float = Field(
+        0.01, gt=0, description="Radius [m] of that grasp, and of the patches of --hold-at and "
+        "--load-at.")
     grasp_mode: Literal["clamped", "pinned"] = Field(
         "clamped", description="clamped: position and rotation held; pinned: position alone.")
+    hold_at: tuple[Point, ...] = Field(
+        (), description="A second gripper or a tie holds the branch at X Y Z [m], as the grasp "
+        "mode says; may be given several times.", json_schema_extra={"metavar": "X Y Z"})
+    load_at: tuple[PointLoad, ...] = Field(
+        (), description="At X Y Z [m] a force FX FY FZ [N] grows with the pull; may be given "
+        "several times.", json_schema_extra={"metavar": "X Y Z FX FY FZ"})
+    mass_at: tuple[PlacedMass, ...] = Field(
+        (), description="At X Y Z [m] hang KG (a fruit, a flower), from the start; may be given "
+        "several times.", json_schema_extra={"metavar": "X Y Z KG"})
     duration: float = Field(1.0, gt=0, description="Time of the pull [s].")
     hold: float = Field(0.5, ge=0, description="Time at the end of the pull [s] (dynamic).")
     frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames a second.")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
+    newmark_beta: float = Field(
+        0.25, gt=0, le=0.5, description="Newmark's beta (dynamic).")
+    newmark_gamma: float = Field(
+        0.5, ge=0.5, le=1, description="Newmark's gamma (dynamic); over 0.5 damps fast vibration.")
+    lumped_mass: bool = Field(
+        False, description="Mass at the nodes alone instead of the consistent mass matrix.")
+    young: float | None = Field(
+        None, gt=0, description="Young's modulus everywhere [Pa] instead of the mesh's.")
     gravity: bool = Field(True, description="Gravity, as it acts on the scan.")
     rest_shape: bool = Field(
         True, description="Take the scan as already sagging under gravity.")
@@ -83,29 +108,30 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     if not force and stored and stored.result.get("converged") and branch.is_current(
             STAGE, settings, reads=["mesh.vtu"]):
         return stored.result
-    model, grasp = _prepared(branch, settings, progress.part(0.0, 0.2), warn)
-    run = _static if settings.kind == "static" else _dynamic
-    driven = settings
-    if settings.move is None and settings.turn is None and settings.grasp_force is None:
-        driven = settings.model_copy(update={"grasp_force": bending_force(model, grasp)})
-    motion = run(model, grasp, driven, progress.part(0.2, 0.9))
-    for message in motion["warnings"]:
+    pull = _pull(branch, settings, progress.part(0.0, 0.2), warn)
+    ahead = progress.part(0.2, 0.9)
+    if settings.kind == "static":
+        motion = static_motion(pull, ahead)
+    else:
+        motion = dynamic_motion(pull, NewmarkSettings(
+            settings.newmark_beta, settings.newmark_gamma, max_step=settings.step), ahead)
+    for message in motion.warnings:
         warn(message)
     with branch.stage(STAGE, settings, reads=["mesh.vtu"]) as stage:
-        result = _write(stage, model, settings, motion)
+        result = _write(stage, pull.model, settings, motion)
         stage.result.update(result)
     progress(1.0, "done")
-    if not motion["converged"]:
+    if not motion.converged:
         raise ConvergenceError(
-            f"The branch could not follow: {motion['message']}",
+            f"The branch could not follow: {motion.message}",
             f"{result['frame_count']} frames up to the last good state are in"
             f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
             "Pull less far, or check units and Young's modulus.")
     return result
 
 
-def bending_force(model: BranchModel, grasp: Grasp) -> tuple[float, float, float]:
-    """Return the force [N] across the branch that would bend it by a fifth of its reach.
+def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
+    """Return the force across the branch that would bend it by a fifth of its reach [N], shape [3].
 
     By the stiffness at rest. A motion along a line invented in space would buckle or stretch a
     branch, whose length is fixed; under a force it goes where it can.
@@ -116,135 +142,106 @@ def bending_force(model: BranchModel, grasp: Grasp) -> tuple[float, float, float
     weightless = model.with_parameters(gravity=(0.0, 0.0, 0.0))
     probe = solve_static(weightless, grasp=grasp, grasp_force=_PROBE * across).require()
     moved = np.linalg.norm(grasp.weights @ probe.displacement[grasp.nodes])
-    x, y, z = _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
-    return float(x), float(y), float(z)
+    return _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
 
 
-def _prepared(branch: Branch, settings: SimulateSettings, progress: Progress,
-              warn: Any) -> tuple[BranchModel, Grasp]:
+def _pull(branch: Branch, settings: SimulateSettings, progress: Progress, warn: Any) -> Pull:
     progress(0.0, "preparing")
+    model, scan = _model(branch, settings, progress, warn)
+
+    def patch(point: Point, mode: str) -> Grasp:
+        # Places are given on the scan; the model's rest shape is that before it sagged.
+        nodes = Grasp.at(scan, np.array(point), settings.grasp_radius, mode).nodes
+        return Grasp.of_nodes(model.mesh, nodes, mode)
+
+    grasp = (Grasp.from_mesh(model.mesh, settings.grasp_mode) if settings.grasp_point is None
+             else patch(settings.grasp_point, settings.grasp_mode))
+    holds = tuple(patch(point, settings.grasp_mode) for point in settings.hold_at)
+    loads = np.zeros_like(model.mesh.nodes)
+    for place in settings.load_at:
+        loaded = patch(place[:3], "pinned")
+        loads[loaded.nodes] += loaded.weights[:, None] * np.array(place[3:])
+    follows_pose = settings.move is not None or settings.turn is not None
+    force = np.array(settings.grasp_force or (0.0, 0.0, 0.0))
+    if not (follows_pose or settings.grasp_force is not None or settings.load_at):
+        force = bending_force(model, grasp)
+    start = solve_static(model, grasp=[grasp, *holds],
+                         grasp_force=np.zeros((1 + len(holds), 3))).require()
+    times, part = _ramp(settings)
+    return Pull(model, start, grasp, follows_pose, holds, _way(start.pose[0], settings, part),
+                force, loads, times, part)
+
+
+def _model(branch: Branch, settings: SimulateSettings, progress: Progress,
+           warn: Any) -> tuple[BranchModel, TetMesh]:
+    """Return the model at its rest shape with all that hangs on it, and the mesh as scanned."""
     model = BranchModel.from_branch(
-        branch, material=settings.material, gravity=branch.gravity if settings.gravity else None,
+        branch, young=settings.young, material=settings.material,
+        gravity=branch.gravity if settings.gravity else None, lumped_mass=settings.lumped_mass,
         damping=RayleighDamping(settings.damping_mass, settings.damping_stiffness))
+    scan = model.mesh
     if settings.gravity and settings.rest_shape:
         try:
-            mesh = unloaded_rest_shape(model, progress=progress)
-            model = model.with_rest_nodes(mesh.nodes)
+            model = model.with_rest_nodes(unloaded_rest_shape(model, progress=progress).nodes)
         except ConvergenceError as error:
             warn(f"{error} The scan is taken as the shape without load.")
-    if settings.grasp_point is None:
-        return model, Grasp.from_mesh(model.mesh, settings.grasp_mode)
-    return model, Grasp.at(model.mesh, np.array(settings.grasp_point), settings.grasp_radius,
-                           settings.grasp_mode)
+    added = [PointMass(tuple(model.mesh.nodes[Grasp.at(scan, np.array(place[:3]), 0.0).nodes[0]]),
+                       place[3]) for place in settings.mass_at]
+    return model.with_point_masses(added), scan
 
 
-def _ramp(settings: SimulateSettings, hold: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and the part of the pull at each, starting and ending at rest."""
+def _ramp(settings: SimulateSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Return times [s] and the part of the pull at each.
+
+    In motion it starts and ends at rest, and the end is held.
+    """
+    hold = settings.hold if settings.kind == "dynamic" else 0.0
     count = max(2, round((settings.duration + hold) * settings.frame_rate) + 1)
     times = np.arange(count) / settings.frame_rate
     part = np.clip(times / settings.duration, 0, 1)
-    return times, part**2 * (3 - 2 * part)
+    return times, part**2 * (3 - 2 * part) if settings.kind == "dynamic" else part
 
 
-def _way(start: StaticResult, grasp: Grasp, settings: SimulateSettings,
-         part: np.ndarray) -> np.ndarray:
+def _way(pose: np.ndarray, settings: SimulateSettings, part: np.ndarray) -> np.ndarray:
     """Return the grasp's poses [frames, 6], from where the loaded branch holds it."""
-    pose = start.pose if start.pose is not None else grasp.rest_pose
-    change = np.concatenate([settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
-    if settings.grasp_mode == "pinned":
-        pose = np.concatenate([pose[:3], np.zeros(3)])
-    return _composed(pose, part[:, None] * change)
-
-
-def _composed(pose: np.ndarray, changes: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
+    changes = part[:, None] * np.concatenate([settings.move or (0.0, 0, 0),
+                                              settings.turn or (0.0, 0, 0)])
+    if settings.grasp_mode == "pinned":
+        pose = np.concatenate([pose[:3], np.zeros(3)])
     turned = Rotation.from_rotvec(changes[:, 3:]) * Rotation.from_rotvec(pose[3:])
     return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])
 
 
-def _static(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
-            progress: Progress) -> dict[str, Any]:
-    times, _ = _ramp(settings, 0.0)
-    part = np.clip(times / settings.duration, 0, 1)
-    start = solve_static(model, grasp=grasp, grasp_force=np.zeros(3)).require()
-    if settings.grasp_force is None:
-        results = follow_poses(model, grasp, _way(start, grasp, settings, part), start=start,
-                               progress=progress)
-    else:
-        results = [start]
-        for number, share in enumerate(part[1:]):
-            progress(number / len(part), "following the force")
-            results.append(solve_static(
-                model, grasp=grasp, grasp_force=share * np.array(settings.grasp_force),
-                start=results[-1]))
-            if not results[-1].converged:
-                break
-    good = [r for r in results if r.converged]
-    bad = next((r for r in results if not r.converged), None)
-    if bad is not None:
-        good = results[:results.index(bad)] + [bad]
-    force = [result.reaction_force for result in good]
-    if settings.grasp_force is not None:
-        force = part[:len(good), None] * np.array(settings.grasp_force)
-    return {
-        "times": times[:len(good)], "displacement": np.array([r.displacement for r in good]),
-        "strain_energy": [r.strain_energy for r in good], "kinetic_energy": [0.0] * len(good),
-        "grasp_force": np.array(force), "grasp_torque": [r.reaction_torque for r in good],
-        "min_det_f": [r.min_det_f for r in good], "converged": bad is None,
-        "message": "" if bad is None else bad.message, "warnings": good[-1].warnings}
-
-
-def _dynamic(model: BranchModel, grasp: Grasp, settings: SimulateSettings,
-             progress: Progress) -> dict[str, Any]:
-    times, part = _ramp(settings, settings.hold)
-    newmark = NewmarkSettings(max_step=settings.step)
-    start = solve_static(model, grasp=grasp, grasp_force=np.zeros(3)).require()
-    if settings.grasp_force is None:
-        found = simulate_dynamics(model, grasp=grasp, poses=_way(start, grasp, settings, part),
-                                  times=times, start=start, settings=newmark, progress=progress)
-        force = found.reaction_force
-    else:
-        pull = part[:, None] * np.array(settings.grasp_force)
-        found = simulate_dynamics(model, grasp=grasp, grasp_forces=pull, times=times, start=start,
-                                  settings=newmark, progress=progress)
-        force = pull[:len(found.times)]
-    return {
-        "times": found.times, "displacement": found.displacement,
-        "strain_energy": found.strain_energy, "kinetic_energy": found.kinetic_energy,
-        "grasp_force": force, "grasp_torque": found.reaction_torque,
-        "min_det_f": found.min_det_f, "converged": found.converged, "message": found.message,
-        "warnings": found.warnings}
-
-
 def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
-           motion: dict[str, Any]) -> dict[str, Any]:
-    displacement = motion["displacement"]
+           motion: Motion) -> dict[str, Any]:
+    displacement = motion.displacement
     nodes = surface_nodes(model.mesh)
     write_pc2(stage.path(f"frames/{settings.name}.pc2"),
               model.mesh.nodes[nodes] + displacement[:, nodes])
     if settings.vtu:
         folder = stage.path(f"frames/{settings.name}/{settings.name}.pvd").parent
-        write_pvd_series(folder, settings.name, model, motion["times"], displacement)
+        write_pvd_series(folder, settings.name, model, motion.times, displacement)
     tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
                              axis=1).argmax())
     strain, stress = _largest(model, displacement)
-    rows = {name: np.asarray(motion[name]).tolist()
-            for name in ("times", "strain_energy", "kinetic_energy", "grasp_force",
-                         "grasp_torque", "min_det_f")}
     frames = {
         "frame_count": len(displacement), "rate": settings.frame_rate,
-        "times_s": rows["times"], "energies_j": rows["strain_energy"],
-        "kinetic_energies_j": rows["kinetic_energy"], "grasp_forces_n": rows["grasp_force"],
-        "grasp_torques_nm": rows["grasp_torque"], "min_det_f": rows["min_det_f"],
-        "converged": motion["converged"],
+        "times_s": motion.times.tolist(), "energies_j": motion.strain_energy.tolist(),
+        "kinetic_energies_j": motion.kinetic_energy.tolist(),
+        "grasp_forces_n": motion.grasp_force.tolist(),
+        "grasp_torques_nm": motion.grasp_torque.tolist(),
+        "hold_forces_n": motion.hold_forces.tolist(), "min_det_f": motion.min_det_f.tolist(),
+        "converged": motion.converged,
         "largest_principal_strains": strain, "largest_principal_stresses_pa": stress}
     write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
     return {
-        "converged": motion["converged"], "frame_count": len(displacement),
-        "energy_j": rows["strain_energy"][-1], "grasp_force_n": rows["grasp_force"][-1],
+        "converged": motion.converged, "frame_count": len(displacement),
+        "energy_j": float(motion.strain_energy[-1]),
+        "grasp_force_n": motion.grasp_force[-1].tolist(),
         "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
-        "min_det_f": float(np.min(rows["min_det_f"]))}
+        "min_det_f": float(motion.min_det_f.min())}
 
 
 def _largest(model: BranchModel, displacement: np.ndarray) -> tuple[list[float], list[float]]:
