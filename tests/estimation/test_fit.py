@@ -8,13 +8,14 @@ import pytest
 from limber.benchmarks.paper_branches import measured
 from limber.errors import Cancelled, InputError
 from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.identifiability import identifiability, require_scale, tie_unresolved
+from limber.estimation.identifiability import identifiability, link_unresolved, require_scale
 from limber.estimation.objective import Objective, Stopped
 from limber.estimation.optimise import gauss_newton, nelder_mead
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.preparation import require_scale_in_principle
 from limber.estimation.recording import Observations
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.uncertainty import uncertainty
 from limber.progress import Progress
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=8)
@@ -123,13 +124,29 @@ def test_gravity_makes_the_scale_known(small_bench, noisy):
     require_scale(judged)
 
 
-def test_what_lies_beyond_the_grasp_is_tied(at_truth, objective):
-    """A modulus that nothing depends on is tied to its neighbour, and the tie is explained."""
+def test_what_lies_beyond_the_grasp_is_linked(at_truth, objective):
+    """A modulus that nothing depends on is said to be like its neighbour, within a factor of ten:
+    its interval is as wide, the neighbour's stays as it was.
+    """
     blind = replace(at_truth, jacobian=at_truth.jacobian * [1.0, 1.0, 1.0, 1e-4])
-    space, messages = tie_unresolved(blind, objective.space)
-    assert space.groups == (0, 1, 2, 2)
-    assert "E4" in messages[0] and "tied to E3" in messages[0]
-    assert tie_unresolved(at_truth, objective.space)[1] == []
+    space, messages = link_unresolved(blind, objective.space)
+    assert space.links == ((3, 2),) and space.size == 4
+    assert "E4" in messages[0] and "of E3" in messages[0]
+    linked = objective.with_space(space)
+    residual = np.r_[blind.residual, space.link_rows() @ blind.free]
+    whole = replace(blind, residual=residual,
+                    jacobian=np.vstack([blind.jacobian, space.link_rows()]))
+    found = uncertainty(whole, linked)
+    width = np.log(found.young_interval[:, 1] / found.young_interval[:, 0]) / 2
+    assert width[3] == pytest.approx(1.97 * LINK_DEVIATION, rel=0.2)
+    three = replace(at_truth, jacobian=at_truth.jacobian[:, :3])
+    alone = np.linalg.inv(three.jacobian.T @ three.jacobian)[2, 2]**0.5
+    assert found.covariance[2, 2]**0.5 == pytest.approx(
+        alone * found.variance_factor**0.5 * found.repetition**0.5, rel=0.02)
+    # Judged again, the link's own row does not count as data.
+    again, _ = link_unresolved(whole, space)
+    assert again.links == space.links
+    assert link_unresolved(at_truth, objective.space)[1] == []
 
 
 def test_a_pull_of_another_branch_shows(small_bench, noisy):

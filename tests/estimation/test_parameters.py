@@ -21,7 +21,7 @@ def test_pack_and_unpack_undo_each_other():
 
 def test_ties_share_one_modulus():
     """Members of a group get one value, the geometric mean at the start; names say so."""
-    space = ParameterSpace.separate(VALUES).tied((0, 1, 1, 7))
+    space = ParameterSpace(VALUES, (0, 1, 1, 2))
     assert space.groups == (0, 1, 1, 2) and space.size == 3
     assert space.names == ["E1", "E2=E3", "E4"]
     young = space.unpack(space.pack(VALUES)).young

@@ -15,8 +15,8 @@ from limber.estimation.grasping import grasp_on
 from limber.estimation.identifiability import (
     Identifiability,
     identifiability,
+    link_unresolved,
     require_scale,
-    tie_unresolved,
 )
 from limber.estimation.model_error import (
     ModelError,
@@ -57,7 +57,7 @@ class Estimate:
 
     Attributes:
         fit: The optimiser's end.
-        objective: What it minimised; its parameter space tells what was tied.
+        objective: What it minimised; its parameter space tells what was linked.
         uncertainty: Covariance and intervals.
         identifiability: Judged before the fit.
         warnings: What the user should know.
@@ -184,9 +184,8 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
-    space, ties = tie_unresolved(first, objective.space)
-    for message in ties:
-        tell(message)
+    # Whether it is worth a word shows at the end: a modulus is told better where it is soft.
+    space, _ = link_unresolved(first, objective.space)
     objective = objective.with_space(space)
     try:
         fit, objective = _fitted(objective, space.pack(start), settings, tell, reduction)
@@ -194,7 +193,10 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     except Stopped:
         fit, stopped = _best_so_far(objective), True
     if settings.method == "gauss-newton" and not stopped:
-        fit, objective = _tied_at_the_end(fit, objective, settings, tell)
+        fit, objective = _linked_at_the_end(fit, objective, settings, tell)
+    elif not stopped:
+        for message in link_unresolved(fit.evaluation, objective.space)[1]:
+            tell(message)
     found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged,
                      stopped=stopped)
     _judge(found, tell)
@@ -299,25 +301,28 @@ def _best_so_far(objective: Objective) -> Fit:
     return Fit(evaluation, False, "stopped")
 
 
-def _tied_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
-                     tell: Callable[[str], None]) -> tuple[Fit, Objective]:
-    """Tie what turns out to be unresolved at the solution, and fit again, until all is resolved."""
-    start = fit.evaluation.free
-    while True:
-        space, ties = tie_unresolved(fit.evaluation, objective.space)
-        if not ties:
-            return fit, objective
-        for message in ties:
-            tell(message)
-        # What was unresolved has run anywhere: the scale of all of them together has not.
-        young = objective.space.unpack(start).young
-        level = np.exp(np.mean(np.log(young))) * np.ones(len(young))
-        values = replace(objective.space.unpack(start), young=level)
+def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
+                       tell: Callable[[str], None]) -> tuple[Fit, Objective]:
+    """Link what the data leave open at the solution, and only that, and fit again if it differs.
+
+    Links are only added after the first time: what comes and goes would never end.
+    """
+    messages: list[str] = []
+    for attempt in range(objective.space.group_count):
+        space, messages = link_unresolved(fit.evaluation, objective.space)
+        if attempt:
+            kept = objective.space.links
+            space = space.linked(kept + tuple(link for link in space.links if link[0] not in {
+                group for group, _ in kept}))
+        if set(space.links) == set(objective.space.links):
+            break
+        start = fit.evaluation.free
         objective = objective.with_space(space)
-        start = space.pack(scaled_start(objective, values))
         fit = gauss_newton(objective, start, robust=settings.robust,
                            evaluation_limit=settings.evaluations)
-        start = fit.evaluation.free
+    for message in messages:
+        tell(message)
+    return fit, objective
 
 
 def _judge(found: Estimate, tell: Callable[[str], None]) -> None:
@@ -432,7 +437,8 @@ def _details(found: Estimate, subject: Subject, pulls: list[Any]) -> dict[str, A
     details: dict[str, Any] = {
         "control_points_m": subject.control_points,
         "fractions": _fractions(subject), "parameters": objective.space.names,
-        "groups": objective.space.groups, "covariance": found.uncertainty.covariance,
+        "groups": objective.space.groups, "links": objective.space.links,
+        "covariance": found.uncertainty.covariance,
         "correlation": found.uncertainty.correlation,
         "singular_values": found.identifiability.singular_values,
         "deviations_before_fit": found.identifiability.deviations,

@@ -21,7 +21,7 @@ def report_figures(branch: Branch, estimate: dict[str, Any]) -> Iterator[tuple[A
     yield (young_along_branch(estimate), _interval_caption(estimate))
     yield (what_the_pulls_tell(estimate),
            "How well the pulls tell each parameter: standard deviation before the fit (at its "
-           "start) and after it. Over 1 a modulus is tied to its neighbour.")
+           "start) and after it. Over 0.5 a modulus is linked to its neighbour.")
     yield (loss_over_evaluations(estimate),
            "Loss against forward simulations; the line is the best so far.")
     for pull in estimate["pulls"]:

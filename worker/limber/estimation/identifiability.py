@@ -8,8 +8,8 @@ from limber.errors import InputError
 from limber.estimation.objective import Evaluation
 from limber.estimation.parameters import ParameterSpace
 
-TIE_DEVIATION = 1.0
-"""A modulus whose logarithm would have a larger standard deviation is tied to its neighbour."""
+UNRESOLVED_DEVIATION = 0.5
+"""A modulus whose logarithm has a larger standard deviation is linked to its neighbour."""
 SCALE_DEVIATION = 0.7
 """The data must give the scale of all moduli together better than this (in its logarithm)."""
 
@@ -62,34 +62,41 @@ def require_scale(found: Identifiability) -> None:
         "--motion dynamic).")
 
 
-def tie_unresolved(evaluation: Evaluation, space: ParameterSpace,
-                   ) -> tuple[ParameterSpace, list[str]]:
-    """Let control points share a modulus until the data resolve all that are left.
+def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
+                    ) -> tuple[ParameterSpace, list[str]]:
+    """Link control points that the data leave open to a neighbour, as neighbours on branches are.
 
-    The worst-determined modulus joins the neighbour whose sensitivity is most like its own.
-    Returns the space, with a sentence for each tie.
+    A link is no equality: the two may differ by a factor of ten, and the interval says so. With
+    an equality the modulus of the neighbour would be wrong as well, and both be thought sure.
+    The worst-determined modulus is linked to the neighbour that is known better, until all others
+    are resolved. Returns the space, with a sentence for each link.
+
+    Args:
+        evaluation: With derivatives; its last rows are those of the space's links.
     """
+    rows = evaluation.jacobian[:len(evaluation.jacobian) - len(space.links)]
+    links: list[tuple[int, int]] = []
     messages = []
-    columns, others = np.split(evaluation.jacobian.copy(), [space.group_count], axis=1)
-    while space.group_count > 1:
-        deviations = _deviations(np.hstack([columns, others]))[:space.group_count]
-        worst = int(np.argmax(deviations))
-        if deviations[worst] <= TIE_DEVIATION:
+    while len(links) < space.group_count - 1:
+        own = space.linked(tuple(links)).link_rows()
+        deviations = _deviations(np.vstack([rows, own]))[:space.group_count]
+        open_ones = deviations.copy()
+        open_ones[[group for group, _ in links]] = 0.0
+        worst = int(np.argmax(open_ones))
+        if open_ones[worst] <= UNRESOLVED_DEVIATION:
             break
-        last = space.group_count - 1
-        partner = worst - 1 if worst == last or (
-            worst > 0 and deviations[worst - 1] >= deviations[worst + 1]) else worst + 1
-        low, high = sorted((worst, partner))
-        names = space.names
+        beside = [k for k in (worst - 1, worst + 1)
+                  if 0 <= k < space.group_count and (k, worst) not in links]
+        if not beside:
+            break
+        partner = min(beside, key=lambda k: deviations[k])
+        links.append((worst, partner))
         messages.append(
-            f"{names[worst]} cannot be told from these pulls (its logarithm only to within "
-            f"{deviations[worst]:.1f}); it was tied to {names[partner]}. Pull at a point farther "
-            "out, or let gravity bend the tip, to tell them apart.")
-        # A common change of two logarithms acts as the sum of both.
-        columns[:, low] += columns[:, high]
-        columns = np.delete(columns, high, axis=1)
-        space = space.tied(tuple(low if group == high else group for group in space.groups))
-    return space, messages
+            f"{space.names[worst]} cannot be told well from these pulls (its logarithm only to "
+            f"within {min(deviations[worst], 99.0):.1f}): that it lies within a factor of ten of "
+            f"{space.names[partner]} was added. Pull at a point farther out, drive by the pose, "
+            "or let gravity bend the tip, to tell it.")
+    return space.linked(tuple(links)), messages
 
 
 def _deviations(jacobian: np.ndarray) -> np.ndarray:

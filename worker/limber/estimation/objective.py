@@ -8,6 +8,7 @@ import numpy as np
 from limber.errors import Cancelled
 from limber.estimation.alignment import Frames
 from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.input_force import Response
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.recording import PullEntry
 from limber.progress import SILENT, Progress
@@ -60,6 +61,7 @@ class Evaluation:
         jacobian: Its derivative to the free vector, shape [r, p], or None.
         loss: The paper's J: sum of squared distances of all seen points [m^2].
         pulls: The simulated pulls.
+        unknown_count: Unknowns of measured input forces that were eliminated from it.
     """
 
     free: np.ndarray
@@ -67,6 +69,7 @@ class Evaluation:
     jacobian: np.ndarray | None
     loss: float
     pulls: tuple[Simulated, ...]
+    unknown_count: int = 0
 
     @property
     def objective(self) -> float:
@@ -93,6 +96,7 @@ class Objective:
         self._expected = expected_count
         self._last: Evaluation | None = None
         self._whitening = [_whitening(forward.frames) for forward in forwards]
+        self._spans: dict[int, tuple[Response, np.ndarray, np.ndarray]] = {}
 
     def with_space(self, space: ParameterSpace) -> "Objective":
         """Return an objective on other parameters that goes on with the same log and count."""
@@ -157,33 +161,94 @@ class Objective:
                            np.sqrt(np.mean(self._forces(index, simulated)**2, axis=1))))
         return scored
 
+    def follow_forces(self, evaluation: Evaluation) -> bool:
+        """Move measured input forces to where an evaluation says they were.
+
+        Returns whether there are any; what was evaluated before is then of another linearisation.
+        """
+        moved = False
+        for index, simulated in enumerate(evaluation.pulls):
+            response = getattr(self.forwards[index], "response", None)
+            if response is None:
+                continue
+            columns, triangle = self._span(index, response)
+            residual, _ = self._rows(index, simulated)
+            change = -np.linalg.lstsq(triangle, columns.T @ residual, rcond=1e-9)[0]
+            self.forwards[index].shift_force(change)
+            moved = True
+        if moved:
+            self.forget()
+        return moved
+
     def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
-        residual, jacobian, loss = [], [], 0.0
+        residuals, jacobians, loss, unknown_count = [], [], 0.0, 0
         for index, simulated in enumerate(pulls):
             frames = self.forwards[index].frames
-            points, seen = self._points(index, simulated), _seen(frames)
-            residual.append(points[seen].ravel())
-            loss += float(np.sum((simulated.positions - frames.positions)[seen]**2))
-            if simulated.d_positions is not None:
-                slope = np.einsum("fmij,fmjp->fmip", self._whitening[index], simulated.d_positions)
-                jacobian.append(slope[seen].reshape(-1, slope.shape[-1]))
-            if self.forwards[index].uses_force:
-                measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
-                residual.append(self._forces(index, simulated)[measured].ravel())
-                if simulated.d_forces is not None:
-                    slope = simulated.d_forces / self._sigma(index)[:, None, None]
-                    jacobian.append(slope[measured].reshape(-1, slope.shape[-1]))
-            if simulated.torques is not None:
-                measured = np.isfinite(frames.wrenches[:, 3:]).all(axis=1)
-                off = simulated.torques - frames.wrenches[:, 3:]
-                sigma = self._torque_sigma(index)[:, None]
-                residual.append((off / sigma)[measured].ravel())
-                if simulated.d_torques is not None:
-                    slope = simulated.d_torques / sigma[..., None]
-                    jacobian.append(slope[measured].reshape(-1, slope.shape[-1]))
-        return Evaluation(free, np.concatenate(residual),
-                          self._on_free(np.vstack(jacobian)) if jacobian else None,
-                          loss, tuple(pulls))
+            loss += float(np.sum((simulated.positions - frames.positions)[_seen(frames)]**2))
+            residual, jacobian = self._rows(index, simulated)
+            response = getattr(self.forwards[index], "response", None)
+            if response is not None:
+                # What another force would explain is no sign of the moduli.
+                columns, _ = self._span(index, response)
+                residual = residual - columns @ (columns.T @ residual)
+                if jacobian is not None:
+                    jacobian = jacobian - columns @ (columns.T @ jacobian)
+                unknown_count += columns.shape[1]
+            residuals.append(residual)
+            if jacobian is not None:
+                jacobians.append(jacobian)
+        links = self.space.link_rows()
+        residuals.append(links @ free)
+        jacobian = np.vstack([self._on_free(np.vstack(jacobians)), links]) if jacobians else None
+        return Evaluation(free, np.concatenate(residuals), jacobian, loss, tuple(pulls),
+                          unknown_count)
+
+    def _rows(self, index: int, simulated: Simulated) -> tuple[np.ndarray, np.ndarray | None]:
+        """Standardised residuals of a pull's points, forces and torques, and their derivative."""
+        seen, force, torque = self._known(index, simulated.torques is not None)
+        residual = [self._points(index, simulated)[seen].ravel()]
+        if force is not None:
+            residual.append(self._forces(index, simulated)[force].ravel())
+        if torque is not None:
+            off = simulated.torques - self.forwards[index].frames.wrenches[:, 3:]
+            residual.append((off / self._torque_sigma(index)[:, None])[torque].ravel())
+        if simulated.d_positions is None:
+            return np.concatenate(residual), None
+        return np.concatenate(residual), self._standardised_slopes(
+            index, simulated.d_positions, simulated.d_forces, simulated.d_torques)
+
+    def _standardised_slopes(self, index: int, points: np.ndarray, forces: np.ndarray,
+                             torques: np.ndarray | None) -> np.ndarray:
+        seen, force, torque = self._known(index, torques is not None)
+        slope = np.einsum("fmij,fmjp->fmip", self._whitening[index], points)
+        rows = [slope[seen].reshape(-1, slope.shape[-1])]
+        if force is not None:
+            slope = forces / self._sigma(index)[:, None, None]
+            rows.append(slope[force].reshape(-1, slope.shape[-1]))
+        if torque is not None:
+            slope = torques / self._torque_sigma(index)[:, None, None]
+            rows.append(slope[torque].reshape(-1, slope.shape[-1]))
+        return np.vstack(rows)
+
+    def _known(self, index: int, has_torque: bool,
+               ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+        """Which points, forces and torques were measured; None: they are not compared."""
+        forward = self.forwards[index]
+        measured = np.isfinite(forward.frames.wrenches)
+        return (_seen(forward.frames),
+                measured[:, :3].all(axis=1) if forward.uses_force else None,
+                measured[:, 3:].all(axis=1) if has_torque else None)
+
+    def _span(self, index: int, response: Response) -> tuple[np.ndarray, np.ndarray]:
+        """Orthonormal columns of all that a pull's input force can change, and their triangle."""
+        known = self._spans.get(index)
+        if known is None or known[0] is not response:
+            wrenches = response.wrenches
+            columns = self._standardised_slopes(
+                index, response.points, wrenches[:, :3],
+                wrenches[:, 3:] if wrenches.shape[1] == 6 else None)
+            known = self._spans[index] = (response, *np.linalg.qr(columns))
+        return known[1], known[2]
 
     def _on_free(self, jacobian: np.ndarray) -> np.ndarray:
         count = len(self.space.groups)
@@ -223,6 +288,8 @@ def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float,
     simulated = forward.simulate(objective.space.unpack(free), (), False)
     if simulated is None:
         return np.inf, np.inf
+    if hasattr(forward, "under_readings"):
+        simulated = forward.under_readings(simulated)
     off = (simulated.positions - forward.frames.positions)[_seen(forward.frames)]
     force = simulated.forces - forward.frames.wrenches[:, :3]
     force = force[np.isfinite(force).all(axis=1)]

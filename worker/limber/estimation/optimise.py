@@ -3,13 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import OptimizeResult, least_squares, minimize
 
 from limber.errors import WorkError
 from limber.estimation.objective import FAILED_OBJECTIVE, Evaluation, Objective
 
 FIRST_STEP = 1.5
 """Longest first step of Gauss-Newton in the space of log E."""
+FORCE_ROUNDS = 6
+"""How often the course of a measured input force is linearised anew at most."""
+FORCE_SETTLED = 0.1
+"""Change of a fit, in standard deviations, below which the course is left where it is."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +69,26 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     phases = [("linear", 0.02), ("soft_l1", tolerance)] if robust else [("linear", tolerance)]
     if robust and is_near:
         phases = phases[1:]
-    moved = start - shift
-    for loss, ending in phases:
-        found = least_squares(
+    def minimised(moved: np.ndarray, loss: str, ending: float) -> OptimizeResult:
+        return least_squares(
             residual, moved, jacobian, bounds=(lower - shift, upper - shift), method="trf",
             loss=loss, f_scale=3.0, ftol=ending, xtol=1e-6, gtol=1e-12,
             max_nfev=evaluation_limit)
+
+    moved = start - shift
+    for loss, ending in phases:
+        found = minimised(moved, loss, ending)
         moved = found.x
+    for _ in range(FORCE_ROUNDS):
+        # Measured input forces are known better now, and so is what they do to the points.
+        if not objective.follow_forces(_required(objective, moved + shift)):
+            break
+        before = _required(objective, moved + shift)
+        found = minimised(moved, *phases[-1])
+        away = before.jacobian @ (found.x - moved)
+        moved = found.x
+        if np.linalg.norm(away) < FORCE_SETTLED:
+            break
     return Fit(_required(objective, found.x + shift), found.status > 0, str(found.message))
 
 

@@ -1,6 +1,6 @@
 """A slow pull, simulated frame by frame as a chain of equilibria, with exact derivatives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,7 +8,8 @@ from limber.errors import InputError, WorkError
 from limber.estimation.alignment import Frames
 from limber.estimation.grasping import grasp_on, pose_on
 from limber.estimation.gripper_path import force_for_travel
-from limber.estimation.key_frames import key_frames, smoothed, travel
+from limber.estimation.input_force import Course, Response, compliance, course_of, nodal_loads
+from limber.estimation.key_frames import key_frames, travel
 from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.estimation.points import point_operator
@@ -61,7 +62,9 @@ class QuasiStaticForward:
         if self.drive == "force" and measured.sum() < 2:
             raise InputError(f"{name}: a force-driven simulation without measured force.",
                              "Nothing would pull.", "Use --drive pose, or record the force.")
-        self.uses_force = self.drive == "pose" and bool(measured.any())
+        if self.drive == "force" and entry.grasp.mode == "clamped":
+            _require_torque(name, entry, frames)
+        self.uses_force = bool(measured.any())
         self.weights = weights
         self.rest_points = np.asarray(rest_points, float)
         self.entry = entry
@@ -73,27 +76,24 @@ class QuasiStaticForward:
         self.set_key_count(key_count)
 
     def set_key_count(self, count: int) -> None:
-        """Simulate at most ``count`` frames from now on."""
+        """Simulate at most ``count`` frames from now on; more where the force asks for it."""
         frames = self.frames
+        self._course: Course | None = None
+        self.response: Response | None = None
         if self.drive == "pose":
-            along = travel(frames.poses)
-        else:
-            # A noisy force is not a path; time orders the frames. One that does not change is one
-            # state.
-            force = frames.wrenches[:, :3]
-            along = frames.times - frames.times[0]
-            along = np.zeros(len(frames)) if np.array_equal(force, force[:1] + 0 * force
-                                                            ) else along
-        self.keys, self.spread = key_frames(along, count)
-        self._memory: list[_Memory | None] = [None] * len(self.keys)
-        self._values: Values | None = None
-        self._hints: list[np.ndarray] | None = None
-        if self.drive == "pose":
+            self.keys, self.spread = key_frames(travel(frames.poses), count)
             self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
                             for pose in frames.poses[self.keys]]
         else:
-            self._drives = list(smoothed(frames.times, frames.wrenches[:, :3],
-                                         frames.times[self.keys]))
+            components = 6 if self.uses_torque else 3
+            self._course = course_of(frames, self._wrench_sigma(components), count, components)
+            self.keys, self.spread = self._course.keys, self._course.spread
+            self._measured = self._course.values
+            self._drives = list(self._measured)
+            self._loads = [self._loads_at(key) for key in self.keys]
+        self._memory: list[_Memory | None] = [None] * len(self.keys)
+        self._values: Values | None = None
+        self._hints: list[np.ndarray] | None = None
 
     @property
     def key_count(self) -> int:
@@ -129,16 +129,18 @@ class QuasiStaticForward:
             memory = self._memory[key]
             same = memory is not None and _equal(self._values, values)
             hint = None if self._hints is None else self._hints[key]
-            result = memory.result if same else self._solved(model, drive, memory, jump, before,
-                                                             hint)
+            result = memory.result if same else self._solved(
+                model, self._load(key, drive), memory, jump, before, hint)
             if result is None:
                 return None
             before = result.displacement
             # An old derivative still foretells most of a small change.
             slope = None if memory is None else memory.slope
             points[key] = self.rest_points + self._observed(before)
-            forces[key] = result.reaction_force if self.drive == "pose" else drive
-            if with_torque:
+            forces[key] = result.reaction_force if self.drive == "pose" else drive[:3]
+            if with_torque and self.drive == "force":
+                torques[key] = drive[3:]
+            elif with_torque:
                 # About the recorded grasp point, which the patch's centre lies beside.
                 arm = drive[:3] - self.frames.poses[self.keys[key], :3]
                 torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
@@ -146,12 +148,67 @@ class QuasiStaticForward:
                 slope, d_forces[key] = self._slopes(model, values, extra, result)
                 for column in range(count):
                     d_points[key, ..., column] = self._observed(slope[..., column])
-                if with_torque:
+                if with_torque and self.drive == "force":
+                    d_torques[key] = 0.0
+                elif with_torque:
                     d_torques[key] = self._torque_slopes(model, values, extra, result, slope,
                                                          self.frames.poses[self.keys[key], :3])
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
+        if sensitivities and self.response is None and self.has_force_unknowns:
+            self.response = self._response(model)
         return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques)
+
+    @property
+    def has_force_unknowns(self) -> bool:
+        """Whether a measured force, with its errors, drives."""
+        return self._course is not None and not self._course.exact
+
+    def shift_force(self, change: np.ndarray) -> None:
+        """Move the course of the force by what a fit says of it; linearise anew from there on.
+
+        Args:
+            change: Of the unknowns, in the order of the response's columns, shape [L].
+        """
+        steps = change.reshape(len(self.keys), -1)
+        self._drives = [drive + step for drive, step in zip(self._drives, steps, strict=True)]
+        self._hints = [memory.displacement + np.tensordot(step, moved, axes=1)
+                       for memory, step, moved in zip(self._memory, steps, self._compliances,
+                                                      strict=True)]
+        self._values, self.response = None, None
+
+    def under_readings(self, simulated: Simulated) -> Simulated:
+        """Foretell a pull from its force's readings alone, without what its points say of it."""
+        if not self.has_force_unknowns or self.response is None:
+            return simulated
+        change = (self._measured - np.array(self._drives)).ravel()
+        return replace(simulated, positions=simulated.positions + self.response.points @ change,
+                       forces=np.full_like(simulated.forces, np.nan))
+
+    def _response(self, model: BranchModel) -> Response:
+        self._compliances = [compliance(model, memory.displacement, loads) for memory, loads in
+                             zip(self._memory, self._loads, strict=True)]
+        components = len(self._loads[0])
+        at_keys = np.array([[self._observed(moved) for moved in each]
+                            for each in self._compliances])
+        points = np.einsum("fk,kcmi->fmikc", self.spread, at_keys)
+        wrenches = np.einsum("fk,cd->fckd", self.spread, np.eye(components))
+        count = len(self.keys) * components
+        return Response(points.reshape(*points.shape[:3], count),
+                        wrenches.reshape(len(self.spread), components, count))
+
+    def _loads_at(self, frame: int) -> np.ndarray:
+        return nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[frame],
+                           self._model.mesh.nodes, 6 if self.uses_torque else 3)
+
+    def _load(self, key: int, drive: np.ndarray) -> np.ndarray:
+        """What a key frame is solved for: a pose, or nodal forces."""
+        return drive if self.drive == "pose" else np.tensordot(drive, self._loads[key], axes=1)
+
+    def _wrench_sigma(self, components: int) -> np.ndarray:
+        sensor = self.entry.sensor
+        each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
+        return np.array(each, float) / np.sqrt(np.maximum(self.frames.wrench_counts, 1))[:, None]
 
     def hint(self, displacements: list[np.ndarray]) -> None:
         """Start the next simulation from these displacements [m] of the key frames."""
@@ -190,24 +247,30 @@ class QuasiStaticForward:
         model, worst = self.model_with(values), 0.0
         for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
             middle = (first + second) // 2
-            if middle in (first, second) or self.drive != "pose":
+            if middle in (first, second):
                 continue
             start = self._memory[int(np.flatnonzero(self.keys == first)[0])]
-            drive = pose_on(self.grasp, self.entry.grasp, self.frames.poses[middle])
-            result = self._solve(model, drive, start.displacement)
+            result = self._solve(model, self._load_between(middle), start.displacement)
             if result is not None:
                 exact = self.rest_points + self._observed(result.displacement)
                 off = np.linalg.norm(exact - known.positions[middle], axis=1)
                 worst = max(worst, float(off.max()))
         return worst
 
+    def _load_between(self, frame: int) -> np.ndarray:
+        if self.drive == "pose":
+            return pose_on(self.grasp, self.entry.grasp, self.frames.poses[frame])
+        return np.tensordot(self.spread[frame] @ np.array(self._drives), self._loads_at(frame),
+                            axes=1)
+
     def _observed(self, displacement: np.ndarray) -> np.ndarray:
         return (self._operator @ displacement.ravel()).reshape(-1, 3)
 
     def _solve(self, model: BranchModel, drive: np.ndarray, start: np.ndarray | None,
                ) -> StaticResult | None:
-        loads = {"pose": drive} if self.drive == "pose" else {"grasp_force": drive}
-        result = solve_static(model, grasp=self.grasp, start=start, settings=SETTINGS, **loads)
+        loads = ({"grasp": self.grasp, "pose": drive} if self.drive == "pose"
+                 else {"nodal_forces": drive})
+        result = solve_static(model, start=start, settings=SETTINGS, **loads)
         return result if result.converged else None
 
     def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
@@ -257,12 +320,26 @@ class QuasiStaticForward:
 
 
 def uses_torque(entry: PullEntry, frames: Frames) -> bool:
-    """Whether the gripper's torque is an observation: a clamped grasp, and a sensor that says how
-    well it measures torque.
+    """Whether the gripper's torque counts: a clamped grasp, and a sensor that says how well it
+    measures torque. Driven by pose it is an observation, driven by force it acts as well.
     """
-    return (entry.drive == "pose" and entry.grasp.mode == "clamped"
-            and entry.sensor.torque_sigma_nm is not None
+    return (entry.grasp.mode == "clamped" and entry.sensor.torque_sigma_nm is not None
             and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
+
+
+def _require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
+    """A clamped gripper also turns the branch: its force alone is not what drives.
+
+    Raises:
+        InputError: its torque was not measured.
+    """
+    if not uses_torque(entry, frames):
+        raise InputError(
+            f"{name}: the force of a clamped gripper is to drive, but its torque is not known.",
+            "A gripper that holds the branch's rotation bends it by a torque as well; a simulation "
+            "with the force alone would be of another pull.",
+            "Use --drive pose; or record the torque, with torque_sigma_nm under [sensor] of "
+            "pull.toml; or set mode = \"pinned\" under [grasp] if the branch could turn.")
 
 
 def _equal(one: Values | None, other: Values) -> bool:

@@ -26,7 +26,8 @@ def scaled_start(objective: Objective, values: Values) -> Values:
 
 
 def _force_ratio(forward: Forward, values: Values) -> float | None:
-    usable = forward.uses_force and hasattr(forward, "force_ratio")
+    usable = (forward.uses_force and forward.entry.drive == "pose"
+              and hasattr(forward, "force_ratio"))
     return forward.force_ratio(values) if usable else None
 
 

@@ -43,8 +43,10 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     average out: the covariance grows by how many frames repeat each other. What the mesh gets
     wrong is not in it (:mod:`limber.estimation.model_error`).
     """
-    jacobian, residual = evaluation.jacobian, evaluation.residual
-    freedom = max(len(residual) - jacobian.shape[1], 1)
+    # Links are no measurements: neither do they tell the noise, nor does its scale act on them.
+    count = len(evaluation.residual) - len(objective.space.links)
+    jacobian, residual = evaluation.jacobian[:count], evaluation.residual[:count]
+    freedom = max(len(residual) - jacobian.shape[1] - evaluation.unknown_count, 1)
     # Huber's proposal: residuals beyond 3 deviations count as 3. Where they are many they are no
     # outliers, but a model that does not fit.
     limit = 3 * _scale(residual)
@@ -55,10 +57,12 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
         # Their stated error lasts from frame to frame: that residuals scatter less is no sign
         # that it is smaller.
         factor = max(factor, 1.0)
+    repetition = repeated(objective.standardised(evaluation))
+    jacobian = np.vstack([jacobian / np.sqrt(max(factor * repetition, 1e-300)),
+                          evaluation.jacobian[count:]])
     _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
     spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
-    repetition = repeated(objective.standardised(evaluation))
-    covariance = factor * repetition * spread @ spread.T
+    covariance = spread @ spread.T
     deviation = np.sqrt(np.diag(covariance))
     width = stats.t.ppf(0.5 + level / 2, freedom) * deviation
     space = objective.space
