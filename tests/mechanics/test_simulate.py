@@ -273,3 +273,31 @@ def test_holds_that_overlap_are_refused(folder, capsys):
     assert call(["simulate", str(folder), "--hold-at", "0", "0", "0.2", "--move", "0.01", "0", "0",
                  "--progress", "none"]) == 2
     assert "overlap" in "".join(capsys.readouterr())
+
+
+def test_a_way_from_a_table_is_followed(folder, tmp_path):
+    """A table that moves as --move does, from elsewhere and with its own clock: the same end."""
+    way = tmp_path / "robot.csv"
+    part = np.linspace(0, 1, 7)
+    rows = [f"{5 + p:.9f},{1 + 20 * p:.9f},{2:.1f},{3 - p:.9f}" for p in part]
+    way.write_text("\n".join(["t_s,x_mm,y_mm,z_mm", *rows]) + "\n")
+    common = ["--kind", "static", "--grasp-mode", "pinned", "--no-gravity", "--frame-rate", "6",
+              "--progress", "none"]
+    assert call(["simulate", str(folder), "--along", str(way), "--name", "way", *common]) == 0
+    assert call(["simulate", str(folder), "--move", "0.02", "0", "-0.001", *common]) == 0
+    assert _frames(folder, "way")["energies_j"] == pytest.approx(
+        _frames(folder)["energies_j"], rel=1e-6)
+    assert call(["simulate", str(folder), "--along", str(way), "--move", "0.02", "0", "0",
+                 *common]) == 2
+
+
+def test_a_plan_takes_the_duration(folder, tmp_path):
+    """A table without times, as plans are, is spread over --duration."""
+    way = tmp_path / "plan.csv"
+    way.write_text("s_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n0,0,0,0.2,0,0,0\n"
+                   "0.01,0.01,0,0.2,0,0.05,0\n0.02,0.02,0,0.199,0,0.1,0\n")
+    assert call(["simulate", str(folder), "--along", str(way), "--duration", "0.5",
+                 "--hold", "0.1", "--progress", "none"]) == 0
+    frames = _frames(folder)
+    assert frames["times_s"][-1] == pytest.approx(0.6)
+    assert frames["energies_j"][-1] > frames["energies_j"][10] > 0

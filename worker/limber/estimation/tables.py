@@ -111,6 +111,12 @@ def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -
                      f"Known are {', '.join(units)}.", "Convert the column, or correct its name.")
 
 
+def time_column(table: Table) -> int | None:
+    """Return which column holds times, if any."""
+    return next((k for k, title in enumerate(table.titles)
+                 if re.fullmatch(_TIME_NAME, split_title(title).plain)), None)
+
+
 def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
     """Return the table with its time stamps [s] in order; other columns keep their titles.
 
@@ -118,10 +124,9 @@ def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
         InputError: no column of times (and no ``rate_hz``), or too few or too disordered rows.
     """
     titles = [split_title(title) for title in table.titles]
-    found = [k for k, title in enumerate(titles) if re.fullmatch(_TIME_NAME, title.plain)]
+    at = time_column(table)
     warnings = list(table.warnings)
-    if found:
-        at = found[0]
+    if at is not None:
         times = table.values[:, at] * scale_of(titles[at], TIME_UNITS_S, "s", table.path)
         if titles[at].unit is None:
             warnings += _suspicious_clock(table.path, times)

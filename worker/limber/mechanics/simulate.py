@@ -14,6 +14,7 @@ from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.pull import Motion, Pull, dynamic_motion, static_motion
 from limber.mechanics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics import solve_static
@@ -86,9 +87,14 @@ class SimulateSettings(BaseModel):
 
 
 def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
-             force: bool = False, progress: Progress = SILENT,
+             along: PoseTable | None = None, force: bool = False, progress: Progress = SILENT,
              warn: Any = lambda _message: None) -> dict[str, Any]:
     """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+
+    Args:
+        branch_folder: With a mesh.
+        settings: How to pull.
+        along: The grasp's way instead of a motion of the settings.
 
     Returns:
         The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
@@ -100,15 +106,17 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     """
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
-    if settings.grasp_force is not None and (settings.move or settings.turn):
-        raise InputError("Both a motion and a force were given.",
-                         "A grasp follows a pose or takes a force.",
-                         "Give --move and --turn, or --grasp-force.")
+    moves = settings.move is not None or settings.turn is not None
+    if (settings.grasp_force is not None) + moves + (along is not None) > 1:
+        raise InputError("More than one of a motion, a way and a force were given.",
+                         "A grasp follows poses or takes a force.",
+                         "Give --move and --turn, --along, or --grasp-force.")
+    digests = {"along": along.digest()} if along else {}
     stored = branch.manifest.stages.get(STAGE)
     if not force and stored and stored.result.get("converged") and branch.is_current(
-            STAGE, settings, reads=["mesh.vtu"]):
+            STAGE, settings, reads=["mesh.vtu"], digests=digests):
         return stored.result
-    pull = _pull(branch, settings, progress.part(0.0, 0.2), warn)
+    pull = _pull(branch, settings, along, progress.part(0.0, 0.2), warn)
     ahead = progress.part(0.2, 0.9)
     if settings.kind == "static":
         motion = static_motion(pull, ahead)
@@ -117,7 +125,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
             settings.newmark_beta, settings.newmark_gamma, max_step=settings.step), ahead)
     for message in motion.warnings:
         warn(message)
-    with branch.stage(STAGE, settings, reads=["mesh.vtu"]) as stage:
+    with branch.stage(STAGE, settings, reads=["mesh.vtu"], digests=digests) as stage:
         result = _write(stage, pull.model, settings, motion)
         stage.result.update(result)
     progress(1.0, "done")
@@ -145,7 +153,8 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
     return _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
 
 
-def _pull(branch: Branch, settings: SimulateSettings, progress: Progress, warn: Any) -> Pull:
+def _pull(branch: Branch, settings: SimulateSettings, along: PoseTable | None,
+          progress: Progress, warn: Any) -> Pull:
     progress(0.0, "preparing")
     model, scan = _model(branch, settings, progress, warn)
 
@@ -161,15 +170,17 @@ def _pull(branch: Branch, settings: SimulateSettings, progress: Progress, warn: 
     for place in settings.load_at:
         loaded = patch(place[:3], "pinned")
         loads[loaded.nodes] += loaded.weights[:, None] * np.array(place[3:])
-    follows_pose = settings.move is not None or settings.turn is not None
+    follows_pose = along is not None or settings.move is not None or settings.turn is not None
     force = np.array(settings.grasp_force or (0.0, 0.0, 0.0))
     if not (follows_pose or settings.grasp_force is not None or settings.load_at):
         force = bending_force(model, grasp)
     start = solve_static(model, grasp=[grasp, *holds],
                          grasp_force=np.zeros((1 + len(holds), 3))).require()
-    times, part = _ramp(settings)
-    return Pull(model, start, grasp, follows_pose, holds, _way(start.pose[0], settings, part),
-                force, loads, times, part)
+    times, part = _ramp(settings, along.duration if along else settings.duration)
+    changes = along.changes(times) if along else part[:, None] * np.concatenate(
+        [settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
+    return Pull(model, start, grasp, follows_pose, holds,
+                _way(start.pose[0], changes, settings.grasp_mode), force, loads, times, part)
 
 
 def _model(branch: Branch, settings: SimulateSettings, progress: Progress,
@@ -190,25 +201,23 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress,
     return model.with_point_masses(added), scan
 
 
-def _ramp(settings: SimulateSettings) -> tuple[np.ndarray, np.ndarray]:
+def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.ndarray]:
     """Return times [s] and the part of the pull at each.
 
     In motion it starts and ends at rest, and the end is held.
     """
     hold = settings.hold if settings.kind == "dynamic" else 0.0
-    count = max(2, round((settings.duration + hold) * settings.frame_rate) + 1)
+    count = max(2, round((duration + hold) * settings.frame_rate) + 1)
     times = np.arange(count) / settings.frame_rate
-    part = np.clip(times / settings.duration, 0, 1)
+    part = np.clip(times / duration, 0, 1)
     return times, part**2 * (3 - 2 * part) if settings.kind == "dynamic" else part
 
 
-def _way(pose: np.ndarray, settings: SimulateSettings, part: np.ndarray) -> np.ndarray:
+def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
     """Return the grasp's poses [frames, 6], from where the loaded branch holds it."""
     from scipy.spatial.transform import Rotation
 
-    changes = part[:, None] * np.concatenate([settings.move or (0.0, 0, 0),
-                                              settings.turn or (0.0, 0, 0)])
-    if settings.grasp_mode == "pinned":
+    if mode == "pinned":
         pose = np.concatenate([pose[:3], np.zeros(3)])
     turned = Rotation.from_rotvec(changes[:, 3:]) * Rotation.from_rotvec(pose[3:])
     return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])
