@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from limber.errors import InputError
 from limber.geometry.cloud import Cloud
+from limber.geometry.sight import find_sight, flying_pixels
 
 POINT_MINIMUM = 50
 _LARGEST_EXTENT = 60.0  # [m]: taller than that is no plant that anybody scans as a branch
@@ -23,6 +24,15 @@ class PreparationSettings(BaseModel):
         None, description="Lower corner of the part to keep, in the file's coordinates.")
     crop_high: tuple[float, float, float] | None = Field(
         None, description="Upper corner of the part to keep.")
+    camera_at: tuple[float, float, float] | None = Field(
+        None, description="Where the one depth camera stood, in the file's coordinates; else the "
+        "origin, if the cloud looks like an image from there.")
+    flying_angle: float = Field(
+        78.0, ge=0, lt=90, description="Depth camera: a step between neighbouring pixels is no "
+        "surface if that would be seen at more than so many degrees; 0 keeps flying pixels.")
+    flying_speck: int = Field(
+        20, ge=1, description="Depth camera: groups of fewer pixels than that are dropped as "
+        "flying.")
     outlier_ratio: float = Field(
         5.0, ge=0, description="Drop points whose neighbours are so many times as far as is usual "
         "around them; 0 keeps all.")
@@ -51,13 +61,15 @@ class Prepared:
     warnings: list[str] = field(default_factory=list)
 
 
-def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None) -> Prepared:
-    """Crop, convert to metres, recentre, and drop duplicates and outliers.
+def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
+            eye: np.ndarray | None = None) -> Prepared:
+    """Crop, convert to metres, recentre, and drop flying pixels, duplicates and outliers.
 
     Args:
         cloud: As the file has it.
         scale: Metres per unit of the file.
         settings: How.
+        eye: Where the camera stood, if it is known, in the file's coordinates, shape [3].
 
     Raises:
         InputError: too few points, or all of them at one place.
@@ -67,6 +79,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     cloud = _cropped(cloud, settings)
     counts["cropped"] = counts["read"] - len(cloud)
     _enough(cloud, "The cloud")
+    cloud = _without_flying(cloud, scale, settings, eye, counts)
     # Subtracted in float64 before anything else: map coordinates leave no digits to a float32.
     scaled = cloud.points * scale
     origin = np.round(scaled.mean(axis=0), 3)
@@ -114,6 +127,22 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
     return cloud if keep.all() else cloud.subset(keep)
 
 
+def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
+                    eye: np.ndarray | None, counts: dict[str, int]) -> Cloud:
+    """Drop flying pixels, if this is what one depth camera saw."""
+    eye = settings.camera_at if eye is None else eye
+    if settings.flying_angle == 0:
+        return cloud
+    sight = find_sight(cloud.points * scale, None if eye is None else np.array(eye) * scale)
+    if sight is None:
+        return cloud
+    flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
+    counts["flying"] = int(flying.sum())
+    _enough(cloud.subset(~flying), "Without its flying pixels (--flying-angle 0 keeps them) the "
+            "depth camera's cloud")
+    return cloud.subset(~flying)
+
+
 def _enough(cloud: Cloud, what: str) -> None:
     if len(cloud) < POINT_MINIMUM:
         raise InputError(f"{what} has {len(cloud)} points.",
@@ -146,6 +175,10 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
         texts.append(f"The cloud is {extent:.0f} m long: are its units millimetres (--unit mm)?")
     if extent < _SMALLEST_EXTENT:
         texts.append(f"The cloud is {1000 * extent:.1f} mm long: are its units really these?")
+    flying = counts.get("flying", 0)
+    if flying > 0.02 * counts["read"]:
+        texts.append(f"{flying} of {counts['read']} points were dropped as a depth camera's "
+                     "flying pixels (--flying-angle, --flying-speck).")
     lost = counts.get("outliers", 0)
     if lost > 0.1 * len(points):
         texts.append(f"{lost} points were dropped as outliers (--outlier-ratio).")

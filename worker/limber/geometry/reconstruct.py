@@ -94,7 +94,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         warn(text)
 
     with branch.stage("reconstruct", settings, digests=digests) as stage:
-        prepared = prepare(raw, UNIT_METRES[settings.unit], settings)
+        prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=_eye(camera_path))
         for text in prepared.warnings:
             tell(text)
         found = _skeleton(prepared, settings, skeleton_path, progress.part(0.02, 0.55))
@@ -213,6 +213,15 @@ def peak_memory_mb() -> float:
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def _eye(camera_path: Path | None) -> np.ndarray | None:
+    """Where the depth image's camera stood [m], shape [3]."""
+    if camera_path is None:
+        return None
+    from limber.perception.camera import read_camera
+
+    return read_camera(camera_path).origin
 
 
 def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: Path | None,

@@ -1,0 +1,119 @@
+"""A cloud that one depth camera saw, looked at as its image again: where pixels fly.
+
+A depth camera's readings at an edge lie between what is in front and what is behind, or anywhere.
+In space they look like twigs along the line of sight; in the image each differs from the pixels
+beside it by more than a surface can fall within a pixel.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+_BESIDE = 1.6  # pixels up to which pixels are neighbours: the eight around
+_REGULAR = 0.6  # 5 % quantile over median of the distances to the nearest pixel; 0.27 for chance
+_AXIS = np.cos(np.radians(35.0))  # a camera frame's own axis is taken if it points so near
+_WIDEST = np.radians(75.0)  # off the middle of the view: no image is wider
+_NOISE = 3.0  # standard deviations that neighbours may differ by
+_LEAST = 200  # readings under which nothing is told of an image
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A cloud as the image of one camera.
+
+    Attributes:
+        pixels: Position of each point in the image, in pixels, shape [n, 2].
+        depth: Distance along the middle of the view [m], shape [n].
+        pitch: Width of a pixel at depth 1.
+    """
+
+    pixels: np.ndarray
+    depth: np.ndarray
+    pitch: float
+
+
+def find_sight(points: np.ndarray, eye: np.ndarray | None = None) -> Sight | None:
+    """Look at a cloud from its camera's place; None if it is no image from there.
+
+    An image has one point a pixel, and pixels lie evenly. Points that were scanned from all
+    around, thinned or moved elsewhere lie by chance in it.
+
+    Args:
+        points: Positions [m], shape [n, 3], camera and points in one frame.
+        eye: The camera's place [m], shape [3]; None: the origin, if the cloud looks like an image
+            from there. If given, only points too wide apart for one view are refused.
+    """
+    if len(points) < _LEAST:
+        return None
+    offset = points if eye is None else points - eye
+    distance = np.linalg.norm(offset, axis=1)
+    if distance.min() <= 1e-9 * max(float(distance.max()), 1e-300):
+        return None
+    ray = offset / distance[:, None]
+    forward = _forward(ray)
+    if forward is None or (ray @ forward).min() < np.cos(_WIDEST):
+        return None
+    depth = offset @ forward
+    right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    right /= np.linalg.norm(right)
+    image = np.stack([offset @ right, offset @ np.cross(forward, right)], axis=1) / depth[:, None]
+    apart = cKDTree(image).query(image, k=2)[0][:, 1]
+    pitch = float(np.median(apart))
+    if pitch <= 0 or (eye is None and np.quantile(apart, 0.05) < _REGULAR * pitch):
+        return None
+    return Sight(image / pitch, depth, pitch)
+
+
+def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
+    """Find the pixels that hold together with no surface.
+
+    Two pixels hold together if their depths differ by no more than noise, and a surface that is
+    seen at the angle ``grazing``, can make them. Noise is measured, as a stereo camera has it:
+    growing with the square of the depth.
+
+    Args:
+        sight: The image.
+        grazing: Steepest surface that counts, between its normal and the line of sight [deg].
+        speck: Groups of fewer pixels than that fly.
+
+    Returns:
+        True where a pixel flies, shape [n].
+    """
+    depth, count = sight.depth, len(sight.depth)
+    pairs = cKDTree(sight.pixels).query_pairs(_BESIDE, output_type="ndarray")
+    one, other = pairs[:, 0], pairs[:, 1]
+    mean = (depth[one] + depth[other]) / 2
+    step = np.linalg.norm(sight.pixels[one] - sight.pixels[other], axis=1) * sight.pitch * mean
+    allowed = np.tan(np.radians(grazing)) * step + _NOISE * np.sqrt(2) * _noise(
+        depth, one, other) * mean**2
+    held = np.abs(depth[one] - depth[other]) <= allowed
+    graph = sparse.coo_matrix((np.ones(held.sum()), (one[held], other[held])), (count, count))
+    group = connected_components(graph, directed=False)[1]
+    return np.bincount(group)[group] < speck
+
+
+def _noise(depth: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
+    """Noise of depth at depth 1: of pixels against the mean of those around, inside surfaces."""
+    count = len(depth)
+    around = np.bincount(one, minlength=count) + np.bincount(other, minlength=count)
+    total = np.bincount(one, depth[other], count) + np.bincount(other, depth[one], count)
+    inside = around >= 7
+    if inside.sum() < _LEAST // 4:
+        return 0.0
+    off = (depth - total / np.maximum(around, 1))[inside] / depth[inside]**2
+    return float(1.4826 * np.median(np.abs(off - np.median(off))) * np.sqrt(8 / 9))
+
+
+def _forward(ray: np.ndarray) -> np.ndarray | None:
+    """Middle of the view: the axis of the frame that points there, as cameras' frames have it."""
+    middle = ray.mean(axis=0)
+    length = float(np.linalg.norm(middle))
+    if length < 0.3:
+        return None
+    middle /= length
+    axis = np.zeros(3)
+    axis[int(np.argmax(np.abs(middle)))] = np.sign(middle[int(np.argmax(np.abs(middle)))])
+    return axis if middle @ axis > _AXIS else middle
