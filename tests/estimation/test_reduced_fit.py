@@ -8,7 +8,7 @@ import pytest
 from limber.benchmarks.paper_branches import Bench, measured
 from limber.errors import InputError
 from limber.estimation import reduced_fit
-from limber.estimation.estimate import fit_pulls
+from limber.estimation.estimate import estimate, fit_pulls
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.reduced_fit import CorrectedForward, Reduction
 from limber.estimation.settings import EstimateSettings
@@ -131,3 +131,14 @@ def test_pulls_it_cannot_hold_are_refused(thick, noisy):
     pull = replace(noisy, entry=noisy.entry.model_copy(update={"drive": "force"}))
     with pytest.raises(InputError, match="--forward full"):
         Reduction(thick.objective([pull], SETTINGS).forwards)
+
+
+def test_other_control_points_make_another_basis(branch_folder):
+    """Estimated again with other fractions: the basis for the first ones is not taken (it has
+    another number of moduli), and the estimate is near the first where both have a point.
+    """
+    settings = EstimateSettings(forward="reduced", mesh_check=False, key_frames=8)
+    first = estimate(branch_folder, settings)
+    again = estimate(branch_folder, settings.model_copy(update={"fractions": (0.2, 0.5, 0.8)}))
+    assert len(again["young_pa"]) == 3
+    assert again["young_pa"][0] == pytest.approx(first["young_pa"][0], rel=0.1)

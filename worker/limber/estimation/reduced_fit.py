@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.errors import InputError, WorkError
 from limber.estimation.grasping import pose_on
 from limber.estimation.key_frames import key_frames, travel
 from limber.estimation.objective import Objective, Simulated
@@ -185,6 +185,8 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
                 ) -> tuple[Fit, Objective]:
     """Fit on reduced models of the pulls; returns the fit and the objective that it belongs to.
 
+    Where a reduced model does not carry the pulls, the full one fits them, and ``tell`` says so.
+
     Args:
         objective: On the full model.
         start: Free vector.
@@ -204,7 +206,12 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
         reduction.build(objective.space.unpack(free), progress)
     for attempt in range(REBUILD_LIMIT + 1):
         corrected = reduction.objective(objective, objective.space.unpack(free))
-        fit = _settled(corrected, free, optimise, tell)
+        try:
+            fit = _settled(corrected, free, optimise, tell)
+        except WorkError:
+            tell("The reduced model loses the branch at one of the recorded poses; the full model "
+                 "was used instead.")
+            return optimise(objective, free), objective
         objective.forward_count = corrected.forward_count
         free = fit.evaluation.free
         values = objective.space.unpack(free)
@@ -287,9 +294,12 @@ def _coordinates(values: Values, extra: tuple[str, ...]) -> np.ndarray:
 
 
 def _digest(group: list[QuasiStaticForward], digest: str) -> str:
+    """Of what a basis depends on; the weights tell where the control points are."""
     text = " ".join([digest, *(f"{forward.name} {forward.entry.model_dump_json()}"
                                for forward in group)])
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
+    joined = hashlib.sha256(text.encode())
+    joined.update(np.ascontiguousarray(group[0].weights).tobytes())
+    return joined.hexdigest()[:20]
 
 
 def _read(path: Path | None, forward: QuasiStaticForward) -> ReducedModel | None:

@@ -102,7 +102,7 @@ class Basis:
 
 def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int,
                vibration_count: int = 0) -> Basis:
-    """Return a basis of ``size`` columns for the snapshots of one grasp.
+    """Return a basis of ``size`` columns, or as many as the snapshots of one grasp hold.
 
     Args:
         size: Lifts, modes of the states and their tangents, modes of the vibrations.
@@ -110,7 +110,7 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
             the states for the other columns: they are many, and statics does without them.
 
     Raises:
-        InputError: fewer columns than lifts, or more than the snapshots hold.
+        InputError: fewer columns than lifts and vibrations take, or snapshots that hold nothing.
     """
     coordinates = GraspCoordinates(grasp)
     count = coordinates.count
@@ -130,12 +130,13 @@ def make_basis(model: BranchModel, grasp: Grasp, snapshots: Snapshots, size: int
     gram = columns.reshape(len(columns), -1) @ heavy.reshape(len(columns), -1).T
     values, vectors = np.linalg.eigh((gram + gram.T) / 2)
     values, vectors = values[::-1], vectors[:, ::-1]
-    wanted = size - count - vibration_count
     available = int(np.count_nonzero(values > 1e-12 * values[0]))
-    if not 0 < wanted <= available:
+    wanted = min(size - count - vibration_count, available)
+    if wanted <= 0:
         raise InputError(f"A reduced model of {size} coordinates.",
-                         f"{len(snapshots)} snapshots hold only {count + available}.",
-                         "Take more training grasps, or a smaller model.")
+                         f"The grasp takes {count} of them, vibrations {vibration_count}; "
+                         f"{len(snapshots)} snapshots hold {available}.",
+                         "Take more training grasps, or a larger model.")
     modes = np.tensordot(vectors[:, :wanted] / np.sqrt(values[:wanted]), columns, (0, 0))
     own = heavy[:len(rest)].reshape(len(rest), -1) @ modes.reshape(wanted, -1).T
     vibrations = _let_go(grasp, lifts, snapshots.vibrations.astype(float))
