@@ -144,3 +144,24 @@ def test_interrupt_ends_with_130(kind):
     out, _ = process.communicate(timeout=10)
     assert process.returncode == 130
     assert json.loads(out.splitlines()[-1])["status"] == "cancelled"
+
+
+def test_help_names_default_and_range_as_typed():
+    """A switch's default is the switch, a vector's has spaces, a list's commas; bounds are told."""
+    class Ranged(BaseModel):
+        """Settings with every kind of default."""
+
+        samples: int = Field(150, ge=30, le=5000, description="Samples.")
+        upright: bool = Field(True, description="Turn it.")
+        damping: tuple[float, float] = Field((0.5, 0.002), description="Damping [1/s, s].")
+        fractions: tuple[float, ...] = Field((0.2, 0.8), description="Places.")
+
+    @click.command()
+    @cli.settings_options(Ranged)
+    def probe(settings):
+        """Probe."""
+
+    told = " ".join(probe.get_help(click.Context(probe)).split())
+    for text in ("[default: 150; at least 30; at most 5000]", "[default: --upright]",
+                 "[default: 0.5 0.002]", "[default: 0.2,0.8]"):
+        assert text in told

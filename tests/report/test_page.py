@@ -5,7 +5,7 @@ import pytest
 from limber.errors import BranchFolderError, InputError
 from limber.geometry.cylinder_mesh import straight_beam
 from limber.report.page import write_report
-from limber.report.tables import comparison_rows, modulus_rows
+from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
 from limber.store import Branch
 
 
@@ -52,6 +52,24 @@ def test_tables_without_truth_or_numbers():
     estimate = {"young_pa": [2e6, 3e6], "young_interval_pa": [[1e6, 4e6], [None, None]]}
     rows = modulus_rows(estimate, None)
     assert rows == [["control point", "E [MPa]", "95 % interval [MPa]"],
-                    ["1", "2.000", "1.000 to 4.000"], ["2", "3.000", "undetermined"]]
+                    ["1", "2", "1 to 4"], ["2", "3", "undetermined"]]
     plan = {"baseline": {"length_m": 0.5, "peak_force_n": None}, "plan": {"length_m": 0.55}}
     assert comparison_rows(plan)[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
+
+
+def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():
+    """Parts in percent, what was not examined said so; a score that was not measured is a dash."""
+    estimate = {"fractions": [0.25, 0.5], "young_deviation": {
+        "sensor": [0.01, 0.02], "geometry": None, "mesh": [0.005, 0.005], "total": [0.011, 0.021]}}
+    assert deviation_rows(estimate)[1:] == [
+        ["1", "0.25", "1.0 %", "not examined", "0.5 %", "1.1 %"],
+        ["2", "0.5", "2.0 %", "not examined", "0.5 %", "2.1 %"]]
+    assert deviation_rows({"fractions": [0.5]}) == []
+    scores = {"a": {"rms_m": 0.0012, "rms_force_n": 0.034, "relative_distance": 0.021,
+                    "relative_force": 0.04, "in_fit": True},
+              "b": {"rms_m": 0.003, "rms_force_n": None, "relative_distance": 0.1,
+                    "relative_force": None, "in_fit": False}}
+    assert held_out_rows({"held_out": scores})[1:] == [
+        ["a", "1.20", "2.1 %", "0.034", "4.0 %", "the other pulls"],
+        ["b", "3.00", "10.0 %", "-", "-", "this estimate"]]
+    assert held_out_rows({"held_out": {}}) == []

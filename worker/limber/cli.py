@@ -23,6 +23,7 @@ from pydantic import BaseModel, ValidationError
 from limber.errors import InputError, LimberError
 from limber.progress import BarSink, JsonSink, Progress
 from limber.store import plain
+from limber.terminal import result_lines, table_lines
 from limber.version import VERSION
 
 # Command name to what `limber --help` says of it. Modules are imported when they are called:
@@ -88,7 +89,8 @@ def main() -> None:
 class Run:
     """What a command's function gets besides its options.
 
-    ``progress`` to report to, ``say`` to print a line on standard error, ``warn`` for warnings.
+    ``progress`` to report to, ``say`` to print a line on standard error, ``show`` a table there,
+    ``warn`` for warnings.
     """
 
     def __init__(self, progress: Progress, say: Callable[[str], None]):
@@ -101,11 +103,15 @@ class Run:
         self.warnings.append(message)
         self.say(f"warning: {message}")
 
+    def show(self, title: str, rows: list[list[str]]) -> None:
+        """Print a table, its first row the header."""
+        self.say("\n".join([f"\n{title}", *(f"  {line}" for line in table_lines(rows))]))
+
 
 def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.Command]:
     """Make a click command of ``function(run, **options) -> result dict``.
 
-    The docstring's first line is the help text. The result is printed as ``name: value`` lines,
+    The docstring's first line is the help text. The result is printed for a person to read,
     or, with ``--json``, as the last line together with ``command``, ``status``, ``seconds``,
     ``warnings`` and ``error``.
     """
@@ -149,7 +155,7 @@ def checked_settings(model: type[BaseModel], values: dict[str, Any]) -> BaseMode
         return model(**values)
     except ValidationError as error:
         first = error.errors()[0]
-        place = "--" + "-".join(str(part) for part in first["loc"]).replace("_", "-")
+        place = "--" + str(first["loc"][0] if first["loc"] else "settings").replace("_", "-")
         raise InputError(f"{place} {first.get('input')!r}: {first['msg']}.",
                          "It is outside what the stage can work with.",
                          "See the option's help for its range.") from error
@@ -221,8 +227,9 @@ def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], as_json: boo
     if outcome["error"]:
         click.echo(f"error: {outcome['error']}", err=True)
     elif not as_json:
-        for key, value in plain(result).items():
-            click.echo(f"{key}: {value}")
+        # Warnings were said when they came up.
+        for line in result_lines({k: v for k, v in plain(result).items() if k != "warnings"}):
+            click.echo(line)
         click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s")
 
 
@@ -231,7 +238,7 @@ def _option(name: str, field: Any) -> Callable:
     flag = "--" + name.replace("_", "-")
     hidden = field.is_required() or optional
     default = None if hidden else field.get_default(call_default_factory=True)
-    common = {"default": None, "help": _help(field.description, default)}
+    common = {"default": None, "help": _help(name, field, kind, default)}
     if kind is bool:
         return click.option(f"{flag}/--no-{name.replace('_', '-')}", name, **common)
     if typing.get_origin(kind) is Literal:
@@ -264,15 +271,27 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
     return annotation, False
 
 
-def _help(description: str | None, default: Any) -> str:
-    text = description or ""
-    if default is None or default == ():
-        return text
-    if isinstance(default, tuple):
-        # As it is typed: lists of any length with commas, vectors with spaces.
-        between = " " if len(default) == 3 else ","
-        return f"{text}  [default: {between.join(map(_shown, default))}]"
-    return f"{text}  [default: {_shown(default)}]"
+def _help(name: str, field: Any, kind: Any, default: Any) -> str:
+    """A field's description, then its default and range as they are typed."""
+    told = []
+    if default is not None and default != ():
+        if kind is bool:
+            shown = name if default else f"no_{name}"
+            told.append(f"default: --{shown.replace('_', '-')}")
+        elif isinstance(default, tuple):
+            # Lists of any length are typed with commas, vectors with spaces.
+            between = "," if typing.get_args(kind)[-1] is Ellipsis else " "
+            told.append(f"default: {between.join(map(_shown, default))}")
+        else:
+            told.append(f"default: {_shown(default)}")
+    told += _bounds(field)
+    return f"{field.description or ''}  [{'; '.join(told)}]" if told else field.description or ""
+
+
+def _bounds(field: Any) -> list[str]:
+    words = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+    return [f"{word} {_shown(float(limit))}" for key, word in words.items()
+            for part in field.metadata if (limit := getattr(part, key, None)) is not None]
 
 
 def _shown(value: Any) -> str:

@@ -49,7 +49,8 @@ class _Demo:
 @click.argument("cloud", required=False, type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Folder of the results.  [default: out/NAME]")
-@click.option("--unit", type=click.Choice(["m", "cm", "mm"]), help="Unit of the cloud.")
+@click.option("--unit", type=click.Choice(["m", "cm", "mm", "in"]),
+              help="Unit of the cloud.  [default: m]")
 @click.option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
               show_default=True, metavar="A,B,C,D",
               help="True Young's modulus [Pa] at the control points of your CLOUD's pull.")
@@ -110,17 +111,9 @@ def _make_folder(folder: Path) -> None:
 def _show_tables(demo: _Demo) -> None:
     from limber.report.tables import comparison_rows, modulus_rows
 
-    _show("Young's modulus", modulus_rows(demo.results["estimate"], demo.results["virtual-pull"]),
-          demo.run)
-    _show("Paths", comparison_rows(demo.results["plan"]), demo.run)
-
-
-def _show(title: str, rows: list[list[str]], run: Run) -> None:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    run.say(f"\n{title}")
-    for row in rows:
-        run.say("  " + "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths,
-                                                                          strict=True)))
+    demo.run.show("Young's modulus",
+                  modulus_rows(demo.results["estimate"], demo.results["virtual-pull"]))
+    demo.run.show("Paths", comparison_rows(demo.results["plan"]))
 
 
 def _summary(demo: _Demo, branch: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from limber.cli import Run, settings_options, stage_command
 from limber.errors import InputError
 from limber.planning.compare import PlanSettings
 from limber.planning.plan import plan_branch_motion
+from limber.report.tables import comparison_rows
 
 
 @stage_command("plan")
@@ -24,5 +25,7 @@ def command(run: Run, branch_folder: Path, name: str, force: bool, settings: Pla
         raise InputError(f"--name {name!r} cannot name a plan.",
                          "It becomes part of file names, and -baseline is the other path's.",
                          "Use letters, digits, dash, dot and underscore.")
-    return plan_branch_motion(branch_folder, settings, name=name, force=force,
-                              progress=run.progress, warn=run.warn)
+    result = plan_branch_motion(branch_folder, settings, name=name, force=force,
+                                progress=run.progress, warn=run.warn)
+    run.show("Both paths, on the full model", comparison_rows(result))
+    return result

@@ -67,7 +67,9 @@ def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
     flat = {key: (path - origin) @ np.stack([across, up], axis=1) for key, path in paths.items()}
     rest = (field.rest - origin) @ np.stack([across, up], axis=1)
     x, y, energy = _slice(field, origin, across, up, np.concatenate([*flat.values(), rest[None]]))
-    figure = Figure(figsize=(8, 6), layout="constrained")
+    # As high as the slice needs at equal scales: paths are often long and flat.
+    height = 6.2 * float(np.ptp(y) / max(np.ptp(x), 1e-9)) + 1.0
+    figure = Figure(figsize=(8, float(np.clip(height, 2.8, 6.5))), layout="constrained")
     axis = figure.subplots()
     # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
     top = max(1.5 * max(max(plan[key]["energies_j"]) for key in paths), 1e-9)

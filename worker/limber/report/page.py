@@ -14,9 +14,22 @@ import numpy as np
 from limber.errors import InputError
 from limber.progress import SILENT, Progress
 from limber.report import figures
-from limber.report.tables import comparison_rows, modulus_rows
+from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
 from limber.store import Branch
 from limber.version import VERSION
+
+_SOURCE_LABELS = {"file": "made from", "unit": "its unit", "sha256": "its sha256",
+                  "truth": "known truth"}
+_QUALITY_LABELS = {
+    "volume_ratio": "mesh over surface volume",
+    "min_dihedral_deg": "smallest angle between faces [degrees]",
+    "min_radius_ratio": "worst shape of a tetrahedron (1 regular, 0 flat)",
+    "mean_radius_ratio": "mean shape",
+    "elements_across": "elements across the branch",
+    "surface_distance_mean": "mean distance of mesh and surface [local radii]",
+    "surface_distance_max_m": "largest distance of mesh and surface [m]",
+    "fork_distance_mean": "mean distance at forks [local radii]",
+    "fork_distance_max": "largest distance at forks [local radii]"}
 
 
 @dataclass
@@ -71,8 +84,8 @@ def _summary(branch: Branch, picture: Path | None) -> Section:
     result = _reconstruction(branch)
     rows = [["what", "value"]]
     source = branch.manifest.source
-    rows += [[key.replace("_", " "), str(value)] for key, value in source.items()
-             if isinstance(value, str | int | float)]
+    rows += [[_SOURCE_LABELS.get(key, key.replace("_", " ")), str(value)]
+             for key, value in source.items() if isinstance(value, str | int | float)]
     for key, label, form in [
             ("point_count", "points used", "{:,.0f}"), ("branch_count", "branches", "{:.0f}"),
             ("length_m", "centreline, all branches [m]", "{:.3f}"),
@@ -96,6 +109,7 @@ def _scan(branch: Branch) -> Section:
     section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
                                         "it is known, one colour an order.")
     result = _reconstruction(branch)
+    section.text += result.get("warnings") or []
     if result.get("clamped_radius_count"):
         section.text.append(f"{result['clamped_radius_count']} radii were clamped to the cloud's "
                             "scale.")
@@ -110,13 +124,14 @@ def _mesh(branch: Branch) -> Section:
     section.draw(figures.mesh_by_modulus(branch), "The tetrahedral mesh, coloured by Young's "
                                                   "modulus; base in black, grasp patch in red.")
     result = _reconstruction(branch)
-    quality = {key: value for key, value in (result.get("mesh_quality") or {}).items()
-               if isinstance(value, int | float)}
+    quality = result.get("mesh_quality") or {}
     rows = [["what", "value"]]
     for key in ("surface_volume_m3", "mesh_volume_m3"):
         if result.get(key) is not None:
-            rows.append([key.replace("_m3", " [m3]").replace("_", " "), f"{result[key]:.4g}"])
-    rows += [[key.replace("_", " "), f"{value:.4g}"] for key, value in quality.items()]
+            rows.append([key.replace("_m3", " [cm3]").replace("_", " "),
+                         f"{1e6 * result[key]:.4g}"])
+    rows += [[label, f"{quality[key]:.4g}"] for key, label in _QUALITY_LABELS.items()
+             if quality.get(key) is not None]
     if len(rows) > 1:
         section.tables.append(("", rows))
     return section
@@ -153,6 +168,12 @@ def _estimate(branch: Branch) -> Section:
     virtual = _virtual_result(branch)
     section.tables.append(("Estimated against true" if virtual else "Estimated",
                            modulus_rows(estimate, virtual)))
+    for title, rows in [
+            ("What makes it unsure: standard deviations", deviation_rows(estimate)),
+            ("Pulls foretold by a fit that did not see them: RMS errors",
+             held_out_rows(estimate))]:
+        if rows:
+            section.tables.append((title, rows))
     section.text.append(
         f"Method: {estimate['method']}; {estimate['forward_count']} forward simulations; "
         f"loss {estimate['loss_m2']:.3g} m²; "
@@ -231,17 +252,23 @@ def _plan(branch: Branch, name: str) -> Section:
 
 def _provenance(branch: Branch) -> Section:
     section = Section("How it was made")
-    rows = [["stage", "seconds", "finished", "settings"]]
+    rows = [["stage", "finished", "settings"]]
     programs: dict[str, str] = {}
     for key, entry in branch.manifest.stages.items():
-        shown = ", ".join(f"{name} {value}" for name, value in entry.settings.items()
-                          if isinstance(value, str | int | float))
-        rows.append([key, f"{entry.seconds:.1f}", entry.finished, shown])
+        shown = ", ".join(f"{name} {_setting(value)}" for name, value in entry.settings.items()
+                          if value not in (None, []))
+        rows.append([key, entry.finished[:16].replace("T", " "), shown])
         programs |= entry.programs
-    section.tables.append(("Stages", rows))
+    section.tables.append(("Stages (times in UTC)", rows))
     section.tables.append(("Programs", [["program", "version"],
                                         *([name, v] for name, v in sorted(programs.items()))]))
     return section
+
+
+def _setting(value: Any) -> str:
+    if isinstance(value, list):
+        return "(" + ", ".join(map(_setting, value)) + ")"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _reconstruction(branch: Branch) -> dict[str, Any]:

@@ -16,9 +16,9 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
     rows = [[*header, "true E [MPa]", "error"] if truth else header]
     for number, young in enumerate(estimate["young_pa"]):
-        row = [str(number + 1), f"{young / 1e6:.3f}", _interval(estimate, number)]
+        row = [str(number + 1), _mpa(young), _interval(estimate, number)]
         if truth:
-            row += [f"{truth[number] / 1e6:.3f}", f"{100 * (young / truth[number] - 1):+.1f} %"]
+            row += [_mpa(truth[number]), f"{100 * (young / truth[number] - 1):+.1f} %"]
         rows.append(row)
     return rows
 
@@ -39,8 +39,58 @@ def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
+def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return what makes each modulus unsure, as standard deviations in percent.
+
+    Args:
+        estimate: ``young_deviation`` with ``sensor``, ``geometry``, ``mesh`` and ``total``, each
+            [K] of log E or None where that was not examined; ``fractions`` [K].
+    """
+    parts = estimate.get("young_deviation") or {}
+    known = {"sensor": "by sensors", "geometry": "by the scan's shape", "mesh": "by the mesh",
+             "total": "together"}
+    if not any(parts.get(name) for name in known):
+        return []
+    rows = [["control point", "place (0 base, 1 tip)", *known.values()]]
+    for number, place in enumerate(estimate["fractions"]):
+        shares = [f"{100 * parts[name][number]:.1f} %" if parts.get(name) else "not examined"
+                  for name in known]
+        rows.append([str(number + 1), f"{place:g}", *shares])
+    return rows
+
+
+def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return how well each pull is foretold by a fit that did not see it.
+
+    Args:
+        estimate: ``held_out``, pull's name to ``rms_m``, ``rms_force_n``, ``relative_distance``,
+            ``relative_force`` (each None where not measured) and ``in_fit``.
+    """
+    scores = estimate.get("held_out") or {}
+    if not scores:
+        return []
+    rows = [["pull", "points [mm]", "of their travel", "force [N]", "of its peak", "foretold by"]]
+    for name, score in scores.items():
+        rows.append([
+            name, _known(score.get("rms_m"), "{:.2f}", 1e3),
+            _known(score.get("relative_distance"), "{:.1f} %", 100),
+            _known(score.get("rms_force_n"), "{:.3g}"),
+            _known(score.get("relative_force"), "{:.1f} %", 100),
+            "the other pulls" if score.get("in_fit", True) else "this estimate"])
+    return rows
+
+
+def _mpa(value: float) -> str:
+    """Four digits [MPa], the unit of the column."""
+    return f"{float(f'{value / 1e6:.4g}'):,.10g}"
+
+
+def _known(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "-" if value is None else form.format(scale * value)
+
+
 def _interval(estimate: Mapping[str, Any], number: int) -> str:
     interval = (estimate.get("young_interval_pa") or {number: None})[number]
     if not interval or None in interval:
         return "undetermined"
-    return f"{interval[0] / 1e6:.3f} to {interval[1] / 1e6:.3f}"
+    return f"{_mpa(interval[0])} to {_mpa(interval[1])}"
