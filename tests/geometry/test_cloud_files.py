@@ -92,8 +92,8 @@ def test_units_become_metres(tmp_path):
     ("a.xyz", b"# only a comment\n", "no lines"),
     ("a.xyz", b"1 2 3\n4 5\n", "line 2 has 2 values"),
     ("a.xyz", b"1 2 3\n4 five 6\n", "line 2: 'five' is not a number"),
-    ("a.xyz", b"1 2 3\n4 nan 6\n", "not finite"),
-    ("a.csv", b"x,y,w\n1,2,3\n", "not a number"),
+    ("a.xyz", b"nan 2 3\n4 nan 6\n", "finite"),
+    ("a.csv", b"x,y,w\n1,2,3\n", "z are missing"),
     ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\n"
               b"property float y\nproperty float z\nend_header\n1234", "cannot be read"),
     ("a.pcd", b"nonsense", "cannot be read"),
@@ -106,6 +106,35 @@ def test_bad_files_are_named(tmp_path, name, content, complaint):
     path.write_bytes(content)
     with pytest.raises(InputError, match=complaint):
         read_points(path)
+
+
+@pytest.mark.parametrize(("name", "content"), [
+    ("a.csv", "x;y;z\n1,5;2,0;3,25\n4;5;6,5\n"), ("a.txt", "x\ty\tz\n1,5\t2,0\t3,25\n4\t5\t6,5\n"),
+    ("a.xyz", "1,5 2,0 3,25\n4,0 5,0 6,5\n"), ("a.csv", "x, y, z\n1.5, 2, 3.25\n4, 5, 6.5\n"),
+    ("a.csv", "Easting,Northing,Height\n1.5,2,3.25\n4,5,6.5\n"),
+    ("a.csv", "x [m],y [m],z [m]\n1.5,2,3.25\n4,5,6.5\n"),
+    ("a.csv", '"Points:0","Points:1","Points:2"\n"1.5","2","3.25"\n"4","5","6.5"\n'),
+    ("a.csv", "x,y,z,\n1.5,2,3.25,\n4,5,6.5,\n"), ("a.pts", "2\n1.5 2 3.25\n4 5 6.5\n"),
+    ("a.csv", "id,z,y,x\n0,3.25,2,1.5\n1,6.5,5,4\n"),
+])
+def test_text_as_programs_write_it(tmp_path, name, content):
+    """Decimal commas, headers with units or other names, quotes, closing separators, counts."""
+    for coding in ("utf-8", "utf-8-sig", "utf-16"):
+        (tmp_path / name).write_bytes(content.encode(coding))
+        np.testing.assert_array_equal(
+            read_points(tmp_path / name).points, [[1.5, 2, 3.25], [4, 5, 6.5]])
+
+
+def test_points_that_are_no_numbers_are_left_away_and_counted(tmp_path):
+    """Drivers of depth cameras write NaN where a pixel saw nothing: no reason to refuse."""
+    points = POINTS.copy()
+    points[::7] = np.nan
+    points[1, 2] = np.inf
+    np.save(tmp_path / "a.npy", points)
+    cloud = read_points(tmp_path / "a.npy")
+    good = np.isfinite(points).all(axis=1)
+    np.testing.assert_array_equal(cloud.points, points[good])
+    assert cloud.not_finite == (~good).sum()
 
 
 def test_missing_file_and_folder(tmp_path):

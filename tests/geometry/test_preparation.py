@@ -5,6 +5,7 @@ import pytest
 
 from limber.errors import InputError
 from limber.geometry.cloud import Cloud
+from limber.geometry.generated import generate_branch
 from limber.geometry.preparation import PreparationSettings, prepare
 
 RNG = np.random.default_rng(0)
@@ -57,3 +58,54 @@ def test_millimetres_taken_for_metres_are_noticed():
     rod = _rod()
     rod[:2, 2] = 0, 1
     assert "1000 m long" in prepare(Cloud(rod * 1000), 1.0).warnings[0]
+
+
+def _plane(count: int, side: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-side / 2, side / 2, (count, 2)),
+                            rng.normal(0, 0.002, count)])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_ground_and_walls_are_cut_out(turned):
+    """A branch on the ground or before a wall is the branch; the user may keep the sheet."""
+    branch = generate_branch(71, length=0.6).cloud.points
+    plane = _plane(2 * len(branch), 1.0, 71)
+    if turned:
+        plane = plane[:, [0, 2, 1]] + [0.0, 0.3, 0.3]
+    both = Cloud(np.vstack([branch, plane]))
+    prepared = prepare(both, 1.0)
+    assert prepared.counts["sheets"] > 0.99 * len(plane)
+    assert len(prepared.cloud) > 0.97 * len(branch)
+    assert any("flat sheet" in text for text in prepared.warnings)
+    assert len(prepare(both, 1.0, PreparationSettings(keep_sheets=True)).cloud) == len(both)
+
+
+def test_branches_are_no_sheets():
+    """Stout, one-sided, noisy, sparse and flat-grown plants lose nothing."""
+    for spec in ({"radius_root": 0.04, "length": 0.3}, {"view": "one-sided", "radius_root": 0.03},
+                 {"noise": 0.003}, {"point_spacing": 0.006}, {"fork_count": 8}):
+        cloud = generate_branch(72, **spec).cloud
+        assert prepare(cloud, 1.0).counts["sheets"] == 0, spec
+        flat = cloud.points * [1.0, 0.05, 1.0]  # as a trained fruit tree is
+        assert prepare(Cloud(flat), 1.0).counts["sheets"] == 0, spec
+
+
+def test_lost_digits_are_told():
+    """Map coordinates in single precision are refused; coarse rounding is told."""
+    points = generate_branch(73).cloud.points
+    far = points + [500_000.0, 4.6e6, 120.0]
+    assert len(prepare(Cloud(far), 1.0).cloud) == len(points)
+    with pytest.raises(InputError, match=r"steps of 0\.5"):
+        prepare(Cloud(far.astype(np.float32).astype(float)), 1.0)
+    near = (points + [500.0, 4600.0, 12.0]).astype(np.float32).astype(float)
+    assert not prepare(Cloud(near), 1.0).warnings
+    assert "rounded to 5 mm" in " ".join(prepare(Cloud(np.round(points / 5e-3) * 5e-3),
+                                                 1.0).warnings)
+
+
+def test_a_line_is_no_branch():
+    """Points without any thickness are refused before they reach the solver."""
+    line = np.linspace(0, 1, 500)[:, None] * [0.3, 0.2, 1.0]
+    with pytest.raises(InputError, match="straight line"):
+        prepare(Cloud(line), 1.0)

@@ -14,21 +14,24 @@ class Cloud:
         points: Positions, shape [n, 3]; metres once they are in a branch folder.
         attributes: Name to array, shape [n] or [n, k]: ``normal`` [n, 3], ``color`` [n, 3] in
             0..255, and whatever scalars the file had.
+        not_finite: Points of the file that were left away, since they are no numbers.
     """
 
     points: np.ndarray
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
+    not_finite: int = 0
 
     def __len__(self) -> int:
         return len(self.points)
 
     def subset(self, chosen: np.ndarray) -> "Cloud":
         """Return the points at indices, or where a mask is true, with their attributes."""
-        return Cloud(self.points[chosen], {k: v[chosen] for k, v in self.attributes.items()})
+        return Cloud(self.points[chosen], {k: v[chosen] for k, v in self.attributes.items()},
+                     self.not_finite)
 
     def with_points(self, points: np.ndarray) -> "Cloud":
         """Return the cloud with other positions, attributes kept."""
-        return Cloud(points, self.attributes)
+        return Cloud(points, self.attributes, self.not_finite)
 
     def write_ply(self, path: Path, *, comment: str = "unit: m") -> None:
         """Write a binary PLY file: positions as double, attributes in their own types."""

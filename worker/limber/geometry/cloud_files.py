@@ -3,14 +3,15 @@
 All give coordinates as the file has them, as float64, and keep normals, colours and scalars.
 """
 
-import io
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from limber.errors import InputError, MissingDependencyError
 from limber.geometry.cloud import Cloud
+from limber.geometry.cloud_text import read_table
 
 _AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("X", "Y", "Z"),
          ("//X", "Y", "Z"))
@@ -23,7 +24,7 @@ def read_points(path: Path) -> Cloud:
 
     Raises:
         InputError: the file is missing, empty, cut short, of an unknown format, holds text where
-            numbers belong, or has coordinates that are not finite.
+            numbers belong, or has no finite coordinates.
         MissingDependencyError: the format needs a package that is not installed.
     """
     path = Path(path)
@@ -32,7 +33,7 @@ def read_points(path: Path) -> Cloud:
                          "Check the path.")
     if path.is_dir():
         raise InputError(f"{path} is a folder.", "A point cloud file was expected.",
-                         "Name a file; a folder of scans is for `limber reconstruct --batch`.")
+                         "Name one of its files, or give the folder to `limber reconstruct`.")
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         known = " ".join(sorted(READERS))
@@ -62,13 +63,14 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
         raise InputError(f"{path} has no points.", "A point cloud was expected.",
                          "Export it again.")
     finite = np.isfinite(cloud.points).all(axis=1)
-    if not finite.all():
-        first = int(np.flatnonzero(~finite)[0])
-        raise InputError(
-            f"{path}: {int((~finite).sum())} of {len(cloud)} points are not finite, the first is "
-            f"number {first + 1}.", "Coordinates must be numbers; NaN and infinity are not.",
-            "Remove those points where the cloud was made.")
-    return cloud
+    if not finite.any():
+        raise InputError(f"{path}: none of {len(cloud)} points is finite.",
+                         "Coordinates must be numbers; NaN and infinity are not.",
+                         "Export it again.")
+    if finite.all():
+        return cloud
+    # Depth cameras' drivers write NaN where a pixel saw nothing.
+    return replace(cloud.subset(finite), not_finite=cloud.not_finite + int((~finite).sum()))
 
 
 def _from_columns(names: list[str], columns: dict[str, np.ndarray]) -> Cloud:
@@ -115,84 +117,13 @@ def _read_pcd(path: Path) -> Cloud:
         packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
         columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
         names = [name for name in names if name != "rgb"] + ["r", "g", "b"]
-    cloud = _from_columns(names, columns)
-    if content.metadata.height > 1:
-        # In an organised cloud NaN is the format's own word for "nothing seen in this pixel".
-        return cloud.subset(np.isfinite(cloud.points).all(axis=1))
-    return cloud
+    return _from_columns(names, columns)
 
 
 def _read_text(path: Path) -> Cloud:
-    """XYZ, TXT, CSV: numbers separated by blanks, tabs, commas or semicolons; a header may be."""
-    text = path.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff")
-    lines = [line for line in text.splitlines() if line.strip() and not _is_comment(line)]
-    if not lines:
-        raise InputError(f"{path} has no lines with numbers.", "A point cloud was expected.",
-                         "Export it again.")
-    separator = next((s for s in (";", ",", "\t") if s in lines[0]), None)
-    names = _header(lines[0], separator)
-    if names:
-        lines = lines[1:]
-    elif len(lines) > 1 and lines[0].split(separator)[0].strip().isdigit() and len(
-            lines[0].split(separator)) == 1:
-        lines = lines[1:]  # some programs write the number of points first
-    table = _numbers(path, lines, separator, text)
-    if table.shape[1] < 3:
-        raise InputError(f"{path} has {table.shape[1]} columns.",
-                         "Coordinates need three.", "Export it again.")
-    if not names or len(names) != table.shape[1]:
-        names = ["x", "y", "z", *_guessed(table.shape[1] - 3)]
-    lowered = [name.lower() for name in names]
-    return _from_columns(lowered, {name: table[:, k] for k, name in enumerate(lowered)})
-
-
-def _is_comment(line: str) -> bool:
-    start = line.lstrip()
-    return start.startswith("#") or (start.startswith("//") and not start[2:3].isalpha())
-
-
-def _header(line: str, separator: str | None) -> list[str]:
-    parts = [part.strip().strip('"').lstrip("/#") for part in line.split(separator)]
-    try:
-        for part in parts:
-            float(part)
-    except ValueError:
-        lowered = [part.lower() for part in parts]
-        return lowered if {"x", "y", "z"} <= set(lowered) else []
-    return []
-
-
-def _numbers(path: Path, lines: list[str], separator: str | None, text: str) -> np.ndarray:
-    try:
-        return np.loadtxt(io.StringIO("\n".join(lines)), delimiter=separator, ndmin=2)
-    except ValueError:
-        pass
-    width = len(lines[0].split(separator))
-    all_lines = text.splitlines()
-    for line in lines:
-        parts = line.split(separator)
-        number = all_lines.index(line) + 1
-        if len(parts) != width:
-            raise InputError(
-                f"{path}, line {number} has {len(parts)} values, the first has {width}.",
-                "The file may be cut short.", "Export it again, or correct that line.")
-        for part in parts:
-            try:
-                float(part)
-            except ValueError:
-                raise InputError(f"{path}, line {number}: {part.strip()[:30]!r} is not a number.",
-                                 "A cloud has one point a line, as numbers.",
-                                 "Correct that line.") from None
-    raise InputError(f"{path} cannot be read as a table of numbers.", "", "Export it again.")
-
-
-def _guessed(extra: int) -> list[str]:
-    """Names of unnamed columns after x, y, z, as scanners and CloudCompare order them."""
-    if extra == 3:
-        return ["red", "green", "blue"]
-    if extra == 6:
-        return ["red", "green", "blue", "nx", "ny", "nz"]
-    return [f"scalar_{k}" for k in range(extra)]
+    """XYZ, TXT, CSV; see :mod:`limber.geometry.cloud_text`."""
+    names, table = read_table(path)
+    return _from_columns(names, {name: table[:, k] for k, name in enumerate(names)})
 
 
 def _read_las(path: Path) -> Cloud:
@@ -235,11 +166,12 @@ def _read_npy(path: Path) -> Cloud:
 
 
 def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> Cloud:
-    key = next((k for k in ("points", "xyz", "positions", "arr_0") if k in arrays), None)
+    names = ("points", "xyz", "positions", "vertices", "arr_0")
+    key = next((name for name in names if name in arrays), None)
     if key is None:
         return _from_columns(list(arrays), arrays)
     points = np.asarray(arrays.pop(key), np.float64)
-    if points.ndim != 2 or points.shape[1] < 3:
+    if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:
         raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
                          "Points have shape [n, 3].", "Save them so.")
     renamed = {"normals": "normal", "colors": "color"}

@@ -8,11 +8,15 @@ from scipy.spatial import cKDTree
 
 from limber.errors import InputError
 from limber.geometry.cloud import Cloud
+from limber.geometry.sheets import find_sheet
 from limber.geometry.sight import find_sight, flying_pixels
 
 POINT_MINIMUM = 50
-_LARGEST_EXTENT = 60.0  # [m]: taller than that is no plant that anybody scans as a branch
+_LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans as a branch
 _SMALLEST_EXTENT = 0.02
+_SHEET_LEAST = 0.08  # share of points that makes a wall or the ground
+_SHEETS_MOST = 6  # a box has no more
+_COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
 
 
 class PreparationSettings(BaseModel):
@@ -33,6 +37,8 @@ class PreparationSettings(BaseModel):
     flying_speck: int = Field(
         20, ge=1, description="Depth camera: groups of fewer pixels than that are dropped as "
         "flying.")
+    keep_sheets: bool = Field(
+        False, description="Keep walls and ground: wide flat sheets are else cut out.")
     outlier_ratio: float = Field(
         5.0, ge=0, description="Drop points whose neighbours are so many times as far as is usual "
         "around them; 0 keeps all.")
@@ -75,7 +81,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         InputError: too few points, or all of them at one place.
     """
     settings = settings or PreparationSettings()
-    counts = {"read": len(cloud)}
+    counts = {"read": len(cloud), "not_finite": cloud.not_finite}
     cloud = _cropped(cloud, settings)
     counts["cropped"] = counts["read"] - len(cloud)
     _enough(cloud, "The cloud")
@@ -87,6 +93,11 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     if np.ptp(points, axis=0).max() <= 1e-9 * max(float(np.abs(scaled).max()), 1e-9):
         raise InputError(f"All {len(points)} points are at one place.",
                          "A branch has an extent.", "Check the export's columns and digits.")
+    _enough_digits(cloud.points)
+    spread = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[1]
+    if spread[1] < 1e-6 * spread[0]:
+        raise InputError(f"All {len(points)} points lie on one straight line.",
+                         "A branch has a thickness.", "Check the export's columns and digits.")
     cloud = cloud.with_points(points)
     _, first = np.unique(points, axis=0, return_index=True)
     counts["duplicates"] = len(cloud) - len(first)
@@ -94,6 +105,8 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     keep = _without_outliers(cloud.points, settings)
     counts["outliers"] = int((~keep).sum())
     cloud = cloud.subset(keep)
+    if not settings.keep_sheets:
+        cloud = _without_sheets(cloud, counts)
     if settings.voxel > 0:
         chosen = voxel_thinned(cloud.points, settings.voxel)
         counts["thinned"] = len(cloud) - len(chosen)
@@ -127,6 +140,32 @@ def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
     return cloud if keep.all() else cloud.subset(keep)
 
 
+def _without_sheets(cloud: Cloud, counts: dict[str, int]) -> Cloud:
+    """Cut out walls and ground, unless little else is there: that is refused later."""
+    count = len(cloud)
+    rest = cloud
+    for _ in range(_SHEETS_MOST):
+        sheet = find_sheet(rest.points, _SHEET_LEAST * count)
+        if sheet is None:
+            break
+        rest = rest.subset(~sheet)
+    if len(rest) < max(0.1 * count, POINT_MINIMUM):
+        return cloud
+    counts["sheets"] = count - len(rest)
+    return rest
+
+
+def _enough_digits(points: np.ndarray) -> None:
+    """Refuse coordinates that lost their digits in single precision, far from the origin."""
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    step = float(np.spacing(np.float32(np.abs(points).max())))
+    if step > _COARSEST_STEP * extent and (points == points.astype(np.float32)).all():
+        raise InputError(
+            f"The coordinates, up to {np.abs(points).max():.7g}, have steps of {step:g}: the cloud "
+            f"is {extent:.3g} long.", "They were kept in single precision (7 digits), and the "
+            "shape is lost.", "Export in double precision, or with an offset subtracted.")
+
+
 def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
                     eye: np.ndarray | None, counts: dict[str, int]) -> Cloud:
     """Drop flying pixels, if this is what one depth camera saw."""
@@ -145,7 +184,7 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
 
 def _enough(cloud: Cloud, what: str) -> None:
     if len(cloud) < POINT_MINIMUM:
-        raise InputError(f"{what} has {len(cloud)} points.",
+        raise InputError(f"{what} has {len(cloud)} point{'s' * (len(cloud) != 1)}.",
                          f"A skeleton needs at least {POINT_MINIMUM}.",
                          "Scan more densely, or crop less.")
 
@@ -168,13 +207,37 @@ def _without_outliers(points: np.ndarray, settings: PreparationSettings) -> np.n
     return keep
 
 
+def _rounding(points: np.ndarray) -> float:
+    """Step [m] that coordinates are rounded to, if it blurs branches; else 0."""
+    steps = []
+    for axis in points.T:
+        apart = np.diff(np.unique(np.round(axis, 9)))
+        if len(apart) < 3 or np.quantile(apart, 0.1) < 0.99 * np.median(apart):
+            return 0.0
+        steps.append(float(np.median(apart)))
+    near = float(np.median(cKDTree(points).query(points[::max(len(points) // 2000, 1)], k=2)[0][
+        :, 1]))
+    return steps[0] if max(steps) < 1.01 * min(steps) and near < 1.5 * steps[0] else 0.0
+
+
 def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     texts = []
     extent = float(np.ptp(points, axis=0).max())
     if extent > _LARGEST_EXTENT:
-        texts.append(f"The cloud is {extent:.0f} m long: are its units millimetres (--unit mm)?")
+        unit = "millimetres (--unit mm)" if extent > 100 else "centimetres (--unit cm)"
+        texts.append(f"The cloud is {extent:.0f} m long: are its units {unit}?")
     if extent < _SMALLEST_EXTENT:
         texts.append(f"The cloud is {1000 * extent:.1f} mm long: are its units really these?")
+    if counts.get("not_finite"):
+        texts.append(f"Points left away since they are no numbers (NaN, infinity): "
+                     f"{counts['not_finite']}.")
+    if counts.get("sheets"):
+        texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
+                     "wall, the ground?) and were cut out (--keep-sheets).")
+    step = _rounding(points)
+    if step > 0:
+        texts.append(f"Coordinates are rounded to {1000 * step:.4g} mm: radii can be no better "
+                     "than that (export with more digits).")
     flying = counts.get("flying", 0)
     if flying > 0.02 * counts["read"]:
         texts.append(f"{flying} of {counts['read']} points were dropped as a depth camera's "

@@ -1,0 +1,134 @@
+"""Clouds as text: XYZ, TXT, CSV and their kin, as scanners, spreadsheets and programs write them.
+"""
+
+import codecs
+import io
+import re
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+
+_AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("pos_x", "pos_y", "pos_z"),
+         ("easting", "northing", "height"), ("easting", "northing", "elevation"),
+         ("easting", "northing", "altitude"), ("easting", "northing", "z"))
+_UNIT = re.compile(r"[\s_]*[\[(](m|cm|mm|in)[\])]$|_(m|cm|mm)$")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+
+
+def read_table(path: Path) -> tuple[list[str], np.ndarray]:
+    """Read the columns of a text file: names, in lower case, and numbers, shape [n, columns].
+
+    Numbers stand between blanks, tabs, commas or semicolons; a header may name the columns, the
+    number of points may come first, and decimals may be commas where commas do not separate.
+
+    Raises:
+        InputError: no numbers, too few columns, or a line that is none of the table; it is named.
+    """
+    text = _decoded(path.read_bytes()).replace('"', "")
+    lines = [line for line in text.splitlines() if line.strip() and not _is_comment(line)]
+    if not lines:
+        raise InputError(f"{path} has no lines with numbers.", "A point cloud was expected.",
+                         "Export it again.")
+    # A header says little of how numbers are written.
+    separator = _separator(lines[min(1, len(lines) - 1)])
+    names = _header(path, lines, separator)
+    if names:
+        lines = lines[1:]
+    elif len(lines) > 1 and lines[0].strip().isdigit():
+        lines = lines[1:]  # some programs write the number of points first
+    if not lines:
+        raise InputError(f"{path} has a header and no points.", "A point cloud was expected.",
+                         "Export it again.")
+    table = _numbers(path, lines, separator, text)
+    if table.shape[1] < 3:
+        raise InputError(f"{path} has {table.shape[1]} columns.",
+                         "Coordinates need three.", "Export it again.")
+    if len(names) != table.shape[1]:
+        names = ["x", "y", "z", *_guessed(table.shape[1] - 3)]
+    return names, table
+
+
+def _decoded(raw: bytes) -> str:
+    for mark, coding in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+                         (codecs.BOM_UTF16_BE, "utf-16")):
+        if raw.startswith(mark):
+            return raw.decode(coding, errors="replace")
+    return raw.decode("utf-8", errors="replace")
+
+
+def _is_comment(line: str) -> bool:
+    start = line.lstrip()
+    return start.startswith("#") or (start.startswith("//") and not start[2:3].isalpha())
+
+
+def _separator(line: str) -> str | None:
+    for mark in (";", "\t"):
+        if mark in line:
+            return mark
+    blanks = line.split()
+    if len(blanks) > 2 and all(_DECIMAL_COMMA.fullmatch(part) for part in blanks):
+        return None
+    return "," if "," in line else None
+
+
+def _parts(line: str, separator: str | None) -> list[str]:
+    parts = [part.strip() for part in line.split(separator)]
+    # Some programs end each line with a separator.
+    return parts[:-1] if len(parts) > 3 and parts[-1] == "" else parts
+
+
+def _header(path: Path, lines: list[str], separator: str | None) -> list[str]:
+    """Names of the columns, coordinates as x, y, z; empty if the first line holds numbers."""
+    other = separator if separator is None or separator in lines[0] else _separator(lines[0])
+    names = [_UNIT.sub("", part.lower().lstrip("/#").strip())
+             for part in _parts(lines[0], other)]
+    if not any(name[:1].isalpha() and name not in ("nan", "inf") for name in names):
+        return []
+    for axes in _AXES:
+        if set(axes) <= set(names):
+            known = dict(zip(axes, "xyz", strict=True))
+            return [known.get(name, name) for name in names]
+    if len(names) == len(_parts(lines[min(1, len(lines) - 1)], separator)):
+        raise InputError(f"{path} has columns {', '.join(names)[:200]}.", "x, y and z are missing.",
+                         "Name the coordinates x, y, z.")
+    return []
+
+
+def _numbers(path: Path, lines: list[str], separator: str | None, text: str) -> np.ndarray:
+    commas = separator != ","
+    try:
+        clean = [line.replace(",", ".") for line in lines] if commas else lines
+        if separator is not None and lines[0].rstrip().endswith(separator):
+            clean = [line.rstrip().removesuffix(separator) for line in clean]
+        return np.loadtxt(io.StringIO("\n".join(clean)), delimiter=separator, ndmin=2)
+    except ValueError:
+        pass
+    width = len(_parts(lines[0], separator))
+    all_lines = text.splitlines()
+    for line in lines:
+        parts = _parts(line, separator)
+        number = all_lines.index(line) + 1
+        if len(parts) != width:
+            raise InputError(
+                f"{path}, line {number} has {len(parts)} values, the first has {width}.",
+                "The file may be cut short.", "Export it again, or correct that line.")
+        for part in parts:
+            try:
+                float(part.replace(",", ".") if commas else part)
+            except ValueError:
+                raise InputError(f"{path}, line {number}: {part.strip()[:30]!r} is not a number.",
+                                 "A cloud has one point a line, as numbers.",
+                                 "Correct that line.") from None
+    raise InputError(f"{path} cannot be read as a table of numbers.",
+                     "Its lines differ in how they are written.", "Export it again.")
+
+
+def _guessed(extra: int) -> list[str]:
+    """Names of unnamed columns after x, y, z, as scanners and CloudCompare order them."""
+    if extra == 3:
+        return ["red", "green", "blue"]
+    if extra == 6:
+        return ["red", "green", "blue", "nx", "ny", "nz"]
+    return [f"scalar_{k}" for k in range(extra)]
