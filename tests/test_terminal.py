@@ -11,6 +11,7 @@ def test_result_has_few_digits_and_nothing_empty():
     assert list(result_lines(result)) == [
         "young_pa: [9.5343e+07, 1e+08]", "converged: yes", "count: 2280", "quality:",
         "  ratio: 0.99584", "bridges:", "  from [0.12346, 0], length 0.037449"]
+    assert list(result_lines({"costs": list(range(30))}))[-1] == "  and 18 more (--json shows all)"
 
 
 def test_table_is_aligned():

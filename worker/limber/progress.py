@@ -83,11 +83,17 @@ class BarSink:
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as RichProgress
+        from rich.table import Column
 
+        # The message gives way where the window is narrow, never the bar and its percentage.
         self._bar = RichProgress(
-            TextColumn("{task.fields[title]}"), BarColumn(bar_width=30),
-            TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
-            TextColumn("{task.description}"), console=Console(stderr=True),
+            TextColumn("{task.fields[title]}",
+                       table_column=Column(no_wrap=True, min_width=len(title))),
+            BarColumn(bar_width=20, table_column=Column(no_wrap=True, min_width=20)),
+            TextColumn("{task.percentage:3.0f} %", table_column=Column(no_wrap=True, min_width=5)),
+            TimeElapsedColumn(table_column=Column(no_wrap=True, min_width=7)),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True, ratio=1)),
+            console=Console(stderr=True), expand=True,
         )
         self._task = self._bar.add_task("", total=1.0, title=title)
 

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-# A list of plain numbers up to this length stands on one line.
-_ON_ONE_LINE = 12
+# A list of plain numbers up to this length stands on one line; of others so many are shown.
+_SHOWN = 12
 
 
 def result_lines(result: Mapping[str, Any]) -> Iterator[str]:
@@ -22,7 +22,9 @@ def result_lines(result: Mapping[str, Any]) -> Iterator[str]:
         if isinstance(value, Mapping):
             yield from (f"  {line}" for line in result_lines(value))
         else:
-            yield from (f"  {_text(item)}" for item in value)
+            yield from (f"  {_text(item)}" for item in value[:_SHOWN])
+            if len(value) > _SHOWN:
+                yield f"  and {len(value) - _SHOWN} more (--json shows all)"
 
 
 def table_lines(rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -40,7 +42,7 @@ def _fits_one_line(value: Any) -> bool:
     if isinstance(value, Mapping):
         return False
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return len(value) <= _ON_ONE_LINE and not any(
+        return len(value) <= _SHOWN and not any(
             isinstance(item, Sequence | Mapping) for item in value)
     return True
 

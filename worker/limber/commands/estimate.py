@@ -9,6 +9,7 @@ from limber.cli import Run, settings_options, stage_command
 from limber.estimation.estimate import estimate
 from limber.estimation.settings import EstimateSettings
 from limber.report.tables import held_out_rows, modulus_rows
+from limber.store import plain
 
 
 @stage_command("estimate")
@@ -25,10 +26,11 @@ def command(run: Run, branch_folder: Path, force: bool, is_online: bool, pace: f
     if is_online:
         from limber.estimation.follow import follow
 
-        result = follow(branch_folder, settings, pace=pace, progress=run.progress, warn=run.warn)
+        result = plain(follow(branch_folder, settings, pace=pace, progress=run.progress,
+                              warn=run.warn))
     else:
-        result = estimate(branch_folder, settings, force=force, progress=run.progress,
-                          warn=run.warn)
+        result = plain(estimate(branch_folder, settings, force=force, progress=run.progress,
+                                warn=run.warn))
     run.show("Young's modulus", modulus_rows(result, None))
     if held_out := held_out_rows(result):
         run.show("Pulls foretold by a fit that did not see them: RMS errors", held_out)

@@ -11,6 +11,7 @@ from limber.errors import InputError
 from limber.planning.compare import PlanSettings
 from limber.planning.plan import plan_branch_motion
 from limber.report.tables import comparison_rows
+from limber.store import plain
 
 
 @stage_command("plan")
@@ -27,5 +28,5 @@ def command(run: Run, branch_folder: Path, name: str, force: bool, settings: Pla
                          "Use letters, digits, dash, dot and underscore.")
     result = plan_branch_motion(branch_folder, settings, name=name, force=force,
                                 progress=run.progress, warn=run.warn)
-    run.show("Both paths, on the full model", comparison_rows(result))
+    run.show("Both paths, on the full model", comparison_rows(plain(result)))
     return result
