@@ -40,8 +40,10 @@ from limber.estimation.preparation import (
 from limber.estimation.recording import GraspEntry
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.shape_error import shape_error
 from limber.estimation.start import scaled_start
 from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
+from limber.geometry.cloud import read_cloud
 from limber.progress import SILENT, Progress
 from limber.store import Branch, plain
 
@@ -64,7 +66,7 @@ class Estimate:
         held_out: Per pull, how a fit that did not see it foretells it: RMS distance [m] and RMS
             force error [N], also over the pull's own travel and peak force.
         stopped: Whether it was stopped before its end.
-        model_error: What residuals cannot show: of the branch's radii and of its mesh.
+        model_error: What residuals cannot show: of the branch's shape and of its mesh.
     """
 
     fit: Fit
@@ -122,14 +124,14 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
         tell(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
     sigma = [pull.entry.sensor.force_sigma_n for pull in pulls]
     objective = Objective(forwards, ParameterSpace.separate(subject.start, _extra(settings)),
-                          log=log, force_sigma=sigma, progress=progress.part(0.2, 0.95),
+                          log=log, force_sigma=sigma, progress=progress.part(0.2, 0.9),
                           expected_count=20 if settings.method == "gauss-newton" else 200)
     found = fit_pulls(objective, subject.start, settings, tell, cache=branch.folder,
                       digest=json.dumps(digests, sort_keys=True))
     found.warnings = messages
     if not found.stopped:
-        progress(0.96, "how much the mesh is too stiff")
-        found.model_error = _model_error(branch, subject, found, pulls[0].entry.grasp, settings)
+        found.model_error = _model_error(branch, subject, found, pulls[0].entry.grasp, settings,
+                                         progress.part(0.9, 0.98))
         if settings.hold_out:
             _score_others(branch, names, subject, found, settings, tell)
     result = _summary(found, settings)
@@ -387,16 +389,29 @@ def _score_others(branch: Branch, names: list[str], subject: Subject, found: Est
 
 
 def _model_error(branch: Branch, subject: Subject, found: Estimate, grasp: GraspEntry,
-                 settings: EstimateSettings) -> ModelError:
-    geometry = None
-    if branch.has("skeleton.csv"):
-        geometry = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
+                 settings: EstimateSettings, progress: Progress) -> ModelError:
+    error = _geometry_error(branch, subject, found, settings, progress)
     if not settings.mesh_check:
-        return ModelError(geometry)
+        return error
+    progress(1.0, "how much the mesh is too stiff")
     inside = point_operator(subject.mesh, subject.control_points)
     model = subject.model.with_parameters(poisson=found.values.poisson)
-    return ModelError(geometry, mesh_error(model, grasp_on(subject.mesh, grasp), inside,
-                                           subject.weights, found.values.young))
+    return replace(error, mesh=mesh_error(model, grasp_on(subject.mesh, grasp), inside,
+                                          subject.weights, found.values.young))
+
+
+def _geometry_error(branch: Branch, subject: Subject, found: Estimate,
+                    settings: EstimateSettings, progress: Progress) -> ModelError:
+    """From the scan's axis and radii; none for a skeleton that was not fitted to a scan."""
+    if not branch.has("skeleton.csv"):
+        return ModelError()
+    radii = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
+    if radii is None or not branch.has("cloud.ply"):
+        return ModelError(radii)
+    drawn = shape_error(found.fit.evaluation, found.objective, subject,
+                        read_cloud(branch.path("cloud.ply")).points, settings.shapes,
+                        progress=progress)
+    return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
 
 
 def _deviations(found: Estimate) -> dict[str, Any]:
@@ -405,7 +420,7 @@ def _deviations(found: Estimate) -> dict[str, Any]:
     sensor = np.minimum(np.sqrt(np.diag(found.uncertainty.covariance))[groups], 35.0)
     error = found.model_error
     return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-            "total": error.total(sensor)}
+            "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
 
 
 def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:

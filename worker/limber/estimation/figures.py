@@ -192,11 +192,14 @@ def force_over_time(pull: dict[str, Any]) -> Any:
 def _interval_caption(estimate: dict[str, Any]) -> str:
     parts = estimate.get("young_deviation") or {}
     told = [f"{name} {100 * max(np.atleast_1d(parts[key])):.1f} %" for key, name in
-            (("sensor", "sensors"), ("geometry", "radii of the scan"), ("mesh", "mesh"))
+            (("sensor", "sensors"), ("geometry", "shape from the scan"), ("mesh", "mesh"))
             if parts.get(key) is not None]
-    missing = "" if not parts else (
-        " Where the scan's axis runs is taken as exact." if parts.get("geometry") is not None else
-        " The radii came without a deviation: what they are off by is not in the interval.")
+    missing = ""
+    if parts and parts.get("geometry") is None:
+        missing = (" The radii came without a deviation: what they are off by is not in the "
+                   "interval.")
+    elif parts.get("axis_is_exact", True) and parts:
+        missing = " Where the scan's axis runs is taken as exact."
     return ("Young's modulus along the branch with its 95 % interval"
             + (f"; largest standard deviation by {', '.join(told)}" if told else "")
             + "." + missing)

@@ -1,4 +1,4 @@
-"""What a fit cannot see of its own error: the branch's thickness, and the mesh.
+"""What a fit cannot see of its own error: the branch's shape, and the mesh.
 
 Residuals tell how well the data fix Young's modulus of the model. If the model is too thick, or
 its mesh too stiff, the fit is as good and the modulus wrong. Both are known otherwise: the scan
@@ -34,13 +34,16 @@ class ModelError:
     """Relative standard deviations of Young's modulus that no residual shows.
 
     Attributes:
-        geometry: At the control points, from the radii's deviation, shape [K]; None where the
-            branch's radii came without one.
+        geometry: At the control points, from what the scan leaves open, shape [K]; None where
+            the branch's radii came without a deviation.
         mesh: From the mesh, shape [K]; None where it was not measured.
+        axis_is_exact: Whether ``geometry`` is of the radii alone (:func:`geometry_error`), not
+            of axis and radii (:func:`limber.estimation.shape_error.shape_error`).
     """
 
     geometry: np.ndarray | None = None
     mesh: np.ndarray | None = None
+    axis_is_exact: bool = True
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""

@@ -44,13 +44,15 @@ class AxisFit:
 
 
 def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
-             progress: Progress = SILENT) -> AxisFit:
+             uncertainty: bool = True, progress: Progress = SILENT) -> AxisFit:
     """Fit axes and radii of a skeleton's runs to points.
 
     Args:
         skeleton: Where the axes about are, with first radii; its topology is kept.
         points: Scanned points [m], shape [m, 3].
         rounds: Gauss-Newton rounds; points choose their cylinder anew in each.
+        uncertainty: Find each radius's standard deviation too; without, it and the states stay
+            as they were.
         progress: Called each round.
     """
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
@@ -80,11 +82,13 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
             break
     match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
     noise = _robust_sigma(match.residual, radius[match.segment])
-    weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
-    sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
+    sigma, state = skeleton.radius_sigma, skeleton.radius_state
+    if uncertainty:
+        weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
+        sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
+        state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     # Noise across the axis makes points lie farther from it on average, by sigma^2 / 2r.
     radius = np.maximum(radius - np.minimum(bias**2 / (2 * radius), 0.25 * radius), 0.1 * floor)
-    state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     fitted = replace(skeleton, nodes=nodes, radius=radius, radius_sigma=sigma, radius_state=state)
     return AxisFit(fitted, match.segment, match.residual, noise)
 
@@ -212,6 +216,36 @@ def nearest_cylinders(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarra
     return np.concatenate(segments), np.concatenate(residuals)
 
 
+def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_matrix, float]:
+    """How firmly points hold a fitted skeleton, and their noise [m].
+
+    The covariance of (x, y, z, radius) of all nodes is noise^2 times the inverse of the matrix,
+    shape [4 n, 4 n]: of a smoothing spline as Wahba (1983) has it. Its noise is that of single
+    points, independent of each other. Of 8 generated scans' true errors, averaged over ninths of
+    the main axis, half lay within 0.7 of the deviations so foretold (of normal ones: 0.67).
+    """
+    match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius, points)
+    noise = max(_robust_sigma(match.residual, skeleton.radius[match.segment]), 1e-12)
+    weight = _tukey(match.residual, np.full(len(points), _TUKEY * noise))
+    return _system(skeleton, skeleton.nodes, skeleton.radius, match, weight, noise).matrix, noise
+
+
+def on_cylinders(skeleton: Skeleton, points: np.ndarray,
+                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Where points lie along the cylinders that they are nearest to, or inside of.
+
+    Returns:
+        Lower and upper node of each, shape [m] each, the share of the way between them, shape
+        [m] (1 throughout in the first cylinder of a twig, whose radius is the twig's), and the
+        way from the axis to the point [m], shape [m, 3].
+    """
+    match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius, points)
+    low, high = skeleton.parent[match.segment], match.segment
+    foot = (1 - match.share)[:, None] * skeleton.nodes[low] + match.share[:, None] * (
+        skeleton.nodes[high])
+    return low, high, np.where(match.own_radius, 1.0, match.share), points - foot
+
+
 @dataclass(frozen=True)
 class _Match:
     segment: np.ndarray
@@ -334,7 +368,7 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
         values += [1 / before / mean, -(1 / before + 1 / after) / mean, 1 / after / mean]
         scale_axis.append(0.5 * density * band**4 * mean)
         scale_radius.append(density * (2.0 * band)**4 * mean)
-        slopes.append(_slope_terms(chain, step, radius, density, len(nodes)))
+        slopes.append((chain, step))
         count += len(chain) - 2
     size = len(nodes)
     if count == 0:
@@ -343,7 +377,8 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         (count, size)).tocsr()
     along = second.T @ sparse.diags(np.concatenate(scale_axis)) @ second
-    thick = second.T @ sparse.diags(np.concatenate(scale_radius)) @ second + sum(slopes)
+    thick = (second.T @ sparse.diags(np.concatenate(scale_radius)) @ second
+             + _slope_terms(slopes, radius, density))
     return (sparse.kron(along, sparse.diags([1.0, 1, 1, 0]))
             + sparse.kron(thick, sparse.diags([0.0, 0, 0, 1]))).tocsc()
 
@@ -358,14 +393,17 @@ def _straightness(nodes: np.ndarray) -> np.ndarray:
     return np.clip(1.3 - np.arccos(np.clip(cosine, -1, 1)), 0.3, 1.0)
 
 
-def _slope_terms(chain: np.ndarray, step: np.ndarray, radius: np.ndarray, density: float,
-                 count: int) -> sparse.csr_matrix:
+def _slope_terms(chains: list[tuple[np.ndarray, np.ndarray]], radius: np.ndarray,
+                 density: float) -> sparse.csr_matrix:
     """Weak penalty on a radius's slope: branches are no cones, whatever stray points say."""
-    thick = (radius[chain[1:]] + radius[chain[:-1]]) / 2
-    index = np.arange(len(chain) - 1)
+    low = np.concatenate([chain[:-1] for chain, _ in chains])
+    high = np.concatenate([chain[1:] for chain, _ in chains])
+    step = np.concatenate([step for _, step in chains])
+    index = np.arange(len(step))
     first = sparse.coo_matrix(
-        (np.concatenate([-1 / step, 1 / step]), (np.tile(index, 2), np.concatenate(
-            [chain[:-1], chain[1:]]))), (len(chain) - 1, count)).tocsr()
+        (np.concatenate([-1 / step, 1 / step]), (np.tile(index, 2), np.concatenate([low, high]))),
+        (len(step), len(radius))).tocsr()
+    thick = (radius[high] + radius[low]) / 2
     return first.T @ sparse.diags(density * (_SLOPE * thick)**2 * step) @ first
 
 

@@ -1,0 +1,58 @@
+"""What a scan leaves open of a branch's shape, carried to its moduli."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import measured
+from limber.estimation import shape_error as module
+from limber.estimation.parameters import Values
+from limber.estimation.preparation import Subject
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.shape_error import shape_error
+
+SETTINGS = EstimateSettings(hold_out=False, poisson=0.36)
+QUANTILE = 2.306 / 1.960  # Student's with 8 shapes over the normal one
+
+
+@pytest.fixture(scope="module")
+def fitted(small, small_bench, small_pull):
+    found = small_bench.fit([measured(small_pull, 3)], SETTINGS)
+    bench = small_bench
+    return found, Subject(bench.mesh, small.skeleton, bench.points, bench.weights, bench.model,
+                          Values(np.full(4, 1e7), 0.36, 900.0))
+
+
+def _with(monkeypatch, fitted, skeletons):
+    found, subject = fitted
+    monkeypatch.setattr(module, "likely_skeletons", lambda *_: skeletons)
+    return shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)),
+                       len(skeletons))
+
+
+def test_thicker_all_along_is_softer_by_the_fourth_power(monkeypatch, fitted, small):
+    """Radii 1 % off, up or down: each modulus 4 %, as in bending stiffness E r^4."""
+    skeleton = small.skeleton
+    found = _with(monkeypatch, fitted, [
+        replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)])
+    assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
+
+
+def test_an_axis_that_is_off_is_not_exact(monkeypatch, fitted, small):
+    """0.1 mm aside in the middle shows in the moduli, 0.2 mm twice as much; nothing as nothing."""
+    skeleton = small.skeleton
+    share = skeleton.arc_length / skeleton.arc_length.max()
+    aside = 1e-4 * np.sin(np.pi * share)[:, None] * [0.0, 1.0, 0.0]
+    once, twice, never = (_with(monkeypatch, fitted, [
+        replace(skeleton, nodes=skeleton.nodes + sign * factor * aside) for sign in 4 * (1, -1)])
+        for factor in (1, 2, 0))
+    assert 0.002 < once.max() < 0.2
+    assert twice == pytest.approx(2 * once, rel=0.1)
+    assert never == pytest.approx(0.0, abs=1e-4)
+
+
+def test_too_few_shapes_say_nothing(fitted):
+    """Under 8 there is no answer, and the radii's deviation is taken instead."""
+    found, subject = fitted
+    assert shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)), 4) is None

@@ -1,0 +1,100 @@
+"""What a scan leaves open of axis and radii, carried to Young's modulus through the pulls.
+
+Branches as likely as the fitted one (:mod:`limber.geometry.likely_shapes`) are pulled as the
+branch was, with the moduli found. By how much their points and forces differ, the fit would have
+taken up in the moduli: that is how far off these may be. Errors of neighbouring places, of axis
+and radius, and of several moduli go together as they do in the scan.
+"""
+
+import numpy as np
+from scipy import stats
+
+from limber.errors import WorkError
+from limber.estimation.objective import Evaluation, Forward, Objective
+from limber.estimation.preparation import Subject
+from limber.estimation.quasi_static import QuasiStaticForward
+from limber.geometry.likely_shapes import likely_skeletons, reshaped
+from limber.geometry.tet_mesh import TetMesh
+from limber.mechanics.model import BranchModel
+from limber.mechanics.young_field import young_weights
+from limber.progress import SILENT, Progress
+
+KEY_FRAMES = 6
+"""Simulated frames of a pull. Only the difference of two shapes is looked at, which varies slowly
+along a pull: with 12 the deviations changed by under a twentieth."""
+FEWEST = 8
+"""Shapes that must find an equilibrium for their spread to say anything."""
+
+
+def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
+                points: np.ndarray, count: int, *, seed: int = 0,
+                progress: Progress = SILENT) -> np.ndarray | None:
+    """Relative standard deviation of E at the control points from axis and radii, shape [K].
+
+    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr. Root mean square over
+    the shapes, times Student's quantile over the normal one since they are few.
+
+    Args:
+        evaluation: At the fit's end, with its Jacobian.
+        objective: What was minimised.
+        subject: The branch that was fitted.
+        points: Its scan [m], shape [m, 3].
+        count: How many shapes.
+        seed: Of the shapes.
+        progress: Called for each.
+
+    Returns:
+        None where a pull is dynamic, since that would take too long, or where too few shapes
+        find an equilibrium.
+    """
+    if count < FEWEST or any(f.entry.motion == "dynamic" for f in objective.forwards):
+        return None
+    base = _pulled(evaluation, objective, subject, subject.mesh, None)
+    if base is None:
+        return None
+    expected, hints = base
+    changes = []
+    shapes = likely_skeletons(subject.skeleton, points, count, np.random.default_rng(seed))
+    for number, shape in enumerate(shapes):
+        progress(number / count, "other shapes that the scan allows")
+        mesh = reshaped(subject.mesh, subject.skeleton, shape)
+        found = None if mesh.volumes.min() <= 0 else _pulled(
+            evaluation, objective, subject, mesh, hints)
+        if found is not None:
+            changes.append(found[0] - expected)
+    if len(changes) < FEWEST:
+        return None
+    steps = np.linalg.lstsq(evaluation.jacobian, np.array(changes).T, rcond=1e-9)[0]
+    groups = list(objective.space.groups)
+    spread = np.sqrt(np.mean(steps[groups]**2, axis=1))
+    return np.minimum(spread * stats.t.ppf(0.975, len(changes)) / stats.norm.ppf(0.975), 35.0)
+
+
+def _pulled(evaluation: Evaluation, objective: Objective, subject: Subject, mesh: TetMesh,
+            hints: list[list[np.ndarray]] | None,
+            ) -> tuple[np.ndarray, list[list[np.ndarray]]] | None:
+    """Residuals of all pulls on a mesh, and the states of their key frames; None: no equilibrium.
+    """
+    start = subject.model
+    model = BranchModel(mesh, young=start.young, poisson=start.poisson, density=start.density,
+                        gravity=None)
+    weights = young_weights(mesh, subject.control_points)
+    forwards = [_forward(forward, model, weights) for forward in objective.forwards]
+    for forward, hint in zip(forwards, hints or [], strict=False):
+        forward.hint(hint)
+    alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
+    # Forces with errors of their own are eliminated from residuals by their derivatives.
+    linearised = any(getattr(forward, "has_force_unknowns", False) for forward in forwards)
+    try:
+        found = alone.evaluate(evaluation.free, jacobian=linearised)
+    except WorkError:
+        return None
+    if found is None:
+        return None
+    return found.residual, [forward.displacements() for forward in forwards]
+
+
+def _forward(forward: Forward, model: BranchModel, weights: np.ndarray) -> QuasiStaticForward:
+    forward = getattr(forward, "full", forward)  # of a reduced one
+    return QuasiStaticForward(forward.name, model, weights, forward.entry, forward.frames,
+                              forward.rest_points, key_count=KEY_FRAMES)
