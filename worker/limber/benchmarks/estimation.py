@@ -14,6 +14,7 @@ import numpy as np
 
 from limber.benchmarks import silicone_beam
 from limber.benchmarks.estimation_noise import noise_rows
+from limber.benchmarks.estimation_scans import scan_rows
 from limber.benchmarks.paper_branches import (
     BRANCHES,
     FRACTIONS,
@@ -45,15 +46,17 @@ SETTINGS = EstimateSettings(hold_out=False)
 
 
 def rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
-    """Measure everything; about 20 minutes on two quiet cores, 5 with ``quick``.
+    """Measure everything; about 30 minutes on two quiet cores, 7 with ``quick``.
 
-    With ``out`` each fit under noise is kept in ``estimation-noise.jsonl``: a run that was stopped
-    goes on there.
+    With ``out`` each fit is kept in ``estimation-noise.jsonl`` and ``estimation-scans.jsonl``: a
+    run that was stopped goes on there.
     """
     progress(0.01, "the paper's branches")
     table = _paper_table()
     kept = out / "estimation-noise.jsonl" if out else None
-    table += noise_rows(3 if quick else 20, progress.part(0.05, 0.6), kept)
+    table += noise_rows(3 if quick else 20, progress.part(0.05, 0.45), kept)
+    kept = out / "estimation-scans.jsonl" if out else None
+    table += scan_rows(2 if quick else 12, progress.part(0.45, 0.6), kept)
     progress(0.6, "depth frames")
     table += _depth_rows(quick)
     progress(0.7, "Nelder-Mead against Gauss-Newton")
