@@ -10,6 +10,7 @@ from limber.errors import InputError
 from limber.geometry.cloud import Cloud
 from limber.geometry.sheets import find_sheet
 from limber.geometry.sight import find_sight, flying_pixels
+from limber.geometry.silhouette import View
 
 POINT_MINIMUM = 50
 _LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans as a branch
@@ -37,6 +38,9 @@ class PreparationSettings(BaseModel):
     flying_speck: int = Field(
         20, ge=1, description="Depth camera: groups of fewer pixels than that are dropped as "
         "flying.")
+    silhouette_reach: float = Field(
+        1.5, ge=0, description="Depth camera: a twig stays if, as the camera saw it, it reaches "
+        "so many radii of its carrier beyond the carrier's axis; 0 keeps all.")
     keep_sheets: bool = Field(
         False, description="Keep walls and ground: wide flat sheets are else cut out.")
     outlier_ratio: float = Field(
@@ -59,12 +63,14 @@ class Prepared:
         origin: What was subtracted [m], in the file's axes, shape [3].
         counts: Number of points dropped, by reason.
         warnings: What the user should know.
+        view: Where the one depth camera stood, in the cloud's frame, if it was one.
     """
 
     cloud: Cloud
     origin: np.ndarray
     counts: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    view: View | None = None
 
 
 def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
@@ -85,7 +91,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     cloud = _cropped(cloud, settings)
     counts["cropped"] = counts["read"] - len(cloud)
     _enough(cloud, "The cloud")
-    cloud = _without_flying(cloud, scale, settings, eye, counts)
+    cloud, view = _without_flying(cloud, scale, settings, eye, counts)
     # Subtracted in float64 before anything else: map coordinates leave no digits to a float32.
     scaled = cloud.points * scale
     origin = np.round(scaled.mean(axis=0), 3)
@@ -112,7 +118,9 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         counts["thinned"] = len(cloud) - len(chosen)
         cloud = cloud.subset(chosen)
     _enough(cloud, "After cropping and cleaning the cloud")
-    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts))
+    if view is not None:
+        view = View(view.eye - origin, view.pitch)
+    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view)
 
 
 def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
@@ -167,19 +175,22 @@ def _enough_digits(points: np.ndarray) -> None:
 
 
 def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
-                    eye: np.ndarray | None, counts: dict[str, int]) -> Cloud:
-    """Drop flying pixels, if this is what one depth camera saw."""
+                    eye: np.ndarray | None, counts: dict[str, int]) -> tuple[Cloud, View | None]:
+    """Drop flying pixels, if this is what one depth camera saw; and where that stood."""
     eye = settings.camera_at if eye is None else eye
-    if settings.flying_angle == 0:
-        return cloud
-    sight = find_sight(cloud.points * scale, None if eye is None else np.array(eye) * scale)
+    place = None if eye is None else np.array(eye) * scale
+    sight = find_sight(cloud.points * scale, place)
     if sight is None:
-        return cloud
+        return cloud, None
+    view = View(np.zeros(3) if place is None else place, sight.pitch)
+    if settings.flying_angle == 0:
+        return cloud, view
     flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
     counts["flying"] = int(flying.sum())
-    _enough(cloud.subset(~flying), "Without its flying pixels (--flying-angle 0 keeps them) the "
-            "depth camera's cloud")
-    return cloud.subset(~flying)
+    rest = cloud.subset(~flying)
+    _enough(rest, "Without its flying pixels (--flying-angle 0 keeps them) the depth camera's "
+            "cloud")
+    return rest, view
 
 
 def _enough(cloud: Cloud, what: str) -> None:

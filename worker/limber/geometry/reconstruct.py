@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.errors import InputError
+from limber.geometry.axis_fit import nearest_cylinders
 from limber.geometry.cloud import Cloud
 from limber.geometry.cloud_files import read_points
 from limber.geometry.control_points import FRACTIONS
@@ -17,6 +19,7 @@ from limber.geometry.forks import smooth_forks
 from limber.geometry.marks import GRASP_FRACTION, mark
 from limber.geometry.mesh_quality import measure_quality
 from limber.geometry.preparation import PreparationSettings, Prepared, prepare
+from limber.geometry.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton import CLAMPED, INTERPOLATED, Skeleton
 from limber.geometry.skeleton_files import UNIT_METRES, read_skeleton, write_cylinders
 from limber.geometry.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
@@ -98,6 +101,10 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         for text in prepared.warnings:
             tell(text)
         found = _skeleton(prepared, settings, skeleton_path, progress.part(0.02, 0.55))
+        if prepared.view is not None and skeleton_path is None:
+            found, text = seen_skeleton(found, prepared, settings.silhouette_reach)
+            if text:
+                tell(text)
         alignment, cloud, found = _aligned(prepared, found, settings)
         skeleton = found.skeleton
         for text in found.warnings:
@@ -215,6 +222,30 @@ def peak_memory_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
+def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
+                  ) -> tuple[SkeletonResult, str]:
+    """Hold a skeleton against the depth camera's image: twigs and radii; and what to tell.
+
+    Args:
+        found: The skeleton of the cloud.
+        prepared: The cloud, and where it was seen from.
+        reach: ``silhouette_reach`` of the settings.
+    """
+    skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
+    skeleton, clamped = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
+    if not (dropped or clamped):
+        return found, ""
+    node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
+    text = ""
+    if dropped:
+        longest = max(twig["length"] for twig in dropped)
+        text = (f"{len(dropped)} twigs (up to {1000 * longest:.0f} mm) were dropped: in the depth "
+                "camera's image they do not leave their carrier, so they may be noise of its "
+                "depth (--silhouette-reach).")
+    return replace(found, skeleton=skeleton, node_of_point=node, residual=residual,
+                   pruned=found.pruned + len(dropped)), text
+
+
 def _eye(camera_path: Path | None) -> np.ndarray | None:
     """Where the depth image's camera stood [m], shape [3]."""
     if camera_path is None:
@@ -231,6 +262,18 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: 
         from limber.geometry.skeletonise import given_skeleton
 
         own = read_skeleton(skeleton_path, scale=scale)
+        if (own.radius <= 0).any():
+            raise InputError(
+                f"{int((own.radius <= 0).sum())} of {own.node_count} nodes of {skeleton_path} have "
+                "radius 0.", "A branch has a thickness.",
+                "Give each node its radius, or reconstruct from the cloud instead.")
+        size = np.linalg.norm(np.ptp(own.nodes, axis=0))
+        extent = np.linalg.norm(np.ptp(prepared.cloud.points, axis=0))
+        if size > 10 * extent:
+            raise InputError(
+                f"The skeleton is {size:.3g} m wide, the cloud {extent:.3g} m.",
+                "They do not belong together, or are in different units.",
+                "Give the skeleton in the cloud's coordinates and unit (--unit is for both).")
         return given_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
