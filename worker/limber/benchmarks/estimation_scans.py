@@ -81,7 +81,8 @@ def coverage_row(trials: list[Trial]) -> Row:
     covered = [trial.covered for trial in sound]
     share = float(np.mean(np.concatenate(covered))) if covered else 0.0
     by_view = {view: [trial.covered for trial in sound if trial.view == view] for view in VIEWS}
-    told = ", ".join(f"{view} {100 * np.mean(held):.0f} %" for view, held in by_view.items() if held)
+    told = ", ".join(f"{view} {100 * np.mean(held):.0f} %"
+                     for view, held in by_view.items() if held)
     poor = sum(trial.is_poor for trial in trials)
     failed = sum(bool(trial.failure) for trial in trials)
     return Row("reconstructed from a scan: 95 % intervals that cover the truth", "88 to 99 %",
