@@ -73,7 +73,7 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
         nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
     joined = join_pieces(graph.nodes, graph.edges, radius, support, gap=gap_factor * typical,
                          bridge_limit=bridge_limit, up=up, join_plants=join_plants)
-    kept = _keep_largest(graph, joined, gap_factor * typical)
+    kept = keep_largest(graph, joined, gap_factor * typical)
     graph.owner = np.where(kept, np.cumsum(kept) - 1, -1)[owner]
     return graph
 
@@ -218,7 +218,7 @@ def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
     return kept, loops
 
 
-def _keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
+def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
     """Take the bridges of the largest piece; the others are left away.
 
     Returns:

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.geometry.axis_fit import (
+    AxisFit,
     attached,
     clamped,
     fit_axes,
@@ -18,6 +19,7 @@ from limber.geometry.axis_fit import (
 )
 from limber.geometry.contraction import Contraction, contract
 from limber.geometry.curve_graph import CurveGraph, curve_graph, end_chain, prune_spurs, rooted
+from limber.geometry.level_sets import POINT_LIMIT, is_sparse, level_graph
 from limber.geometry.pieces import second_base
 from limber.geometry.plausibility import (
     GIVEN,
@@ -26,11 +28,14 @@ from limber.geometry.plausibility import (
     check_round,
     warnings,
 )
-from limber.geometry.skeleton import Skeleton
+from limber.geometry.skeleton import INTERPOLATED, Skeleton
 from limber.progress import SILENT, Progress
 
 FIT_POINT_LIMIT = 60_000
 """More points than that do not make the fit better, only slower."""
+
+LEAF_SHARE = 0.5
+"""Share of points over two radii off their axis from which a scan shows leaves, not branches."""
 
 
 class SkeletonSettings(BaseModel):
@@ -134,6 +139,13 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                         join_plants=settings.plants == "joined")
     check_one_plant(graph, len(thin), diagonal, settings.plants)
     start = _root_node(graph, points[thin], root, up, settings.prune)
+    if is_sparse(points[thin], contraction.drawn):
+        thin, loops, base = thinned(points, POINT_LIMIT), graph.loops, graph.nodes[start]
+        graph = level_graph(
+            points[thin], base, gap_factor=settings.gap_factor, up=up,
+            bridge_limit=settings.bridge_limit * diagonal, join_plants=settings.plants == "joined")
+        graph.loops = loops
+        start = _root_node(graph, points[thin], base, up, settings.prune)
     first, pruned = _first_skeleton(graph, settings, start)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
     if (graph.owner < 0).any():
@@ -142,6 +154,16 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
+    if float(np.mean(residual > fitted.skeleton.radius[segment])) > LEAF_SHARE:
+        base = graph.nodes[start]
+        graph = level_graph(
+            points[thin], base, gap_factor=settings.gap_factor, up=up,
+            width=float(np.median(graph.thickness)), join_plants=settings.plants == "joined",
+            bridge_limit=settings.bridge_limit * diagonal)
+        start = _root_node(graph, points[thin], base, up, settings.prune)
+        first, pruned = _first_skeleton(graph, settings, start)
+        fitted, more = _through_leaves(first, some, fitted, settings, diagonal), 0
+        segment, residual = nearest_cylinders(fitted.skeleton, points)
     result = SkeletonResult(
         fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
         graph.split_off, graph.loops, pruned + more,
@@ -224,43 +246,77 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
          progress: Progress):
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
     skeleton = resampled(skeleton, 1.5)
-    fit = fit_axes(skeleton, points, progress=progress.part(0.0, 0.5))
+    fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.0, 0.5))
     skeleton = _with_full_tips(_without_bare_ends(attached(fit.skeleton), points), points, fit)
     # Noise makes a carrier look thicker, and its outliers look like twigs.
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
     skeleton, strands = _without_strands(skeleton.subset(keep))
     skeleton = resampled(clamped(skeleton, low, high), 1.0)
-    fit = fit_axes(skeleton, points, progress=progress.part(0.5, 0.8))
+    fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.5, 0.8))
     skeleton, late = _without_strands(fit.skeleton)
-    if late:
-        fit = fit_axes(skeleton, points, rounds=6, progress=progress.part(0.8, 1.0))
+    fit = fit_axes(skeleton, points, rounds=6 if late else 0, progress=progress.part(0.8, 1.0))
     pruned += strands + late
     return replace(fit, skeleton=tapered(clamped(fit.skeleton, low, high))), pruned
 
 
+def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
+                    settings: SkeletonSettings, diagonal: float) -> AxisFit:
+    """Axes in the middle of stem and leaves, without a fit: leaves are no cylinders.
+
+    A leaf's radius is its stalk's, for want of a better one, and marked as not measured.
+    """
+    skeleton = attached(resampled(skeleton, 1.0))
+    for _ in range(3):
+        skeleton = skeleton.moved(_evened(skeleton))
+    low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
+    skeleton = _with_full_tips(tapered(clamped(skeleton, low, high)), points, fit)
+    return replace(fit, skeleton=replace(
+        skeleton, radius_sigma=0.25 * skeleton.radius,
+        radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8)))
+
+
+def _evened(skeleton: Skeleton) -> np.ndarray:
+    """Each node between others of its run moved half way to their middle [m], shape [n, 3]."""
+    nodes = skeleton.nodes.copy()
+    for members in skeleton.runs():
+        inner, old = members[1:-1], skeleton.nodes
+        nodes[inner] = 0.5 * old[inner] + 0.25 * (old[members[:-2]] + old[members[2:]])
+    return nodes
+
+
 def _without_strands(skeleton: Skeleton) -> tuple[Skeleton, int]:
-    count = 0
-    while (inside := _embedded_run(skeleton)) is not None:
-        skeleton, count = skeleton.subset(skeleton.branch != inside), count + 1
-    return skeleton, count
-
-
-def _embedded_run(skeleton: Skeleton) -> int | None:
-    """A side run without twigs of its own that lies mostly inside the others, if there is one.
+    """Drop side runs that lie mostly inside the others, thinnest twigs first.
 
     Where a scan has holes, the contraction may leave two strands in one branch.
     """
-    carriers = set(skeleton.branch[skeleton.parent[1:]][
-        skeleton.branch[1:] != skeleton.branch[skeleton.parent[1:]]].tolist())
-    for run in range(skeleton.branch_count - 1, 0, -1):
-        own = skeleton.branch == run
-        if run in carriers:
-            continue
-        distance, near = cKDTree(skeleton.nodes[~own]).query(skeleton.nodes[own])
-        if float(np.median(distance / skeleton.radius[~own][near])) < 1.3:
-            return run
-    return None
+    count, run = 0, skeleton.branch_count - 1
+    while run > 0:
+        if _is_strand(skeleton, run):
+            skeleton, count = skeleton.subset(skeleton.branch != run), count + 1
+            run = skeleton.branch_count
+        run -= 1
+    return skeleton, count
+
+
+def _is_strand(skeleton: Skeleton, run: int) -> bool:
+    """Whether a side run has no twigs of its own and lies mostly inside the others."""
+    own = np.flatnonzero(skeleton.branch == run)
+    carried = (skeleton.branch[skeleton.parent[1:]] == run) & (skeleton.branch[1:] != run)
+    if carried.any():
+        return False
+    # Others that could hold it: only those around.
+    middle = skeleton.nodes[own].mean(axis=0)
+    span = np.linalg.norm(skeleton.nodes[own] - middle, axis=1).max()
+    reach = 2 * span + 1.4 * float(skeleton.radius.max())
+    others = np.flatnonzero((skeleton.branch != run)
+                            & (np.linalg.norm(skeleton.nodes - middle, axis=1) < reach))
+    if len(others) == 0:
+        return False
+    gap = np.linalg.norm(skeleton.nodes[own][:, None] - skeleton.nodes[others], axis=2)
+    near = np.argmin(gap, axis=1)
+    share = gap[np.arange(len(own)), near] / skeleton.radius[others][near]
+    return float(np.median(share)) < 1.3
 
 
 def _without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
