@@ -54,8 +54,8 @@ def test_no_branch_is_thicker_than_its_silhouette():
     fat = Skeleton.from_edges(truth.nodes, truth.parent, 2 * truth.radius)
     thinner, count = within_silhouette(fat, points, view)
     pixel = 1.1 / camera.fx
-    assert np.mean(thinner.radius <= 1.25 * truth.radius + pixel) > 0.9
-    assert thinner.radius.min() > 0.97 * truth.radius.min()
+    assert np.mean(thinner.radius <= 1.25 * truth.radius + pixel) > 0.8
+    assert np.all(thinner.radius > 0.9 * truth.radius)
     assert count == (thinner.radius_state == CLAMPED).sum() > 0.8 * truth.node_count
 
 

@@ -96,8 +96,8 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
             cap = _SLACK * float(area[own[near]].sum()) / (2 * total) + width[own[near]].max()
             if radius[node] > cap:
                 radius[node], state[node] = cap, CLAMPED
-        if run == 0:
-            radius[0] = min(radius[0], 1.1 * radius[members[1]])
+        if run == 0 and radius[0] > 1.1 * radius[members[1]]:
+            radius[0], state[0] = 1.1 * radius[members[1]], CLAMPED
     clamped = int((radius < skeleton.radius).sum())
     return replace(skeleton, radius=radius, radius_state=state), clamped
 
