@@ -12,6 +12,7 @@ from limber.cli import call
 from limber.errors import InputError
 from limber.estimation.grasping import grasp_on
 from limber.estimation.hung_load import settled
+from limber.estimation.importing import _against
 from limber.estimation.points import point_operator
 from limber.estimation.recording import GraspEntry, Observations, read_pull
 from limber.estimation.registration import read_nominal, register
@@ -218,3 +219,25 @@ def test_the_recorded_beam_settles_alike_in_both_files(branch_folder, tmp_path):
         moved.append(pull.observations.positions[-1] - np.array(pull.entry.rest_points_m))
     assert np.allclose(*moved, atol=2e-6)
     assert np.linalg.norm(moved[0][:3], axis=1) == pytest.approx(0.0173, abs=8e-4)
+
+
+def test_another_frame_of_reference_is_refused(rig, tmp_path, capsys):
+    """Without --nominal the capture's own frame is taken for the branch's: markers metres away
+    from it are refused, and nothing is brought in.
+    """
+    times, seen = rig.recording(0.5)
+    table = np.column_stack([times, seen.reshape(len(times), -1)])
+    titles = ["t_s", *(f"tip{k}_{axis}_m" for k in range(seen.shape[1]) for axis in "xyz")]
+    np.savetxt(tmp_path / "swing.csv", table, "%.6f", ",", header=",".join(titles), comments="")
+    grasp = [f"{x:.6f}" for x in rig.grasp]
+    assert call(["import-pull", str(rig.folder), str(tmp_path / "swing.csv"), "--name", "hung",
+                 "--weight", "0.5", "--grasp-point", *grasp]) == 2
+    assert "another frame of reference" in capsys.readouterr().err
+    assert not (rig.folder / "pulls" / "hung").exists()
+
+
+def test_motion_against_the_load_is_named():
+    """Across the load is what an upright branch does; against it is a sign or a frame."""
+    load = np.array([0.0, 0.0, -1.0])
+    assert _against(np.array([[0.02, 0.0, -0.001], [0.001, 0.0, 0.001]]), load) == ""
+    assert "170 degrees" in _against(np.array([[0.0, 0.00353, 0.02]]), load)

@@ -37,6 +37,7 @@ from limber.estimation.tables import (
     split_title,
     with_columns,
 )
+from limber.geometry.tet_mesh import TetMesh
 from limber.progress import SILENT, Progress
 from limber.store import Branch, file_digest
 
@@ -277,6 +278,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
         rest, positions = placed.apply(rest), placed.apply(positions)
     for message in (*still.warnings, *(placed.warnings if placed else ())):
         warn(message)
+    _require_near(rest, name, branch)
     sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
     load = _load(settings, branch)
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
@@ -287,10 +289,43 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     write_pull(folder, Pull(name, entry, still.times[[0, -1]], poses, wrenches,
                             Observations(still.times, positions)))
     moved = positions[-1] - rest
+    if suspicion := _against(moved, load):
+        warn(f"{name}: {suspicion}")
     return {"frame_count": len(still.times), "point_count": len(used), "time_offset_s": 0.0,
             "labels": [labels[k] for k in used], "load_n": load.tolist(),
             "displacement_m": moved.tolist(), "settled_s": still.duration,
             "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
+
+
+def _require_near(rest: np.ndarray, name: str, branch: Branch) -> None:
+    """Refuse markers that lie elsewhere than the branch, as those of a capture's own frame do.
+
+    Raises:
+        InputError: one is farther from the mesh than a quarter of its extent.
+    """
+    nodes = TetMesh.read(branch.require("mesh.vtu", "reconstruct")).nodes
+    off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in rest])
+    extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    if off.max() > 0.25 * extent:
+        raise InputError(
+            f"{name}: at rest a marker lies {off.max() * 1e3:.0f} mm from the branch, which is "
+            f"{extent * 1e3:.0f} mm long.",
+            "The recording is in another frame of reference, or in another unit.",
+            "Say with --nominal where on the branch the markers are, and check --unit.")
+
+
+def _against(moved: np.ndarray, load: np.ndarray) -> str:
+    """Say it where markers go against the load (displacements [m], load [N]); across it is well:
+    an upright branch gives way to a weight sideways.
+    """
+    size = np.linalg.norm(moved, axis=1)
+    mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)
+    turn = np.degrees(np.arccos(np.clip(
+        mean @ load / max(np.linalg.norm(mean) * np.linalg.norm(load), 1e-12), -1, 1)))
+    if turn < 100:
+        return ""
+    return (f"the markers move at {turn:.0f} degrees to the load. Is the recording in the "
+            "branch's frame (--nominal), and does the load pull that way?")
 
 
 def _load(settings: ImportSettings, branch: Branch) -> np.ndarray:

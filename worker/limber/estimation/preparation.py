@@ -53,6 +53,12 @@ def subject_of(branch: Branch, settings: EstimateSettings) -> Subject:
     mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
     skeleton = Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
     points = control_points(skeleton, settings.fractions)
+    wrong = np.flatnonzero(~(mesh.cell_data["young"] > 0))
+    if len(wrong) and settings.young is None:
+        raise InputError(
+            f"Young's modulus is {mesh.cell_data['young'][wrong[0]]:g} Pa in tetrahedron "
+            f"{wrong[0]} of mesh.vtu.", "A modulus to start from must be positive.",
+            "Give --young, or correct the mesh.")
     young = settings.young or float(np.exp(np.mean(np.log(mesh.cell_data["young"]))))
     poisson = _given(settings.poisson, mesh.cell_data["poisson"])
     density = _given(settings.density, mesh.cell_data["density"])
