@@ -1,12 +1,16 @@
 """Cleaning a cloud: digits, duplicates, outliers, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from limber.errors import InputError
 from limber.geometry.cloud import Cloud
+from limber.geometry.cloud_files import read_points
 from limber.geometry.generated import generate_branch
 from limber.geometry.preparation import PreparationSettings, prepare
+from limber.geometry.sheets import find_sheet
 
 RNG = np.random.default_rng(0)
 
@@ -109,3 +113,15 @@ def test_a_line_is_no_branch():
     line = np.linspace(0, 1, 500)[:, None] * [0.3, 0.2, 1.0]
     with pytest.raises(InputError, match="straight line"):
         prepare(Cloud(line), 1.0)
+
+
+def test_leaves_are_no_sheets():
+    """The lower half of a leafy seedling, where two leaves lie flat, keeps them."""
+    path = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "tomato_maize"
+    if not path.is_dir():
+        pytest.skip("no ../shared/data")
+    points = read_points(path / "tomato_03-05.xyz").points / 1000
+    for axis in range(3):
+        middle = (points[:, axis].min() + points[:, axis].max()) / 2
+        for half in (points[points[:, axis] < middle], points[points[:, axis] > middle]):
+            assert find_sheet(half, 0.08 * len(half)) is None

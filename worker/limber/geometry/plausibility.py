@@ -12,6 +12,7 @@ from limber.geometry.skeleton import Skeleton
 GIVEN = "skeleton given"
 """Status of a contraction that was not needed."""
 
+_STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _NAMED = 3  # gaps and loops that are named one by one
 _FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--skeleton)."
 
@@ -57,11 +58,11 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str)
 
 def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
                  residual: np.ndarray) -> None:
-    """Refuse what has an axis but no roundness at all: a ball, a heap of foliage."""
+    """Refuse what has an axis but no roundness at all: a ball. Leaves are told, not refused."""
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))
     away = float(np.median(np.abs(residual + skeleton.radius[segment])))
-    if round_share < 0.15 and away > 0.08 * extent:
+    if round_share < 0.15 and away > _STOUT * extent:
         raise InputError(
             f"Only {100 * round_share:.0f} % of the points lie on round axes; the others are "
             f"{away:.3g} m away (median).", "It is not branch-like.", _FIX)
@@ -118,8 +119,10 @@ def warnings(result: Any) -> list[str]:
     if result.second_base is not None:
         texts.append(f"The plant stands on a second base, at {_place(result.second_base)}: two "
                      "plants that touch? Cut out one of them (--crop-low, --crop-high).")
-    misfit = float(np.mean(np.abs(result.residual) > np.maximum(
-        3 * result.noise, 0.4 * result.skeleton.radius[result.node_of_point])))
+    # Leaves make noise look large: what lies a whole radius off is on no axis, whatever noise is.
+    radius = result.skeleton.radius[result.node_of_point]
+    misfit = float(np.mean(np.abs(result.residual) > np.clip(
+        3 * result.noise, 0.4 * radius, radius)))
     if misfit > 0.15:
         texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
                      "pixels or a second plant? Radii there mean little.")
