@@ -7,6 +7,7 @@ import pytest
 
 from limber.benchmarks.paper_branches import measured
 from limber.estimation import shape_error as module
+from limber.estimation.estimate import _tell_largest_part
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
@@ -56,3 +57,19 @@ def test_too_few_shapes_say_nothing(fitted):
     """Under 8 there is no answer, and the radii's deviation is taken instead."""
     found, subject = fitted
     assert shape_error(found.fit.evaluation, found.objective, subject, np.empty((0, 3)), 4) is None
+
+
+def test_the_largest_part_of_a_wide_interval_is_named():
+    """20 % by the scan at the last point: scan better. 10 % in all: no word. Sensors: pull more."""
+    def told(sensor: float, geometry: float | None) -> list[str]:
+        parts = [value for value in (sensor, geometry) if value is not None]
+        messages: list[str] = []
+        _tell_largest_part({
+            "sensor": np.array([0.01, sensor]), "mesh": None,
+            "geometry": None if geometry is None else np.array([0.01, geometry]),
+            "total": np.array([0.014, np.linalg.norm(parts)])}, messages.append)
+        return messages
+
+    assert told(0.05, 0.08) == []
+    assert "point 2" in told(0.05, 0.2)[0] and "scan from more sides" in told(0.05, 0.2)[0]
+    assert "More pulls" in told(0.3, 0.2)[0] and "More pulls" in told(0.3, None)[0]

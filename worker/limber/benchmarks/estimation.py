@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.benchmarks import silicone_beam
+from limber.benchmarks.estimation_force import force_rows
 from limber.benchmarks.estimation_noise import noise_rows
 from limber.benchmarks.estimation_scans import scan_rows
 from limber.benchmarks.paper_branches import (
@@ -56,7 +57,9 @@ def rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
     kept = out / "estimation-noise.jsonl" if out else None
     table += noise_rows(3 if quick else 20, progress.part(0.05, 0.45), kept)
     kept = out / "estimation-scans.jsonl" if out else None
-    table += scan_rows(2 if quick else 12, progress.part(0.45, 0.6), kept)
+    table += scan_rows(2 if quick else 10, progress.part(0.45, 0.6), kept)
+    progress(0.58, "driven by force")
+    table += force_rows(2 if quick else 10)
     progress(0.6, "depth frames")
     table += _depth_rows(quick)
     progress(0.7, "Nelder-Mead against Gauss-Newton")

@@ -54,6 +54,13 @@ MISFIT_FACTOR = 4.0
 twice the stated noise. Of 10 branches reconstructed from scans, all sound ones stayed under 1.3,
 and the one whose axis ran into a twig and back came to 13, with moduli threefold off."""
 
+WIDE = 0.15
+"""Standard deviation of a log E from which it is worth a word what would narrow it."""
+ADVICE = {"sensor": "More pulls, in other directions or farther, would narrow it.",
+          "geometry": "A scan from more sides, or with less noise, would narrow it.",
+          "mesh": "A finer mesh (--mesh-spacing of reconstruct) would narrow it."}
+"""What to do about the part of an interval that is the largest."""
+
 
 @dataclass
 class Estimate:
@@ -134,6 +141,7 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     if not found.stopped:
         found.model_error = _model_error(branch, subject, found, pulls[0].entry.grasp, settings,
                                          progress.part(0.9, 0.98))
+        _tell_largest_part(_deviations(found), tell)
         if settings.hold_out:
             _score_others(branch, names, subject, found, settings, tell)
     result = _summary(found, settings)
@@ -424,6 +432,20 @@ def _deviations(found: Estimate) -> dict[str, Any]:
     error = found.model_error
     return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
             "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
+
+
+def _tell_largest_part(deviations: dict[str, Any], tell: Callable[[str], None]) -> None:
+    """Say what would narrow a wide interval: the part that makes up most of its variance."""
+    total = deviations["total"]
+    worst = int(np.argmax(total))
+    if total[worst] < WIDE:
+        return
+    parts = {name: float(deviations[name][worst]) for name in ADVICE
+             if deviations[name] is not None}
+    largest = max(parts, key=parts.get)
+    each = ", ".join(f"{name} {100 * part:.0f} %" for name, part in parts.items())
+    tell(f"E at control point {worst + 1} has a standard deviation of {100 * total[worst]:.0f} % "
+         f"({each}). {ADVICE[largest]}")
 
 
 def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:

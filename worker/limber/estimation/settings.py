@@ -44,5 +44,5 @@ class EstimateSettings(BaseModel):
         True, description="At the end, see on a finer mesh how much this one is too stiff; it "
         "enters the interval.")
     shapes: int = Field(
-        24, ge=0, description="At the end, pull so many branches that the scan allows as well; "
+        16, ge=0, description="At the end, pull so many branches that the scan allows as well; "
         "how they differ enters the interval. 0: the radii's deviation alone, the axis as exact.")

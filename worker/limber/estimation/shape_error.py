@@ -19,9 +19,9 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
 
-KEY_FRAMES = 6
+KEY_FRAMES = 4
 """Simulated frames of a pull. Only the difference of two shapes is looked at, which varies slowly
-along a pull: with 12 the deviations changed by under a twentieth."""
+along a pull: with 4, 6 and 12 the deviations came out within 1.5 % of each other."""
 FEWEST = 8
 """Shapes that must find an equilibrium for their spread to say anything."""
 
