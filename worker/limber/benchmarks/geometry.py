@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.benchmarks.geometry_crowns import CROWNS, against_graph, crown_rows, explained
 from limber.benchmarks.table import Row
 from limber.geometry.axis_fit import median_radii
 from limber.geometry.cloud_files import read_points
@@ -37,7 +38,8 @@ SCANS = (("coffeetree_branch/branch.xyz", ["--unit", "m"]),
 def rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
     """Measure; pictures and raw numbers go to ``out``."""
     table = _generated(4 if quick else 20, progress.part(0.0, 0.4), out)
-    table += _contraction(quick, progress.part(0.4, 0.55))
+    table += crown_rows(1 if quick else len(CROWNS), progress.part(0.4, 0.45))
+    table += _contraction(quick, progress.part(0.45, 0.55))
     table += _speed(quick, progress.part(0.55, 0.75))
     table += _scans(quick, progress.part(0.75, 1.0), out)
     return table
@@ -267,7 +269,7 @@ def _speed(quick: bool, progress: Progress) -> list[Row]:
 def _scans(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
     if not DATA.is_dir():
         return [Row("real scans", "all", "not measured: no ../shared/data", None)]
-    table, valid, count, notes = [], 0, 0, []
+    table, valid, count, notes, shares = [], 0, 0, [], []
     with tempfile.TemporaryDirectory() as temporary:
         for number, (name, options) in enumerate(SCANS):
             if quick and number > 1:
@@ -288,14 +290,24 @@ def _scans(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
                 valid += good
                 if out is not None:
                     draw_folder(folder, out / f"{path.stem}.png")
+                ours = Skeleton.read_swc(folder / "skeleton.swc")
+                share = explained(read_points(folder / "cloud.ply").points, ours)
+                shares.append(f"{path.stem} {share:.0%}")
                 if path.stem == "Tree_1":
                     table += _against_qsm(folder)
+                if path.with_suffix(".graph.txt").is_file():
+                    text = against_graph(path.with_suffix(".graph.txt"),
+                                         _in_file_frame(folder, ours).nodes, ours.parent)
+                    table.append(Row(f"{path.stem}: axes against the authors'", "report", text,
+                                     None))
             notes.append(f"{path.stem} {seconds:.0f} s " + (
                 f"{result['tet_count']} tets" if result["status"] == "done" else "FAILED"))
             if path.stem == "branch":
                 table.append(Row("whole `reconstruct` of coffeetree_branch", "30 s",
                                  f"{seconds:.1f} s", seconds <= 30 and run.returncode == 0))
             progress((number + 1) / len(SCANS), path.stem)
+    table.append(Row("real scans: points no farther outside a branch than twice their spacing",
+                     "report", "; ".join(shares), None))
     table.append(Row("real scans: surface watertight, no self-intersection", "all",
                      f"{valid}/{count} ({'; '.join(notes)})", valid == count))
     return table
@@ -306,10 +318,7 @@ def _against_qsm(folder: Path) -> list[Row]:
     path = DATA / "aRchi_tree_1" / "Tree_1_cylinders_TreeQSM.csv"
     theirs = read_cylinders(path) if _is_tree(path) else None
     ours = Skeleton.read_swc(folder / "skeleton.swc")
-    manifest = json.loads((folder / "branch.json").read_text())
-    from limber.store import Alignment
-
-    back = ours.moved(Alignment.model_validate(manifest["alignment"]).undo(ours.nodes))
+    back = _in_file_frame(folder, ours)
     with open(path, newline="", encoding="utf-8") as stream:
         table = list(csv.DictReader(stream))
     start = np.array([[float(r[k]) for k in ("sx", "sy", "sz")] for r in table])
@@ -336,6 +345,14 @@ def _against_qsm(folder: Path) -> list[Row]:
             f"{k}: {step[theirs.order[1:] == k].sum():.0f}" for k in range(4))
     rows.append(Row("aRchi_tree_1: length by order [m]", "report", text, None))
     return rows
+
+
+def _in_file_frame(folder: Path, skeleton: Skeleton) -> Skeleton:
+    """Return a branch folder's skeleton in its scan file's axes, origin and unit."""
+    from limber.store import Alignment
+
+    manifest = json.loads((folder / "branch.json").read_text())
+    return skeleton.moved(Alignment.model_validate(manifest["alignment"]).undo(skeleton.nodes))
 
 
 def _is_tree(path: Path) -> bool:

@@ -90,6 +90,7 @@ def _along_plant(points: np.ndarray, links: np.ndarray, source: np.ndarray,
     graph = graph.maximum(graph.T)
     _, piece = connected_components(graph, directed=False)
     distance, before = np.full(len(points), np.inf), np.full(len(points), -1)
+    # One start, though levels near it run askew: from all points around a cut, more spurs came.
     starts = np.array([np.argmin(np.linalg.norm(points - source, axis=1))])
     while True:
         way, previous, _ = dijkstra(graph, directed=False, indices=starts, min_only=True,
