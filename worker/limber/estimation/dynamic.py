@@ -1,10 +1,14 @@
 """A fast pull, simulated in time: inertia, damping and what swings on after the gripper stops."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from limber.errors import InputError
 from limber.estimation.alignment import Frames
+from limber.estimation.force_motion import motion_response
 from limber.estimation.grasping import grasp_on, pose_on
+from limber.estimation.input_force import Response, nodal_loads
 from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.estimation.points import point_operator
@@ -30,7 +34,18 @@ class DynamicForward:
         if entry.drive == "force" and not measured.all():
             raise InputError(f"{name}: the force is missing in {np.sum(~measured)} frames.",
                              "A force-driven motion needs it throughout.", "Use --drive pose.")
-        self.uses_force = entry.drive == "pose" and bool(measured.any())
+        self.drive = entry.drive
+        if self.drive == "force" and entry.grasp.mode == "clamped":
+            raise InputError(
+                f"{name}: the force of a clamped gripper is to drive a motion.",
+                "Such a gripper bends the branch by a torque as well; here only a force drives "
+                "what moves fast.",
+                'Use --drive pose; or set mode = "pinned" under [grasp] of pull.toml if the '
+                "branch could turn.")
+        self.uses_force = bool(measured.any())
+        self._forces = frames.wrenches[:, :3]
+        self.response: Response | None = None
+        self._arguments = (name, model, weights, entry)
         self.rest_points = np.asarray(rest_points, float)
         self.weights = weights
         gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
@@ -48,10 +63,10 @@ class DynamicForward:
         model = self._model.with_parameters(
             young=self.weights @ values.young, poisson=values.poisson, density=values.density,
             damping=RayleighDamping(*values.damping))
-        frames, by_pose = self.frames, self.entry.drive == "pose"
+        frames, by_pose = self.frames, self.drive == "pose"
         drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
                                      for pose in frames.poses])} if by_pose
-                 else {"grasp_forces": frames.wrenches[:, :3]})
+                 else {"grasp_forces": self._forces})
         wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
         asked = {"sensitivities": wanted, "sensitivity_nodes": self._nodes} if sensitivities else {}
         result = simulate_dynamics(model, grasp=self.grasp, times=frames.times, **drive, **asked)
@@ -59,9 +74,11 @@ class DynamicForward:
             return None
         moved = (self._operator @ result.displacement.reshape(len(frames), -1).T).T
         positions = self.rest_points + moved.reshape(len(frames), -1, 3)
-        forces = result.reaction_force if by_pose else frames.wrenches[:, :3]
+        forces = result.reaction_force if by_pose else self._forces
         if not sensitivities:
             return Simulated(positions, forces)
+        if self.response is None and not by_pose:
+            self.response = self._response(model)
         slopes = result.sensitivities
         count = slopes.displacement.shape[-1]
         # Damping enters the fit by its logarithm.
@@ -72,3 +89,27 @@ class DynamicForward:
         d_positions = np.stack([(self._near @ frame).reshape(-1, 3, count) for frame in flat])
         d_forces = slopes.reaction_force if by_pose else np.zeros((len(frames), 3, count))
         return Simulated(positions, forces, d_positions * scale, d_forces * scale)
+
+    def until(self, count: int) -> "DynamicForward":
+        """Return the first ``count`` frames of the pull."""
+        return DynamicForward(*self._arguments, self.frames[:count], self.rest_points)
+
+    def shift_force(self, change: np.ndarray) -> None:
+        """Move the force by what a fit says of it, shape [3 f]; respond anew from there on."""
+        self._forces = self._forces + change.reshape(-1, 3)
+        self.response = None
+
+    def under_readings(self, simulated: Simulated) -> Simulated:
+        """Foretell a pull from its force's readings alone, without what its points say of it."""
+        if self.response is None:
+            return simulated
+        change = (self.frames.wrenches[:, :3] - self._forces).ravel()
+        return replace(simulated, positions=simulated.positions + self.response.points @ change,
+                       forces=np.full_like(simulated.forces, np.nan))
+
+    def _response(self, model: BranchModel) -> Response:
+        loads = nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[0],
+                            model.mesh.nodes, 3)
+        count = len(self.frames)
+        points = motion_response(model, loads, self._operator, self.frames.times)
+        return Response(points, np.eye(3 * count).reshape(count, 3, 3 * count))

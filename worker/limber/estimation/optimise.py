@@ -10,6 +10,10 @@ from limber.estimation.objective import FAILED_OBJECTIVE, Evaluation, Objective
 
 FIRST_STEP = 1.5
 """Longest first step of Gauss-Newton in the space of log E."""
+SETTLED_ITERATIONS = 4
+"""So many iterations of Nelder-Mead for each corner of its simplex have to change nothing."""
+SETTLED_FALL = 0.01
+"""Fall of half the squared standardised residuals that is nothing: a seventh of a deviation."""
 FORCE_ROUNDS = 6
 """How often the course of a measured input force is linearised anew at most."""
 FORCE_SETTLED = 0.1
@@ -96,40 +100,83 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
                 delta_m2: float | None = None, tolerance: float = 1e-3) -> Fit:
     """The paper's estimator (Algorithm 1): scipy's Nelder-Mead on the free vector.
 
-    It stops when the mean squared error of the points falls below ``delta_m2`` [m^2], or settles:
-    when the simplex spans less than ``tolerance`` in every log E and in the objective.
+    It stops when the mean squared error of the points falls below ``delta_m2`` [m^2]; when the
+    error settles, that is no longer falls by what could matter beside the noise; or when the
+    simplex spans less than ``tolerance`` in every log E and in the objective. Settled above
+    ``delta_m2`` is not converged.
 
     Raises:
         WorkError: no candidate had an equilibrium.
     """
     lower, upper = objective.space.bounds()
-    best: list[Evaluation] = []
-    point_count = max(sum(int(np.isfinite(f.frames.positions).all(axis=2).sum())
-                          for f in objective.forwards), 1)
+    rule = _Settling(objective, delta_m2)
+    if any(getattr(forward, "drive", "") == "force" for forward in objective.forwards):
+        # What its errors do to the points is found with the derivatives.
+        _required(objective, start)
 
     def cost(free: np.ndarray) -> float:
         known = objective.log.find(free)
         if known is not None:
+            rule.seen(known.objective, known.loss)
             return known.objective
         found = objective.evaluate(free)
         if found is None:
             return FAILED_OBJECTIVE
-        if not best or found.objective < best[0].objective:
-            best[:] = [found]
+        rule.seen(found.objective, found.loss)
         return found.objective
-
-    def settled(_free: np.ndarray) -> None:
-        if delta_m2 is not None and best and best[0].loss / point_count < delta_m2:
-            raise StopIteration
 
     steps = np.r_[np.full(objective.space.group_count, 0.5),
                   [0.03 if name == "poisson" else 0.3 for name in objective.space.extra]]
     simplex = np.vstack([start, start + np.diag(steps)])
     found = minimize(cost, start, method="Nelder-Mead", bounds=list(zip(lower, upper, strict=True)),
-                     callback=settled, options={
+                     callback=rule.after_iteration, options={
                          "initial_simplex": np.clip(simplex, lower, upper), "xatol": tolerance,
                          "fatol": tolerance, "maxfev": evaluation_limit, "adaptive": False})
-    return Fit(_required(objective, found.x), bool(found.success), str(found.message))
+    return Fit(_required(objective, found.x), *rule.verdict(bool(found.success), evaluation_limit))
+
+
+class _Settling:
+    """The paper's end: the mean squared error of the points settles below a threshold."""
+
+    def __init__(self, objective: Objective, delta_m2: float | None):
+        self._delta = delta_m2
+        self._points = max(sum(int(np.isfinite(f.frames.positions).all(axis=2).sum())
+                               for f in objective.forwards), 1)
+        self._window = SETTLED_ITERATIONS * (objective.space.size + 1)
+        self._best = (np.inf, np.inf)
+        self._course: list[float] = []
+        self._has_settled = False
+
+    @property
+    def _error(self) -> float:
+        """Mean squared distance of the best candidate [m^2]."""
+        return self._best[1] / self._points
+
+    def seen(self, objective: float, loss: float) -> None:
+        self._best = min(self._best, (objective, loss))
+
+    def after_iteration(self, _free: np.ndarray) -> None:
+        self._course.append(self._best[0])
+        if self._delta is not None and self._error < self._delta:
+            raise StopIteration
+        if len(self._course) > self._window:
+            fell = self._course[-1 - self._window] - self._course[-1]
+            self._has_settled = fell <= min(SETTLED_FALL, 1e-3 * self._course[-1])
+        if self._has_settled:
+            raise StopIteration
+
+    def verdict(self, is_small: bool, limit: int) -> tuple[bool, str]:
+        """Whether it converged, and why it ended."""
+        error = f"the mean squared distance of the points, {self._error:.3g} m2,"
+        if self._delta is not None and self._error < self._delta:
+            return True, f"{error} fell below {self._delta:.3g} m2"
+        if not (self._has_settled or is_small):
+            return False, (f"{limit} simulations were not enough: {error} still falls. Allow more "
+                           "(--evaluations), or use --method gauss-newton")
+        if self._delta is None:
+            return True, f"{error} settled"
+        return False, (f"{error} settled above the {self._delta:.3g} m2 asked for (--delta-m2): "
+                       "noise or the model's error is larger than that")
 
 
 def _required(objective: Objective, free: np.ndarray) -> Evaluation:

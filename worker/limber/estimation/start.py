@@ -5,7 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from limber.estimation.objective import Forward, Objective
+from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
+
+PARTS = (0.25, 0.45, 0.7)
+"""Of a fast pull's frames, how many are fitted before all of them are."""
+FEWEST_FRAMES = 6
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:
@@ -14,6 +19,12 @@ def scaled_start(objective: Objective, values: Values) -> Values:
     How far a force moves a branch depends on force over modulus alone: a few solutions give the
     scale. Where a force or gravity drives, a few decades are tried instead.
     """
+    if any(hasattr(forward, "until") for forward in objective.forwards):
+        return _step_by_step(objective, values)
+    return _scaled(objective, values)
+
+
+def _scaled(objective: Objective, values: Values) -> Values:
     factors = [factor for forward in objective.forwards
                if (factor := _force_ratio(forward, values)) is not None]
     if factors:
@@ -23,6 +34,27 @@ def scaled_start(objective: Objective, values: Values) -> Values:
            for forward in objective.forwards):
         return _from_the_stiff_side(objective, values)
     return _scanned(objective, values)
+
+
+def _step_by_step(objective: Objective, values: Values) -> Values:
+    """Fit the beginning of fast pulls first, then more and more of them.
+
+    A branch of wrong moduli swings at other frequencies: later in the motion it is anywhere, and
+    a fit to all frames at once ends beside the truth. Over a quarter of the frames it cannot be a
+    whole swing off; what is found there foretells the next part.
+    """
+    space = objective.space
+    likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
+    for number, part in enumerate(PARTS):
+        forwards = [forward.until(max(int(part * len(forward.frames)), FEWEST_FRAMES))
+                    if hasattr(forward, "until") else forward for forward in objective.forwards]
+        short = objective.with_forwards(forwards).with_space(likely)
+        if number == 0:
+            values = _scaled(short, values)
+        fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2)
+        values = likely.unpack(fit.evaluation.free)
+        objective.forward_count = short.forward_count
+    return values
 
 
 def _force_ratio(forward: Forward, values: Values) -> float | None:

@@ -1,0 +1,167 @@
+"""A force that drives a simulation and was measured with errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.benchmarks.paper_branches import measured
+from limber.errors import InputError
+from limber.estimation.alignment import frames_of
+from limber.estimation.dynamic import DynamicForward
+from limber.estimation.force_motion import motion_response
+from limber.estimation.grasping import grasp_on
+from limber.estimation.input_force import course_of, nodal_loads
+from limber.estimation.optimise import nelder_mead
+from limber.estimation.points import point_operator
+from limber.estimation.recording import GraspEntry
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.virtual_pull import VirtualPullSettings, simulate_pull
+from limber.mechanics.dynamics import simulate_dynamics
+from limber.mechanics.grasp import rotation_matrix
+
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
+
+
+def driven(pull, **entry):
+    return replace(pull, entry=pull.entry.model_copy(update={"drive": "force"} | entry))
+
+
+@pytest.fixture(scope="module")
+def noisy(small_pull):
+    return driven(measured(small_pull, 3))
+
+
+def test_noise_of_the_force_is_no_modulus(small_bench, noisy):
+    """2 % of force noise: every interval holds the truth; the inner moduli are known to 15 %; no
+    misfit is left, whose share the force's errors were where it was taken as exact.
+    """
+    found = small_bench.fit([noisy], SETTINGS)
+    low, high = found.uncertainty.young_interval.T
+    assert np.all((low < TRUTH) & (TRUTH < high))
+    assert np.abs(found.values.young / TRUTH - 1)[:3].max() < 0.15
+    assert high[3] / low[3] > 2 * high[0] / low[0]
+    assert 0.7 < found.uncertainty.variance_factor < 1.35
+
+
+def test_elimination_equals_the_effective_variance(small_bench, noisy):
+    """The projected objective is that of residuals weighted by the points' noise plus the
+    force's, carried through the compliance.
+    """
+    objective = small_bench.objective([noisy], SETTINGS)
+    evaluation = objective.evaluate(np.log(1.1 * TRUTH), jacobian=True)
+    forward = objective.forwards[0]
+    rows, _ = objective._rows(0, evaluation.pulls[0])
+    points = evaluation.pulls[0].positions.size
+    sigma = noisy.entry.sensor.position_sigma_m
+    through = forward.response.points.reshape(points, -1) / sigma
+    readings = forward.response.wrenches.reshape(-1, through.shape[1])
+    prior = np.linalg.inv(readings.T @ readings) * noisy.entry.sensor.force_sigma_n**2
+    # Of the course, the readings leave their best guess; where it starts.
+    guess = np.linalg.lstsq(readings, -rows[points:] * noisy.entry.sensor.force_sigma_n,
+                            rcond=None)[0]
+    off = rows[:points] + through @ guess
+    weighted = off @ np.linalg.solve(np.eye(points) + through @ prior @ through.T, off)
+    left = rows[points:] + readings @ guess / noisy.entry.sensor.force_sigma_n
+    assert 2 * evaluation.objective == pytest.approx(weighted + left @ left, rel=1e-6)
+    assert evaluation.unknown_count == through.shape[1]
+
+
+def test_following_the_force_moves_it_to_the_truth(small_bench, small_pull, noisy):
+    """At the true moduli the points tell more of the force than its sensor alone."""
+    objective = small_bench.objective([noisy], SETTINGS)
+    before = objective.evaluate(np.log(TRUTH), jacobian=True)
+    true = small_pull.wrenches[:, :3]
+    assert objective.follow_forces(before)
+    after = objective.evaluate(np.log(TRUTH), jacobian=True)
+    errors = [np.linalg.norm(each.pulls[0].forces - true) for each in (before, after)]
+    assert errors[1] < 0.85 * errors[0]
+    assert after.objective == pytest.approx(before.objective, rel=0.02)
+
+
+def test_a_stated_load_is_exact_and_a_jerky_force_gets_more_key_frames(noisy):
+    """A force that never changes is no reading; one that jerks is followed frame by frame."""
+    frames = frames_of(noisy)
+    sigma = np.full((len(frames), 3), noisy.entry.sensor.force_sigma_n)
+    steady = frames.wrenches.copy()
+    steady[:, :3] = (0.0, 0.0, -1.0)
+    assert course_of(replace(frames, wrenches=steady), sigma, 6, 3).exact
+    assert len(course_of(frames, sigma, 6, 3).keys) < len(frames)
+    jerky = frames.wrenches.copy()
+    jerky[::2, :3] += 1.0
+    assert len(course_of(replace(frames, wrenches=jerky), sigma, 4, 3).keys) == len(frames)
+
+
+def test_a_clamped_gripper_needs_its_torque(small, small_bench):
+    """Its force and torque together bend the branch as its pose does; without torque: refused.
+
+    (As long as the pull does not press the branch together: held it stays, pushed it buckles.)
+    """
+    pull = simulate_pull(small.truth(), "pull-1", VirtualPullSettings(
+        young=small.young, poisson=0.36, frames=8, mode="clamped", phase=0.5, seed=2,
+        reach=0.2, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
+    sensor = pull.entry.sensor
+    pull = driven(pull)
+    found = small_bench.objective([pull], SETTINGS).evaluate(np.log(TRUTH))
+    off = np.linalg.norm(found.pulls[0].positions - pull.observations.positions, axis=2)
+    moved = np.linalg.norm(pull.observations.positions[-1] - pull.observations.positions[0],
+                           axis=1)
+    # The patch is not stiffened, the mesh another one, and pressing magnifies both.
+    assert np.all(off[-1] < 0.12 * moved.max())
+    deaf = driven(pull, sensor=sensor.model_copy(update={"torque_sigma_nm": None}))
+    with pytest.raises(InputError, match="torque is not known"):
+        small_bench.objective([deaf], SETTINGS)
+    with pytest.raises(InputError, match="clamped"):
+        DynamicForward("p", small_bench.model, small_bench.weights, pull.entry, frames_of(pull),
+                       small_bench.points)
+
+
+def test_nodal_loads_have_the_wrench(small_bench, small):
+    """Their sum is the force; their torque about the recorded point, at the recorded rotation, is
+    the torque.
+    """
+    point = small.skeleton.point_at(0.9) + [1e-3, 0.0, 0.0]
+    entry = GraspEntry(point_m=tuple(map(float, point)), radius_m=0.012, mode="clamped")
+    mesh = small_bench.mesh
+    grasp = grasp_on(mesh, entry)
+    pose = np.array([0.1, 0.0, 0.3, 0.3, -0.2, 0.5])
+    turn = rotation_matrix(pose[3:])
+    placed = pose[:3] + (mesh.nodes - point) @ turn.T
+    wrench = np.array([1.0, -2.0, 0.5, 0.03, 0.02, -0.04])
+    loads = np.tensordot(wrench, nodal_loads(grasp, entry, pose, mesh.nodes, 6), axes=1)
+    assert np.allclose(loads.sum(axis=0), wrench[:3])
+    assert np.allclose(np.cross(placed - pose[:3], loads).sum(axis=0), wrench[3:])
+
+
+def test_response_of_a_small_motion(small_bench):
+    """Modes give what the force's noise does to the points, as the simulation does."""
+    bench = small_bench
+    entry = GraspEntry(point_m=tuple(map(float, bench.branch.skeleton.point_at(0.92))),
+                       radius_m=0.012, mode="pinned")
+    grasp, times = grasp_on(bench.mesh, entry), np.linspace(0.0, 0.6, 13)
+    model = bench.model.with_parameters(young=bench.weights @ TRUTH)
+    forces = 1e-5 * np.random.default_rng(1).standard_normal((13, 3))
+    operator = point_operator(bench.mesh, bench.points)
+    response = motion_response(model, nodal_loads(grasp, entry, np.zeros(6), bench.mesh.nodes, 3),
+                               operator, times)
+    result = simulate_dynamics(model, grasp=grasp, grasp_forces=forces, times=times)
+    true = np.array([operator @ frame.ravel() for frame in result.displacement])
+    found = (response @ forces.ravel()).reshape(13, -1)
+    assert np.linalg.norm(found - true) < 0.03 * np.linalg.norm(true)
+
+
+def test_nelder_mead_says_why_it_ended(small_bench, noisy):
+    """Too few simulations, and a threshold under the noise: neither converged, each in words."""
+    settings = SETTINGS.model_copy(update={"key_frames": 4})
+    pull = driven(noisy)
+    pull = replace(pull, entry=pull.entry.model_copy(update={"drive": "pose"}))
+    short = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.3,
+                        evaluation_limit=12)
+    assert not short.converged and "12 simulations were not enough" in short.reason
+    loose = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.1,
+                        delta_m2=1e-3)
+    assert loose.converged and "fell below 0.001 m2" in loose.reason
+    strict = nelder_mead(small_bench.objective([pull], settings), np.log(TRUTH) + 0.05,
+                         delta_m2=1e-9)
+    assert not strict.converged and "settled above" in strict.reason
