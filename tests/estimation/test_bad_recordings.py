@@ -219,3 +219,14 @@ def test_rgbd_faults(branch_folder, tables, capsys):
     (folder / "mask").mkdir()
     Image.fromarray(np.full((6, 8), 255, np.uint8)).save(folder / "mask" / "f0.png")
     assert warned(run(0), "2 of 3 frames have no mask")
+
+
+def test_markers_in_another_unit_are_refused(branch_folder, capsys):
+    """Millimetres taken for metres: refused at once, and the moduli in the mesh stay."""
+    def change(source):
+        changed(source / "markers.csv", lambda times, values: (times, 1000 * values))
+    before = (branch_folder / "mesh.vtu").read_bytes()
+    pull_with(branch_folder, "millimetres", change)
+    line = estimated(branch_folder, capsys, "--pull", "millimetres", code=2)
+    assert "another unit" in line["error"] and "--unit" in line["error"]
+    assert (branch_folder / "mesh.vtu").read_bytes() == before

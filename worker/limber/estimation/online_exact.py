@@ -16,6 +16,7 @@ from limber.estimation.grasping import grasp_on, pose_on
 from limber.estimation.points import point_operator
 from limber.estimation.recording import GraspEntry
 from limber.geometry.tet_mesh import TetMesh
+from limber.jobs.process import end_with_parent
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced import ReducedModel, ReducedSettings, reduce_snapshots
 from limber.mechanics.reduced_training import Trainer, sample_young
@@ -160,6 +161,7 @@ _solver: list[ExactSolver] = []
 
 
 def _begin(branch: FullBranch) -> None:
+    end_with_parent()
     # Ctrl-C reaches the whole group of processes; the parent ends this one in order.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _solver[:] = [ExactSolver(branch)]

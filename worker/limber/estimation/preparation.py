@@ -183,7 +183,11 @@ def _with_overrides(entry: PullEntry, settings: EstimateSettings) -> PullEntry:
 
 
 def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, warn: Warn) -> None:
-    """Warn where the first frame, at rest, shows the points elsewhere than the branch has them."""
+    """Warn where the first frame, at rest, shows the points elsewhere than the branch has them.
+
+    Raises:
+        InputError: all of them lie farther off than the branch is long.
+    """
     at_rest = np.linalg.norm(frames.poses[:, :3] - pull.entry.grasp.point_m, axis=1) < 2e-3
     if not len(rest) or not at_rest.any() or pull.entry.gravity_m_s2 is not None:
         return
@@ -191,6 +195,13 @@ def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, warn: Warn) -> Non
     if not np.isfinite(shown).any():
         return
     off = np.linalg.norm(np.nanmedian(shown, axis=0) - rest, axis=1)
+    size = float(np.linalg.norm(np.ptp(np.vstack([rest, pull.entry.grasp.point_m]), axis=0)))
+    if np.nanmin(off) > max(2 * size, 0.1):
+        raise InputError(
+            f"{pull.name}: at rest the observed points lie {np.nanmin(off):.3g} to "
+            f"{np.nanmax(off):.3g} m from where this branch, about {size:.2g} m long, has them.",
+            "The recording is in another unit or another frame of reference.",
+            "Import it with --unit, or with --nominal (where on the branch the markers are).")
     limit = 5e-3 + 5 * pull.entry.sensor.position_sigma_m
     if np.nanmax(off) > limit:
         warn(f"{pull.name}: at rest the observed points lie up to {np.nanmax(off) * 1e3:.0f} mm "

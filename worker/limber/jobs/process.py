@@ -1,9 +1,11 @@
 """One stage as a process: its progress relayed, its result returned, cancelled with its parent."""
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from typing import Any, TextIO
 
@@ -53,6 +55,24 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
         if process.returncode != 0:
             raise _failure(name, process.returncode, result, errors, fix)
     return result
+
+
+def end_with_parent() -> None:
+    """Called in a pool's process: end it when the process that made the pool is killed.
+
+    Python's pool processes wait for work for ever when their parent dies without a word.
+    """
+    from multiprocessing import parent_process
+
+    parent = parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()
 
 
 def _read_lines(process: subprocess.Popen, progress: Progress) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import WorkError
+from limber.jobs.process import end_with_parent
 from limber.planning.field import GraspSamples, fit_field
 from limber.planning.grasp_model import GraspModel, Reach, acceptable, read_grasp_model
 from limber.progress import SILENT, Progress
@@ -181,6 +182,7 @@ _stop: Any = None
 
 def _join_pool(channel: Any, stop: Any) -> None:
     global _channel, _stop
+    end_with_parent()
     _channel, _stop = channel, stop
 
 
