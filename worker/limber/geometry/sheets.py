@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-_SAMPLE = 1500
+_SAMPLE = 400
+_ENOUGH = 150  # points that tell a plane
 _REACH = 0.05  # of the cloud's diagonal: what is looked at around a point
 _FLAT, _WIDE = 0.01, 0.3  # variance across a sheet, and along its narrower side, over the next
 _TRIES = 200
@@ -32,6 +33,7 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
     for point, near in zip(points[sample], tree.query_ball_point(points[sample], reach),
                            strict=True):
         if len(near) > 10:
+            near = near[::len(near) // _ENOUGH + 1]
             values, axes = np.linalg.eigh(np.cov(dense[near].T))
             if values[0] < _FLAT * values[1] and values[1] > _WIDE * values[2]:
                 centres.append(point)
