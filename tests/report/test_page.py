@@ -63,7 +63,7 @@ def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():
         "sensor": [0.01, 0.02], "geometry": None, "mesh": [0.005, 0.005], "total": [0.011, 0.021]}}
     assert deviation_rows(estimate)[1:] == [
         ["1", "0.25", "1.0 %", "not examined", "0.5 %", "1.1 %"],
-        ["2", "0.5", "2.0 %", "not examined", "0.5 %", "2.1 %"]]
+        ["2", "0.50", "2.0 %", "not examined", "0.5 %", "2.1 %"]]
     assert deviation_rows({"fractions": [0.5]}) == []
     scores = {"a": {"rms_m": 0.0012, "rms_force_n": 0.034, "relative_distance": 0.021,
                     "relative_force": 0.04, "in_fit": True},

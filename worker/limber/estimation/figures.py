@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.estimation.identifiability import UNRESOLVED_DEVIATION
 from limber.estimation.uncertainty import OUTLIER
 from limber.store import Branch
 
@@ -21,7 +22,8 @@ def report_figures(branch: Branch, estimate: dict[str, Any]) -> Iterator[tuple[A
     yield (young_along_branch(estimate), _interval_caption(estimate))
     yield (what_the_pulls_tell(estimate),
            "How well the pulls tell each parameter: standard deviation before the fit (at its "
-           "start) and after it. Over 0.5 a modulus is linked to its neighbour.")
+           f"start) and after it. Over {UNRESOLVED_DEVIATION:g} (line) a modulus is linked to its "
+           "neighbour.")
     yield (loss_over_evaluations(estimate),
            "Loss against forward simulations; the line is the best so far.")
     for pull in estimate["pulls"]:
@@ -86,7 +88,7 @@ def what_the_pulls_tell(estimate: dict[str, Any]) -> Any:
     axes.bar(place - 0.2, np.clip(before[:len(names)], least, 1e3), 0.38, color="#bbbbbb",
              label="before the fit")
     axes.bar(place + 0.2, np.clip(after, least, 1e3), 0.38, color=SIMULATED, label="after it")
-    axes.axhline(1.0, color=TRUE, lw=0.8)
+    axes.axhline(UNRESOLVED_DEVIATION, color=TRUE, lw=0.8)
     axes.set_yscale("log")
     axes.set_xticks(place, names)
     axes.set_ylabel("standard deviation of log E")

@@ -55,7 +55,7 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     for number, place in enumerate(estimate["fractions"]):
         shares = [f"{100 * parts[name][number]:.1f} %" if parts.get(name) else "not examined"
                   for name in known]
-        rows.append([str(number + 1), f"{place:g}", *shares])
+        rows.append([str(number + 1), f"{place:.2f}", *shares])
     return rows
 
 
