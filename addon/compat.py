@@ -18,12 +18,6 @@ def can_denoise() -> bool:
     return bool(getattr(_cycles, "with_openimagedenoise", False))
 
 
-def eevee_engine() -> str:
-    """Return EEVEE's identifier: it was BLENDER_EEVEE_NEXT from 4.2 to 4.5."""
-    engines = bpy.types.RenderSettings.bl_rna.properties["engine"].enum_items.keys()
-    return "BLENDER_EEVEE_NEXT" if "BLENDER_EEVEE_NEXT" in engines else "BLENDER_EEVEE"
-
-
 def use_nodes(thing: bpy.types.Material | bpy.types.World) -> None:
     """Give a material or world its nodes; from 5.0 on it always has them."""
     if bpy.app.version < (5, 0, 0):

@@ -60,7 +60,7 @@ class VirtualPullSettings(BaseModel):
     drive: Literal["pose", "force"] = Field(
         "pose", description="What is said to move the branch; force: its force, as in the paper.")
     weight: float | None = Field(
-        None, gt=0, description="Hang a growing weight of at last so many kilograms on the grasp "
+        None, gt=0, description="Hang a growing weight of at last so many newtons on the grasp "
         "instead of pulling sideways (slow, driven by force).")
     damping: tuple[float, float] = Field(
         (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
@@ -210,7 +210,8 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
         kind=_kind(settings), point=np.array(entry.grasp.point_m),
         axis=np.array(entry.grasp.point_m) - truth.skeleton.nodes[0], travel=settings.reach * arc,
         turn=settings.turn, phase=phase, times=settings.times,
-        weight=np.array(truth.gravity) * (settings.weight or 0.0)), progress=progress)
+        weight=(settings.weight or 0.0) * np.array(truth.gravity)
+        / np.linalg.norm(truth.gravity)), progress=progress)
     operator = point_operator(truth.mesh, truth.control_points)
     positions = np.array([truth.control_points + (operator @ displacement.ravel()).reshape(-1, 3)
                           for displacement in made.displacements])

@@ -21,9 +21,10 @@ class PlanSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the grasp shall be [m]; without any goal a far pose is chosen and named."))
+        "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
+        "chosen and named."))
     tip_goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the branch's tip (its flower) shall be [m]."))
+        "Where the branch's tip (its flower) shall be, in the branch's frame [m]."))
     goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp starts [m]; default the rest pose."))
@@ -142,7 +143,8 @@ def _check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> 
     if not field.region.contains(start)[0]:
         raise InputError(f"The start ({place}) m lies outside the sampled region.",
                          "The branch's energy is not known there.",
-                         "Choose a start nearer to rest, or sample a larger --deflection.")
+                         "Choose a start nearer to rest, or sample farther (`limber energy "
+                         "--deflection`).")
     energy = float(field.energy(start)[0])
     force = float(np.linalg.norm(field.force(start)))
     raise InputError(f"At the start the energy is {energy:.3g} J and the force {force:.3g} N.",

@@ -138,7 +138,8 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
         f"{distance.min():.3f} m, with the grasp at ({place}).",
         f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
         f"{_place(field.region.low)} to {_place(field.region.high)}.",
-        "Choose a goal nearer to that, widen --goal-tolerance, or sample a larger --deflection.")
+        "Choose a goal nearer to that, widen --goal-tolerance, or sample farther (`limber "
+        "energy --deflection`).")
 
 
 def _place(point: np.ndarray) -> str:
