@@ -73,3 +73,15 @@ def test_the_largest_part_of_a_wide_interval_is_named():
     assert told(0.05, 0.08) == []
     assert "point 2" in told(0.05, 0.2)[0] and "scan from more sides" in told(0.05, 0.2)[0]
     assert "More pulls" in told(0.3, 0.2)[0] and "More pulls" in told(0.3, None)[0]
+
+
+def test_a_pull_that_its_force_drives_is_no_exception(monkeypatch, small, small_bench, small_pull):
+    """Its forces are unknowns with readings, eliminated: radii 1 % off are still 4 %."""
+    pull = measured(small_pull, 3)
+    pull = replace(pull, entry=pull.entry.model_copy(update={"drive": "force"}))
+    bench, skeleton = small_bench, small.skeleton
+    subject = Subject(bench.mesh, skeleton, bench.points, bench.weights, bench.model,
+                      Values(np.full(4, 1e7), 0.36, 900.0))
+    found = _with(monkeypatch, (bench.fit([pull], SETTINGS), subject), [
+        replace(skeleton, radius=skeleton.radius * (1 + sign * 0.01)) for sign in 4 * (1, -1)])
+    assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
