@@ -91,8 +91,16 @@ class DynamicForward:
         return Simulated(positions, forces, d_positions * scale, d_forces * scale)
 
     def until(self, count: int) -> "DynamicForward":
-        """Return the first ``count`` frames of the pull."""
-        return DynamicForward(*self._arguments, self.frames[:count], self.rest_points)
+        """Return the first ``count`` frames of the pull, driven by force where that is known.
+
+        Led along a path, a branch of wrong moduli is stretched, and its force is thousandfold;
+        by a force it is merely moved too far.
+        """
+        name, model, weights, entry = self._arguments
+        measured = np.isfinite(self.frames.wrenches[:, :3]).all()
+        if measured and entry.grasp.mode == "pinned":
+            entry = entry.model_copy(update={"drive": "force"})
+        return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points)
 
     def shift_force(self, change: np.ndarray) -> None:
         """Move the force by what a fit says of it, shape [3 f]; respond anew from there on."""

@@ -37,7 +37,7 @@ class Fit:
 
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
                  evaluation_limit: int = 40, tolerance: float = 3e-5, is_near: bool = False,
-                 ) -> Fit:
+                 force_rounds: int = FORCE_ROUNDS) -> Fit:
     """Levenberg-Marquardt in a trust region (scipy's ``least_squares``) on the free vector.
 
     Args:
@@ -48,6 +48,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         evaluation_limit: At most so many forward simulations.
         tolerance: Relative change of cost that ends it.
         is_near: Whether the start is next to the solution already.
+        force_rounds: How often the course of a measured input force is linearised anew at most.
 
     Raises:
         WorkError: no equilibrium at the start.
@@ -83,7 +84,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     for loss, ending in phases:
         found = minimised(moved, loss, ending)
         moved = found.x
-    for _ in range(FORCE_ROUNDS):
+    for _ in range(force_rounds):
         # Measured input forces are known better now, and so is what they do to the points.
         if not objective.follow_forces(_required(objective, moved + shift)):
             break

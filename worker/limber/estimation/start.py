@@ -51,7 +51,8 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
         short = objective.with_forwards(forwards).with_space(likely)
         if number == 0:
             values = _scaled(short, values)
-        fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2)
+        fit = gauss_newton(short, likely.pack(values), evaluation_limit=12, tolerance=1e-2,
+                           force_rounds=1)
         values = likely.unpack(fit.evaluation.free)
         objective.forward_count = short.forward_count
     return values
