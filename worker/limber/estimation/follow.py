@@ -179,7 +179,7 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
     rest = subject.control_points if pull.entry.rest_points_m is None else np.array(
         pull.entry.rest_points_m)
     branch = FullBranch(subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson,
-                        start.density, tuple(gravity))
+                        start.density, tuple(gravity), subject.model.point_masses)
     return Begun(reduced, branch, pull, deviation)
 
 

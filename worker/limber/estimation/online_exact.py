@@ -17,7 +17,7 @@ from limber.estimation.points import point_operator
 from limber.estimation.recording import GraspEntry
 from limber.geometry.tet_mesh import TetMesh
 from limber.jobs.process import end_with_parent
-from limber.mechanics.model import BranchModel
+from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.reduced import ReducedModel, ReducedSettings, reduce_snapshots
 from limber.mechanics.reduced_training import Trainer, sample_young
 from limber.mechanics.sensitivities import static_sensitivities
@@ -55,7 +55,7 @@ class FullBranch:
         weights: From control points to tetrahedra, shape [tet_count, K].
         entry: The recorded grasp.
         rest_points: Observed points at rest [m], shape [m, 3].
-        poisson, density, gravity: Of the branch.
+        poisson, density, gravity, point_masses: Of the branch.
     """
 
     mesh: TetMesh
@@ -65,11 +65,13 @@ class FullBranch:
     poisson: float
     density: float
     gravity: tuple[float, float, float]
+    point_masses: tuple[PointMass, ...] = ()
 
     def model(self, young: np.ndarray) -> BranchModel:
         """Return the branch with these moduli at the control points [Pa]."""
         return BranchModel(self.mesh, young=self.weights @ young, poisson=self.poisson,
-                           density=self.density, gravity=self.gravity)
+                           density=self.density, gravity=self.gravity,
+                           point_masses=self.point_masses)
 
 
 class ExactSolver:

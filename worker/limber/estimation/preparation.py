@@ -19,7 +19,7 @@ from limber.geometry.control_points import control_points
 from limber.geometry.skeleton import Skeleton
 from limber.geometry.tet_mesh import TetMesh
 from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import BranchModel
+from limber.mechanics.model import BranchModel, point_masses
 from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
 from limber.store import Branch
@@ -63,7 +63,9 @@ def subject_of(branch: Branch, settings: EstimateSettings) -> Subject:
     poisson = _given(settings.poisson, mesh.cell_data["poisson"])
     density = _given(settings.density, mesh.cell_data["density"])
     damping = RayleighDamping()
-    model = BranchModel(mesh, young=young, poisson=poisson, density=density, gravity=None)
+    # Twigs that the mesh leaves out weigh on it in pulls that gravity bends.
+    model = BranchModel(mesh, young=young, poisson=poisson, density=density, gravity=None,
+                        point_masses=point_masses(branch))
     start = Values(np.full(len(points), young), poisson, density,
                    (damping.mass, damping.stiffness))
     return Subject(mesh, skeleton, points, young_weights(mesh, points), model, start)

@@ -77,7 +77,7 @@ def _pulled(evaluation: Evaluation, objective: Objective, subject: Subject, mesh
     """
     start = subject.model
     model = BranchModel(mesh, young=start.young, poisson=start.poisson, density=start.density,
-                        gravity=None)
+                        gravity=None, point_masses=start.point_masses)
     weights = young_weights(mesh, subject.control_points)
     forwards = [_forward(forward, model, weights) for forward in objective.forwards]
     for forward, hint in zip(forwards, hints or [], strict=False):
