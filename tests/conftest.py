@@ -1,8 +1,21 @@
-"""What every test shares: the folder of the real recordings."""
+"""What every test shares: real recordings; small meshes, branches and pulls with known truth."""
 
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from tests.subjects.meshes import box_mesh
+from tests.subjects.paper_branches import Bench, PaperBranch, exact_pull
+
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.recordings.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+)
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
@@ -13,3 +26,79 @@ def shared_data() -> Path:
     if not SHARED.is_dir():
         pytest.skip(f"the real recordings are not here (looked for {SHARED.name} in ../shared)")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def short_box() -> TetMesh:
+    """A block of 72 quadratic tetrahedra, fixed at z = 0."""
+    return box_mesh()
+
+
+@pytest.fixture(scope="session")
+def slender_beam() -> TetMesh:
+    """A square beam 0.6 m long and 8 mm thick, 1,488 quadratic tetrahedra."""
+    return box_mesh((0.008, 0.008, 0.6), (1, 1, 248))
+
+
+@pytest.fixture(scope="session")
+def small() -> PaperBranch:
+    """Short and thick: few tetrahedra; E falls by a factor of 4 along it."""
+    return PaperBranch("small", (40e6, 22e6, 12e6, 3e6), 0.36, 0.40, (0.010, 0.008), 0.4)
+
+
+@pytest.fixture(scope="session")
+def small_pull(small) -> Pull:
+    """16 frames, without noise."""
+    return exact_pull(small, 0, frames=16)
+
+
+@pytest.fixture(scope="session")
+def small_bench(small) -> Bench:
+    return Bench(small, slice_length=2.0)
+
+
+@pytest.fixture
+def plain_pull() -> Pull:
+    """A recording made by hand: a spring of 50 N/m pulled out 0.1 m, two markers that follow."""
+    times = np.linspace(0.0, 4.0, 201)
+    eased = np.clip((times - 0.4) / 3.0, 0.0, 1.0)
+    way = 0.1 * eased**2 * (3 - 2 * eased)
+    poses = np.zeros((201, 6))
+    poses[:, 0], poses[:, 2] = way, 0.5
+    rng = np.random.default_rng(0)
+    wrenches = np.zeros((201, 6))
+    wrenches[:, 0] = 50.0 * way
+    wrenches[:, :3] += 0.02 * rng.standard_normal((201, 3))
+    seen = np.linspace(0.2, 3.8, 60)
+    moved = np.interp(seen, times, way)
+    positions = np.zeros((60, 2, 3))
+    positions[:, 0, 0], positions[:, 0, 2] = 0.3 * moved, 0.2
+    positions[:, 1, 0], positions[:, 1, 2] = 0.7 * moved, 0.35
+    entry = PullEntry(grasp=GraspEntry(point_m=(0.0, 0.0, 0.5), radius_m=0.01),
+                      sensor=SensorEntry(force_sigma_n=0.02))
+    return Pull("spring", entry, times, poses, wrenches, Observations(seen, positions))
+
+
+@pytest.fixture(scope="session")
+def branch_template(tmp_path_factory, small, small_bench):
+    """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
+    from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+    from limber.store import Branch
+
+    folder = tmp_path_factory.mktemp("branches") / "small.branch"
+    branch = Branch.create(folder)
+    with branch.stage("reconstruct") as stage:
+        small.skeleton.write_swc(stage.path("skeleton.swc"))
+        count = small_bench.mesh.tet_count
+        small_bench.mesh.with_data(cell_data={
+            "young": np.full(count, 1e8), "poisson": np.full(count, 0.36),
+            "density": np.full(count, 900.0)}).write(stage.path("mesh.vtu"))
+    settings = VirtualPullSettings(young=small.young, poisson=0.36, frames=12, seed=4, phase=0.5)
+    virtual_pull(folder, "pull-1", settings)
+    return folder
+
+
+@pytest.fixture
+def branch_folder(branch_template, tmp_path):
+    """A copy to work in: a branch folder can be moved and copied."""
+    return shutil.copytree(branch_template, tmp_path / "small.branch")

@@ -7,7 +7,7 @@ import sys
 def test_a_factorisation_leaves_every_library_with_one_thread():
     """After a static solve all BLAS libraries of the process, cvxopt's too, use one thread."""
     program = (
-        "from limber.geometry.cylinder_mesh import straight_beam\n"
+        "from limber.geometry.tets.cylinder_mesh import straight_beam\n"
         "from limber.mechanics import BranchModel, solve_static\n"
         "mesh = straight_beam(0.2, 0.01, slice_count=3)\n"
         "solve_static(BranchModel(mesh, young=1e8, poisson=0.3, density=900.0)).require()\n"

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.geometry.cylinder_mesh import straight_beam
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.store import Branch
 
 ROOT = Path(__file__).parents[2]

@@ -29,7 +29,7 @@ def positions(bpy):
 
 def _scene_in_process(addon, branch, path, bpy):
     """Build the scene here, as the process of `limber scene` does, without rendering."""
-    from limber.scene_data import scene_data
+    from limber.scene.data import scene_data
     from limber.store import Branch
 
     scenes = importlib.import_module("limber_addon.scene")
@@ -189,7 +189,7 @@ def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
 
 def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     """Frames of another mesh end the process with code 3 and a reason, not with a still branch."""
-    from limber.scene_data import scene_data
+    from limber.scene.data import scene_data
     from limber.store import Branch
 
     scene_data(Branch.open(beam.folder)).write(tmp_path / "data.npz")

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import Bench
 
-from limber.benchmarks.paper_branches import Bench
-from limber.estimation.alignment import Frames
-from limber.estimation.dynamic import DynamicForward
+from limber.estimation.forward.dynamic import DynamicForward
 from limber.estimation.identifiability import identifiability, require_scale
 from limber.estimation.objective import Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values
+from limber.recordings.alignment import Frames
 
 YOUNG = np.array([40e6, 30e6, 22e6, 16e6])
 EXTRA = ("density", "alpha", "beta")

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import measured
 
-from limber.benchmarks.paper_branches import measured
 from limber.errors import Cancelled, InputError
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.identifiability import identifiability, link_unresolved, require_scale
@@ -13,10 +13,10 @@ from limber.estimation.objective import Objective, Stopped
 from limber.estimation.optimise import gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.preparation import require_scale_in_principle
-from limber.estimation.recording import Observations
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.uncertainty import uncertainty
 from limber.progress import Progress
+from limber.recordings.recording import Observations
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=8)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

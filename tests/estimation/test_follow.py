@@ -5,8 +5,8 @@ import time
 
 import numpy as np
 
-from limber.estimation import follow
-from limber.estimation.recording import write_pull
+from limber.estimation.online import follow
+from limber.recordings.recording import write_pull
 
 
 def test_rows_are_taken_as_they_are_written(tmp_path, plain_pull, monkeypatch):

@@ -10,14 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from limber.cli import call
 from limber.errors import InputError
-from limber.estimation.grasping import grasp_on
-from limber.estimation.hung_load import settled
-from limber.estimation.importing import _against
-from limber.estimation.points import point_operator
-from limber.estimation.recording import GraspEntry, Observations, read_pull
-from limber.estimation.registration import read_nominal, register
+from limber.estimation.forward.hung_load import settled
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics import solve_static
+from limber.mechanics.statics.solve import solve_static
+from limber.recordings.grasping import grasp_on
+from limber.recordings.importing import _against
+from limber.recordings.points import point_operator
+from limber.recordings.recording import GraspEntry, Observations, read_pull
+from limber.recordings.registration import read_nominal, register
 
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "silicone_beam"
 YOUNG, WEIGHTS = 2.5e7, (0.3, 0.7)

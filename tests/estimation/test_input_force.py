@@ -4,21 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import measured
 
-from limber.benchmarks.paper_branches import measured
 from limber.errors import InputError
-from limber.estimation.alignment import frames_of
-from limber.estimation.dynamic import DynamicForward
-from limber.estimation.force_motion import motion_response
-from limber.estimation.grasping import grasp_on
-from limber.estimation.input_force import course_of, nodal_loads
+from limber.estimation.forward.dynamic import DynamicForward
+from limber.estimation.forward.force_motion import motion_response
+from limber.estimation.forward.input_force import course_of, nodal_loads
 from limber.estimation.optimise import nelder_mead
-from limber.estimation.points import point_operator
-from limber.estimation.recording import GraspEntry
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import VirtualPullSettings, simulate_pull
-from limber.mechanics.dynamics import simulate_dynamics
+from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.grasp import rotation_matrix
+from limber.recordings.alignment import frames_of
+from limber.recordings.grasping import grasp_on
+from limber.recordings.points import point_operator
+from limber.recordings.recording import GraspEntry
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import Bench
 
-from limber.benchmarks.paper_branches import Bench
-from limber.estimation.grasping import grasp_on
 from limber.estimation.model_error import (
     ModelError,
     geometry_error,
@@ -14,12 +13,13 @@ from limber.estimation.model_error import (
     refined,
     total_interval,
 )
-from limber.estimation.points import point_operator
-from limber.estimation.recording import GraspEntry
 from limber.estimation.uncertainty import repeated
-from limber.geometry.skeleton_files import write_cylinders
+from limber.geometry.skeleton.files import write_cylinders
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics import solve_static
+from limber.mechanics.statics.solve import solve_static
+from limber.recordings.grasping import grasp_on
+from limber.recordings.points import point_operator
+from limber.recordings.recording import GraspEntry
 
 YOUNG = np.array([40e6, 22e6, 12e6, 3e6])
 

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import Bench, measured
 
-from limber.benchmarks.paper_branches import Bench, measured
-from limber.estimation.alignment import frames_of
-from limber.estimation.online import OnlineEstimator, OnlineFrame
-from limber.estimation.online_exact import FullBranch, Here
+from limber.estimation.online.exact import FullBranch, Here
+from limber.estimation.online.filter import OnlineEstimator, OnlineFrame
 from limber.estimation.settings import EstimateSettings
-from limber.mechanics.reduced import ReducedSettings, build_reduced
-from limber.mechanics.reduced_training import TrainingSettings
+from limber.mechanics.reduced.model import ReducedSettings, build_reduced
+from limber.mechanics.reduced.training import TrainingSettings
+from limber.recordings.alignment import frames_of
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 

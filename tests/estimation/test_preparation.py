@@ -6,7 +6,7 @@ import pytest
 
 from limber.estimation.preparation import subject_of
 from limber.estimation.settings import EstimateSettings
-from limber.mechanics.statics import solve_static
+from limber.mechanics.statics.solve import solve_static
 from limber.store import Branch
 
 

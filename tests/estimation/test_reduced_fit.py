@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import Bench, measured
 
-from limber.benchmarks.paper_branches import Bench, measured
 from limber.errors import InputError
 from limber.estimation import reduced_fit
-from limber.estimation.estimate import estimate, fit_pulls
+from limber.estimation.fit import estimate, fit_pulls
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.reduced_fit import CorrectedForward, Reduction
 from limber.estimation.settings import EstimateSettings

@@ -6,8 +6,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from limber.benchmarks import estimation_scans as campaign
-from limber.benchmarks.estimation_scans import Trial
+from benchmarks import estimation_scans as campaign
+from benchmarks.estimation_scans import Trial
 from limber.progress import SILENT
 
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import measured
 
-from limber.benchmarks.paper_branches import measured
 from limber.estimation import shape_error as module
-from limber.estimation.estimate import _tell_largest_part
+from limber.estimation.fit import _tell_largest_part
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings

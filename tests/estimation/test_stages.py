@@ -7,14 +7,14 @@ import pytest
 
 from limber.cli import call
 from limber.errors import Cancelled, InputError
-from limber.estimation.estimate import EVALUATIONS, estimate
 from limber.estimation.figures import report_figures
-from limber.estimation.follow import follow
-from limber.estimation.recording import read_pull
+from limber.estimation.fit import EVALUATIONS, estimate
+from limber.estimation.online.follow import follow
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.progress import Progress
+from limber.recordings.recording import read_pull
 from limber.store import Branch
 
 QUICK = EstimateSettings(key_frames=6)

@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.subjects.paper_branches import Bench
 
-from limber.benchmarks.paper_branches import Bench
 from limber.errors import InputError
-from limber.estimation.alignment import frames_of
-from limber.estimation.dynamic import DynamicForward
+from limber.estimation.forward.dynamic import DynamicForward
 from limber.estimation.identifiability import identifiability
 from limber.estimation.objective import Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.recording import read_pull, write_pull
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import TrueBranch, VirtualPullSettings, simulate_pull
-from limber.geometry.control_points import control_points
+from limber.geometry.skeleton.control_points import control_points
+from limber.recordings.alignment import frames_of
+from limber.recordings.recording import read_pull, write_pull
 
 TRUTH = (40e6, 22e6, 12e6, 3e6)
 FRACTIONS = (0.2, 0.4, 0.6, 0.8)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import Skeleton
 
 
 @pytest.fixture(scope="session")

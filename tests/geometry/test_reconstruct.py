@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 from limber.cli import call
 from limber.errors import Cancelled, InputError
 from limber.geometry.batch import reconstruct_folder
-from limber.geometry.cloud_files import read_points
+from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import generate_branch, write_generated
 from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
 from limber.geometry.reconstruct import ReconstructSettings, reconstruct
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, solve_static
 from limber.mechanics.simulate import SimulateSettings, simulate
 from limber.progress import Progress

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from limber.errors import MeshingError
-from limber.geometry.cylinder_mesh import curved_beam, split_wedges, straight_beam
-from limber.geometry.forks import crease_angles, smooth_forks
 from limber.geometry.generated import generate_branch
-from limber.geometry.implicit_surface import level_surface
-from limber.geometry.marks import mark
-from limber.geometry.mesh_quality import dihedral_angles, measure_quality, radius_ratios
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.surface import Surface
-from limber.geometry.surface_checks import check_surface
-from limber.geometry.surface_distance import distance_to_surface
-from limber.geometry.sweep import bending_factor, polygon_factor, rings
-from limber.geometry.tet_mesh import TetMesh
-from limber.geometry.tetrahedra import MeshSettings, mesh_branch, tetrahedralise
-from limber.geometry.tubes import branch_surface
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.surface.checks import check_surface
+from limber.geometry.surface.distance import distance_to_surface
+from limber.geometry.surface.forks import crease_angles, smooth_forks
+from limber.geometry.surface.implicit_surface import level_surface
+from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.sweep import bending_factor, polygon_factor, rings
+from limber.geometry.surface.tubes import branch_surface
+from limber.geometry.tets.cylinder_mesh import curved_beam, split_wedges, straight_beam
+from limber.geometry.tets.marks import mark
+from limber.geometry.tets.quality import dihedral_angles, measure_quality, radius_ratios
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch, tetrahedralise
 from limber.mechanics import BranchModel, solve_static
 
 
@@ -99,7 +99,7 @@ def test_level_surface_closes_a_ball():
 
 def test_an_empty_union_of_fillets_leaves_the_surface(y_skeleton, monkeypatch):
     """Where the union fails, the surface without fillets comes back with a warning."""
-    monkeypatch.setattr("limber.geometry.forks._joined", lambda *_: None)
+    monkeypatch.setattr("limber.geometry.surface.forks._joined", lambda *_: None)
     plain = branch_surface(y_skeleton)
     smooth, check, warnings = smooth_forks(plain, y_skeleton)
     assert smooth is plain and check.valid and "1 of 1 forks" in warnings[0]
@@ -107,7 +107,7 @@ def test_an_empty_union_of_fillets_leaves_the_surface(y_skeleton, monkeypatch):
 
 def test_forks_stay_sharp_where_a_fillet_fails(y_skeleton, monkeypatch):
     """A fillet that adds too much volume is given up, with a warning."""
-    monkeypatch.setattr("limber.geometry.forks.VOLUME_CHANGE", 1e-5)
+    monkeypatch.setattr("limber.geometry.surface.forks.VOLUME_CHANGE", 1e-5)
     plain = branch_surface(y_skeleton)
     smooth, check, warnings = smooth_forks(plain, y_skeleton)
     assert smooth is plain and check.valid

@@ -1,8 +1,8 @@
 """Warming up compiles what surfaces need."""
 
-from limber.geometry.face_crossings import pierced
-from limber.geometry.rounded_union import fillet_level
-from limber.geometry.surface_distance import _distances
+from limber.geometry.surface.distance import _distances
+from limber.geometry.surface.face_crossings import pierced
+from limber.geometry.surface.rounded_union import fillet_level
 from limber.geometry.warm_up import warm_up
 
 

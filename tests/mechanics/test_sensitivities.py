@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.mechanics.conftest import box_mesh
+from tests.subjects.meshes import box_mesh
 
 from limber.errors import InputError
 from limber.mechanics import (
@@ -17,7 +17,7 @@ from limber.mechanics import (
     static_sensitivities,
     young_weights,
 )
-from limber.mechanics.rest_shape import unloaded_rest_shape
+from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 
 PRECISE = StaticSettings(tolerance=1e-12)
 CONTROL = np.array([2e7, 1e7, 3e7])

@@ -6,12 +6,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from tests.mechanics.conftest import box_mesh
+from tests.subjects.meshes import box_mesh
 
 from limber.cli import call
 from limber.errors import ConvergenceError, InputError
-from limber.geometry.cylinder_mesh import straight_beam
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, solve_static
 from limber.mechanics.frames import read_pc2
 from limber.mechanics.simulate import SimulateSettings, simulate

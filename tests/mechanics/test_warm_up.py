@@ -6,7 +6,7 @@ import sys
 SCRIPT = """
 import sys
 import numpy as np
-from limber.geometry.cylinder_mesh import straight_beam
+from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics import *
 from limber.mechanics.strain import strain_state
 from limber.mechanics.warm_up import warm_up

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
-from limber.geometry.cylinder_mesh import straight_beam
+from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.perception.camera import (
     D455,
     Camera,

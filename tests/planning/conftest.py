@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from limber.geometry.cylinder_mesh import curved_beam
-from limber.geometry.marks import mark
-from limber.geometry.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.cylinder_mesh import curved_beam
+from limber.geometry.tets.marks import mark
 from limber.mechanics import Grasp
 from limber.planning.compare import PlanSettings
 from limber.planning.field import GraspSamples, fit_field

@@ -9,7 +9,7 @@ import pytest
 
 from limber.cli import call
 from limber.errors import BranchFolderError, Cancelled, ConvergenceError, InputError, NoPathError
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.compare import PlanSettings
 from limber.planning.field import EnergyField
 from limber.planning.figures import report_figures

@@ -3,7 +3,7 @@
 import pytest
 
 from limber.errors import BranchFolderError, InputError
-from limber.geometry.cylinder_mesh import straight_beam
+from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.report.page import write_report
 from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
 from limber.store import Branch

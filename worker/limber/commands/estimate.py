@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.estimation.estimate import estimate
+from limber.estimation.fit import estimate
 from limber.estimation.settings import EstimateSettings
 from limber.report.tables import held_out_rows, modulus_rows
 from limber.store import plain
@@ -24,7 +24,7 @@ def command(run: Run, branch_folder: Path, force: bool, is_online: bool, pace: f
             settings: EstimateSettings) -> dict[str, Any]:
     """Young's modulus along the branch with its uncertainty, from recorded or virtual pulls."""
     if is_online:
-        from limber.estimation.follow import follow
+        from limber.estimation.online.follow import follow
 
         result = plain(follow(branch_folder, settings, pace=pace, progress=run.progress,
                               warn=run.warn))

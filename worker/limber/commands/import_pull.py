@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.estimation.importing import ImportSettings, import_pull
+from limber.recordings.importing import ImportSettings, import_pull
 
 
 @stage_command("import-pull")

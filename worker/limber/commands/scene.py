@@ -1,7 +1,7 @@
 """``limber scene``: a Blender scene of a branch, made by a process that has bpy.
 
 The core never imports bpy: the ``bpy`` package in this Python, or a Blender program, runs the
-add-on's ``make_scene.py`` on data prepared by :mod:`limber.scene_data`.
+add-on's ``make_scene.py`` on data prepared by :mod:`limber.scene.data`.
 """
 
 import importlib.util
@@ -41,7 +41,7 @@ def command(run: Run, branch_folder: Path, output: Path | None, picture: Path | 
     Files made by the bpy package (5.0) open in Blender 4.5 and newer. To have one made by another
     Blender, 4.2 or newer, name that in LIMBER_SCENE_BLENDER.
     """
-    from limber.scene_data import scene_data
+    from limber.scene.data import scene_data
 
     if (output is None) == (data_path is None):
         raise InputError("Neither or both of --output and --data were given.",

@@ -6,10 +6,10 @@ import click
 import numpy as np
 
 from limber.cli import Run, settings_options, stage_command
-from limber.estimation.recording import POSE_COLUMNS
-from limber.estimation.tables import read_table, robot_stream, time_column, with_columns
 from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.simulate import SimulateSettings, simulate
+from limber.recordings.recording import POSE_COLUMNS
+from limber.recordings.tables import read_table, robot_stream, time_column, with_columns
 
 
 @stage_command("simulate")

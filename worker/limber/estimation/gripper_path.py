@@ -15,10 +15,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from limber.errors import WorkError
-from limber.mechanics.dynamics import simulate_dynamics
+from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
-from limber.mechanics.statics import StaticResult, StaticSettings, solve_static
+from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.progress import SILENT, Progress
 
 SETTINGS = StaticSettings(tolerance=1e-8)

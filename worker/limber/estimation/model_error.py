@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.errors import WorkError
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import static_sensitivities
-from limber.mechanics.statics import solve_static
+from limber.mechanics.statics.solve import solve_static
 
 RADIUS_POWER = 4.0
 """Bending stiffness is Young's modulus times radius to the fourth: one can stand for the other."""

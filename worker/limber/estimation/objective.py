@@ -6,12 +6,12 @@ from typing import Protocol
 import numpy as np
 
 from limber.errors import Cancelled
-from limber.estimation.alignment import Frames
 from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.input_force import Response
+from limber.estimation.forward.input_force import Response
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.recording import PullEntry
 from limber.progress import SILENT, Progress
+from limber.recordings.alignment import Frames
+from limber.recordings.recording import PullEntry
 
 FAILED_OBJECTIVE = 1e12
 """Objective of parameters under which the simulation finds no equilibrium."""

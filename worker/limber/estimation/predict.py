@@ -9,13 +9,13 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError, WorkError
-from limber.estimation.alignment import Frames
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import subject_of
-from limber.estimation.quasi_static import QuasiStaticForward
-from limber.estimation.recording import PullEntry, read_entry
 from limber.estimation.settings import EstimateSettings
 from limber.progress import SILENT, Progress
+from limber.recordings.alignment import Frames
+from limber.recordings.recording import PullEntry, read_entry
 from limber.store import Branch, plain
 
 

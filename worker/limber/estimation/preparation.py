@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
-from limber.estimation.alignment import Frames, frames_of
-from limber.estimation.checks import clean
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.objective import Forward
 from limber.estimation.parameters import Values
-from limber.estimation.quasi_static import QuasiStaticForward
-from limber.estimation.recording import Pull, PullEntry, read_pull
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.control_points import control_points
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel, point_masses
 from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
+from limber.recordings.alignment import Frames, frames_of
+from limber.recordings.checks import clean
+from limber.recordings.recording import Pull, PullEntry, read_pull
 from limber.store import Branch
 
 Warn = Callable[[str], None]
@@ -163,7 +163,7 @@ def require_scale_in_principle(forwards: list[Forward]) -> None:
 def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
              settings: EstimateSettings) -> Forward:
     if entry.motion == "dynamic":
-        from limber.estimation.dynamic import DynamicForward
+        from limber.estimation.forward.dynamic import DynamicForward
 
         return DynamicForward(name, subject.model, subject.weights, entry, frames, rest)
     return QuasiStaticForward(name, subject.model, subject.weights, entry, frames, rest,

@@ -17,16 +17,16 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError, WorkError
-from limber.estimation.grasping import pose_on
-from limber.estimation.key_frames import key_frames, travel
+from limber.estimation.forward.key_frames import key_frames, travel
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.reduced import ReducedForward
 from limber.estimation.objective import Objective, Simulated
 from limber.estimation.optimise import Fit
 from limber.estimation.parameters import Values
-from limber.estimation.quasi_static import QuasiStaticForward
-from limber.estimation.reduced_forward import ReducedForward
-from limber.mechanics.reduced import ReducedModel, ReducedSettings, reduce_snapshots
-from limber.mechanics.reduced_training import Trainer, sample_young
+from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
+from limber.mechanics.reduced.training import Trainer, sample_young
 from limber.progress import SILENT, Progress
+from limber.recordings.grasping import pose_on
 
 STATES_PER_PULL = 24
 """Full solutions along each pull that the basis is made of."""

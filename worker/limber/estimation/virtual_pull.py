@@ -14,22 +14,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
-from limber.estimation.grasping import grasp_on
 from limber.estimation.gripper_path import MotionWanted, moved
-from limber.estimation.points import point_operator
-from limber.estimation.recording import (
-    GraspEntry,
-    Observations,
-    Pull,
-    PullEntry,
-    SensorEntry,
-    write_pull,
-)
-from limber.geometry.control_points import control_points
-from limber.geometry.marks import base_nodes
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.tet_mesh import TetMesh
-from limber.geometry.tetrahedra import MeshSettings, mesh_branch
+from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.marks import base_nodes
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights
@@ -37,6 +27,16 @@ from limber.perception.camera import D455, Camera, write_camera
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.progress import SILENT, Progress
+from limber.recordings.grasping import grasp_on
+from limber.recordings.points import point_operator
+from limber.recordings.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+    write_pull,
+)
 from limber.store import Branch
 
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)

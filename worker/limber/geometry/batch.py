@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from limber.errors import Cancelled, InputError, LimberError, WorkError
-from limber.geometry.cloud_files import READERS
+from limber.geometry.cloud.files import READERS
 from limber.geometry.reconstruct import ReconstructSettings, reconstruct
 from limber.progress import SILENT, Progress
 

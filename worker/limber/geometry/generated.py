@@ -10,11 +10,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
-from limber.geometry.cloud import Cloud
-from limber.geometry.control_points import FRACTIONS, control_points
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.surface import Surface
-from limber.geometry.sweep import frames, tangents
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.skeleton.control_points import FRACTIONS, control_points
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.sweep import frames, tangents
 from limber.store import file_digest, plain, write_atomically
 
 _STEP = 0.004  # [m] between nodes of the true axes
@@ -75,7 +75,7 @@ def generate_branch(seed: int, **spec: object) -> GeneratedBranch:
         spec: Fields of :class:`BranchSpec`.
     """
     from limber.cli import checked_settings
-    from limber.geometry.tubes import branch_surface
+    from limber.geometry.surface.tubes import branch_surface
 
     wanted = checked_settings(BranchSpec, spec)
     rng = np.random.default_rng(seed)

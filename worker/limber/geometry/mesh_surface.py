@@ -8,16 +8,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError, MeshingError
-from limber.geometry.control_points import FRACTIONS
-from limber.geometry.marks import GRASP_FRACTION, mark
-from limber.geometry.mesh_quality import measure_quality
 from limber.geometry.reconstruct import peak_memory_mb, require_file
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.skeleton_files import UNIT_METRES
-from limber.geometry.surface import Surface
-from limber.geometry.surface_input import usable_surface
-from limber.geometry.tetrahedra import MeshSettings, tetrahedralise
-from limber.geometry.upright import shortest_turn
+from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.files import UNIT_METRES
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.upright import shortest_turn
+from limber.geometry.surface.input import usable_surface
+from limber.geometry.surface.surface import Surface
+from limber.geometry.tets.marks import GRASP_FRACTION, mark
+from limber.geometry.tets.quality import measure_quality
+from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
 from limber.progress import SILENT, Progress
 from limber.store import Alignment, Branch, file_digest
 
@@ -62,7 +62,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
 
     Raises:
         InputError: the surface cannot be read or is not that of one solid:
-            :func:`limber.geometry.surface_input.usable_surface`.
+            :func:`limber.geometry.surface.input.usable_surface`.
         MeshingError: fTetWild failed.
     """
     settings = settings or MeshSurfaceSettings()
@@ -201,7 +201,7 @@ def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: 
 
 def _aligned(surface: Surface, skeleton: Skeleton, scale: float, settings: MeshSurfaceSettings,
              ) -> tuple[Alignment, Surface, Skeleton]:
-    from limber.geometry.upright import upright_rotation
+    from limber.geometry.skeleton.upright import upright_rotation
 
     root = skeleton.nodes[0]
     rotation = upright_rotation(skeleton, np.array(settings.up), settings.upright) \

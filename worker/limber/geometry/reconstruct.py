@@ -10,23 +10,23 @@ import numpy as np
 from pydantic import Field
 
 from limber.errors import InputError
-from limber.geometry.axis_fit import nearest_cylinders
-from limber.geometry.cloud import Cloud
-from limber.geometry.cloud_files import read_points
-from limber.geometry.control_points import FRACTIONS
-from limber.geometry.depth_files import read_depth
-from limber.geometry.forks import smooth_forks
-from limber.geometry.marks import GRASP_FRACTION, mark
-from limber.geometry.mesh_quality import measure_quality
-from limber.geometry.preparation import PreparationSettings, Prepared, prepare
-from limber.geometry.silhouette import within_silhouette, without_hidden_twigs
-from limber.geometry.skeleton import CLAMPED, INTERPOLATED, Skeleton
-from limber.geometry.skeleton_files import UNIT_METRES, read_skeleton, write_cylinders
-from limber.geometry.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
-from limber.geometry.surface import Surface
-from limber.geometry.tetrahedra import MeshResult, MeshSettings, mesh_branch
-from limber.geometry.tubes import branch_surface
-from limber.geometry.upright import upright_rotation
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.depth_files import read_depth
+from limber.geometry.cloud.files import read_points
+from limber.geometry.cloud.preparation import PreparationSettings, Prepared, prepare
+from limber.geometry.skeleton.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.files import UNIT_METRES, read_skeleton, write_cylinders
+from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.skeleton import CLAMPED, INTERPOLATED, Skeleton
+from limber.geometry.skeleton.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
+from limber.geometry.skeleton.upright import upright_rotation
+from limber.geometry.surface.forks import smooth_forks
+from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.tubes import branch_surface
+from limber.geometry.tets.marks import GRASP_FRACTION, mark
+from limber.geometry.tets.quality import measure_quality
+from limber.geometry.tets.tetrahedra import MeshResult, MeshSettings, mesh_branch
 from limber.progress import SILENT, Progress
 from limber.store import Alignment, Branch, file_digest
 
@@ -259,7 +259,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: 
               progress: Progress) -> SkeletonResult:
     scale = UNIT_METRES[settings.unit]
     if skeleton_path is not None:
-        from limber.geometry.skeletonise import given_skeleton
+        from limber.geometry.skeleton.skeletonise import given_skeleton
 
         own = read_skeleton(skeleton_path, scale=scale)
         if (own.radius <= 0).any():

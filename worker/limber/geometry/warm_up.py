@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from limber.geometry.forks import smooth_forks
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.surface_distance import distance_to_surface
-from limber.geometry.tubes import branch_surface
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.surface.distance import distance_to_surface
+from limber.geometry.surface.forks import smooth_forks
+from limber.geometry.surface.tubes import branch_surface
 from limber.progress import SILENT, Progress
 
 

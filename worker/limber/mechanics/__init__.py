@@ -1,6 +1,6 @@
 """Mechanics of a branch: finite elements, statics, dynamics, sensitivities."""
 
-from limber.mechanics.dynamics import DynamicResult, NewmarkSettings, simulate_dynamics
+from limber.mechanics.dynamics.simulate import DynamicResult, NewmarkSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import Material, RayleighDamping
 from limber.mechanics.model import BranchModel, PointMass
@@ -9,7 +9,7 @@ from limber.mechanics.sensitivities import (
     StaticSensitivities,
     static_sensitivities,
 )
-from limber.mechanics.statics import StaticResult, StaticSettings, follow_poses, solve_static
+from limber.mechanics.statics.solve import StaticResult, StaticSettings, follow_poses, solve_static
 from limber.mechanics.young_field import young_weights
 
 __all__ = [

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import strain_state
 from limber.store import write_atomically

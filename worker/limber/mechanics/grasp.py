@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 
 from limber.errors import InputError
-from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics.elements import node_weights
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.elements.shapes import node_weights
 
 
 @dataclass(frozen=True)

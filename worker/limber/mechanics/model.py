@@ -9,12 +9,11 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from limber.compiled import for_kernels
 from limber.errors import InputError
-from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics import elements
-from limber.mechanics.compiled import for_kernels
-from limber.mechanics.equations import Equations, Viscous
-from limber.mechanics.forces import (
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.elements import shapes as elements
+from limber.mechanics.elements.forces import (
     ForceLayout,
     internal_force,
     largest_stretch,
@@ -24,6 +23,7 @@ from limber.mechanics.forces import (
     tangent_times,
 )
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials import (
     Material,
     RayleighDamping,
@@ -124,7 +124,7 @@ class BranchModel:
     Attributes:
         lame_lambda, lame_mu: Lamé coefficients [Pa], shape [tet_count].
         gradients, weights: Strain operators at the quadrature points, from
-            limber.mechanics.elements.
+            limber.mechanics.elements.shapes.
 
     Raises:
         InputError: elements inverted or flat, several pieces, nodes without tetrahedra, too few

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.errors import InputError
-from limber.mechanics.equations import Equations, Viscous
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials import lame_by_poisson
 from limber.mechanics.model import BranchModel
 

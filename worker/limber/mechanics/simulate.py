@@ -8,16 +8,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import ConvergenceError, InputError
-from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics.dynamics import NewmarkSettings
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.dynamics.pull import Motion, Pull, dynamic_motion, static_motion
+from limber.mechanics.dynamics.simulate import NewmarkSettings
 from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.pose_table import PoseTable
-from limber.mechanics.pull import Motion, Pull, dynamic_motion, static_motion
-from limber.mechanics.rest_shape import unloaded_rest_shape
-from limber.mechanics.statics import solve_static
+from limber.mechanics.statics.rest_shape import unloaded_rest_shape
+from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.strain import strain_state
 from limber.progress import SILENT, Progress
 from limber.store import Branch, write_atomically

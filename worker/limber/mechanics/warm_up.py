@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from limber.geometry.tet_mesh import TetMesh
-from limber.mechanics.dynamics import simulate_dynamics
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.mechanics.reduced_strain import compile_kernels
+from limber.mechanics.reduced.strain import compile_kernels
 from limber.mechanics.sensitivities import ParameterSet
 from limber.progress import SILENT, Progress
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from limber.errors import InputError
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import TetMesh
 
 
 def young_weights(mesh: TetMesh, control_points: np.ndarray, power: float = 2) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from limber.geometry.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import Skeleton
 
 
 @dataclass(frozen=True)

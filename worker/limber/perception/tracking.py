@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from limber.geometry.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.camera import SeenCloud
 from limber.perception.curve import BentCurve, RestCurve
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.mechanics.compiled import compiled
+from limber.compiled import compiled
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from limber.compiled import compiled
 from limber.errors import InputError, WorkError
-from limber.mechanics.compiled import compiled
 from limber.planning.chart import Chart, mapped, pulled_back_size
 from limber.planning.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.trust import TrustRegion, trusted_at

@@ -5,8 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
+from limber.compiled import compiled
 from limber.errors import NoPathError
-from limber.mechanics.compiled import compiled
 from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
 
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from limber.errors import WorkError
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import (
     BranchModel,
     Grasp,
@@ -174,7 +174,7 @@ def read_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
     reach = Reach.of(skeleton, Grasp.from_mesh(mesh).centre)
     if not gravity:
         return GraspModel(mesh, reach, None)
-    from limber.mechanics.rest_shape import unloaded_rest_shape
+    from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 
     hanging = GraspModel(mesh, reach, branch.gravity, point_masses(branch))
     return replace(hanging, mesh=unloaded_rest_shape(hanging.model))

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import trapezoid
 
-from limber.mechanics.compiled import compiled
+from limber.compiled import compiled
 from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
 
 STEP = 0.005

@@ -155,7 +155,7 @@ def _change(before: float, after: float, sign: int) -> float | None:
 def _write(stage: Stage, name: str, grasp_model: GraspModel, summary: dict[str, Any],
            field: EnergyField, baseline: ResolvedPath, plan: ResolvedPath) -> None:
     from limber.mechanics.frames import write_pc2
-    from limber.scene_data import at_nodes
+    from limber.scene.data import at_nodes
 
     detailed = dict(summary)
     for key, path in (("baseline", baseline), ("plan", plan)):

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from limber.compiled import compiled
 from limber.errors import NoPathError
-from limber.mechanics.compiled import compiled
 from limber.planning.field import EnergyField, FieldArrays
 from limber.planning.objective import EdgeWeights, edge_cost, path_cost
 from limber.planning.smoothing import polish, shortcut, slide_end

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from limber.compiled import compiled
 from limber.errors import WorkError
-from limber.mechanics.compiled import compiled
 
 _EDGE = 1e-9  # [m] a sample on the hull belongs to it in spite of rounding
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from limber.geometry.skeleton import Skeleton
-from limber.geometry.tet_mesh import TetMesh
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.store import Branch
 
 if TYPE_CHECKING:

@@ -145,7 +145,7 @@ def _pulls(branch: Branch) -> list[Callable[[Branch], Section]]:
 
 
 def _pull(branch: Branch, name: str) -> Section:
-    from limber.estimation.recording import read_pull
+    from limber.recordings.recording import read_pull
 
     section = Section(f"Pull {name}")
     pull = read_pull(branch.path(f"pulls/{name}"))

@@ -1,0 +1,161 @@
+"""Readers: every format gives the same points, and bad files are named."""
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.geometry.cloud.cloud import Cloud, read_cloud
+from limber.geometry.cloud.depth_files import read_depth
+from limber.geometry.cloud.files import read_points
+
+POINTS = np.random.default_rng(0).normal(size=(200, 3)).round(5)
+
+
+def _write_pcd(path, kind):
+    header = ("# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
+              f"COUNT 1 1 1 1\nWIDTH 200\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 200\n"
+              f"DATA {kind}\n")
+    table = np.column_stack([POINTS, np.arange(200)]).astype(np.float32)
+    body = table.tobytes() if kind == "binary" else "\n".join(
+        " ".join(map(str, row)) for row in table).encode()
+    path.write_bytes(header.encode() + body)
+
+
+def _write_compressed_pcd(path):
+    from pypcd4 import Encoding, PointCloud
+
+    PointCloud.from_xyz_points(POINTS.astype(np.float32)).save(
+        path, encoding=Encoding.BINARY_COMPRESSED)
+
+
+def _write_ascii_ply(path):
+    rows = "\n".join(f"{x} {y} {z} 0 0 1 200 10 20" for x, y, z in POINTS)
+    names = "".join(f"property float {n}\n" for n in ("x", "y", "z", "nx", "ny", "nz"))
+    names += "".join(f"property uchar {n}\n" for n in ("red", "green", "blue"))
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 200\n{names}end_header\n{rows}\n")
+
+
+def _write_las(path):
+    import laspy
+
+    content = laspy.create(point_format=3)
+    content.header.scales, content.header.offsets = [1e-5] * 3, [0, 0, 0]
+    content.x, content.y, content.z = POINTS.T
+    content.intensity = np.arange(200)
+    content.write(path)
+
+
+WRITERS = {
+    "a.xyz": lambda p: np.savetxt(p, POINTS),
+    "a.csv": lambda p: np.savetxt(p, POINTS, delimiter=",", header="x,y,z", comments=""),
+    "semicolon.txt": lambda p: np.savetxt(p, POINTS, delimiter=";"),
+    "double.ply": lambda p: Cloud(POINTS).write_ply(p),
+    "ascii.ply": _write_ascii_ply,
+    "a.pcd": lambda p: _write_pcd(p, "ascii"),
+    "b.pcd": lambda p: _write_pcd(p, "binary"),
+    "c.pcd": _write_compressed_pcd,
+    "a.las": _write_las,
+    "a.laz": _write_las,
+    "a.npz": lambda p: np.savez(p, points=POINTS, intensity=np.arange(200)),
+    "a.obj": lambda p: p.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in POINTS)),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_each_format_gives_the_points(tmp_path, name):
+    """Positions agree to the precision of the format's own numbers."""
+    path = tmp_path / name
+    WRITERS[name](path)
+    np.testing.assert_allclose(read_points(path).points, POINTS, atol=2e-5)
+
+
+def test_attributes_are_kept(tmp_path):
+    """Normals, colours and scalars survive reading and writing."""
+    path = tmp_path / "a.ply"
+    _write_ascii_ply(path)
+    cloud = read_points(path)
+    cloud.write_ply(tmp_path / "b.ply")
+    again = read_points(tmp_path / "b.ply")
+    assert set(again.attributes) == {"normal", "color"}
+    np.testing.assert_array_equal(again.attributes["color"][0], [200, 10, 20])
+
+
+def test_units_become_metres(tmp_path):
+    """A file in millimetres is read in metres."""
+    path = tmp_path / "a.xyz"
+    np.savetxt(path, POINTS * 1000)
+    np.testing.assert_allclose(read_cloud(path, unit="mm").points, POINTS, atol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "content", "complaint"), [
+    ("a.xyz", b"", "is empty"),
+    ("a.xyz", b"# only a comment\n", "no lines"),
+    ("a.xyz", b"1 2 3\n4 5\n", "line 2 has 2 values"),
+    ("a.xyz", b"1 2 3\n4 five 6\n", "line 2: 'five' is not a number"),
+    ("a.xyz", b"nan 2 3\n4 nan 6\n", "finite"),
+    ("a.csv", b"x,y,w\n1,2,3\n", "z are missing"),
+    ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\n"
+              b"property float y\nproperty float z\nend_header\n1234", "cannot be read"),
+    ("a.pcd", b"nonsense", "cannot be read"),
+    ("a.laz", b"nonsense", "cannot be read"),
+    ("a.docx", b"nonsense", "suffix"),
+])
+def test_bad_files_are_named(tmp_path, name, content, complaint):
+    """Empty, cut short, non-numeric, not finite, unknown: an error that says which and where."""
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=complaint):
+        read_points(path)
+
+
+@pytest.mark.parametrize(("name", "content"), [
+    ("a.csv", "x;y;z\n1,5;2,0;3,25\n4;5;6,5\n"), ("a.txt", "x\ty\tz\n1,5\t2,0\t3,25\n4\t5\t6,5\n"),
+    ("a.xyz", "1,5 2,0 3,25\n4,0 5,0 6,5\n"), ("a.csv", "x, y, z\n1.5, 2, 3.25\n4, 5, 6.5\n"),
+    ("a.csv", "Easting,Northing,Height\n1.5,2,3.25\n4,5,6.5\n"),
+    ("a.csv", "x [m],y [m],z [m]\n1.5,2,3.25\n4,5,6.5\n"),
+    ("a.csv", '"Points:0","Points:1","Points:2"\n"1.5","2","3.25"\n"4","5","6.5"\n'),
+    ("a.csv", "x,y,z,\n1.5,2,3.25,\n4,5,6.5,\n"), ("a.pts", "2\n1.5 2 3.25\n4 5 6.5\n"),
+    ("a.csv", "id,z,y,x\n0,3.25,2,1.5\n1,6.5,5,4\n"),
+])
+def test_text_as_programs_write_it(tmp_path, name, content):
+    """Decimal commas, headers with units or other names, quotes, closing separators, counts."""
+    for coding in ("utf-8", "utf-8-sig", "utf-16"):
+        (tmp_path / name).write_bytes(content.encode(coding))
+        np.testing.assert_array_equal(
+            read_points(tmp_path / name).points, [[1.5, 2, 3.25], [4, 5, 6.5]])
+
+
+def test_points_that_are_no_numbers_are_left_away_and_counted(tmp_path):
+    """Drivers of depth cameras write NaN where a pixel saw nothing: no reason to refuse."""
+    points = POINTS.copy()
+    points[::7] = np.nan
+    points[1, 2] = np.inf
+    np.save(tmp_path / "a.npy", points)
+    cloud = read_points(tmp_path / "a.npy")
+    good = np.isfinite(points).all(axis=1)
+    np.testing.assert_array_equal(cloud.points, points[good])
+    assert cloud.not_finite == (~good).sum()
+
+
+def test_missing_file_and_folder(tmp_path):
+    """Neither is a cloud."""
+    with pytest.raises(InputError, match="no file"):
+        read_points(tmp_path / "none.ply")
+    with pytest.raises(InputError, match="is a folder"):
+        read_points(tmp_path)
+
+
+def test_depth_image_with_mask(tmp_path):
+    """A flat depth image at 0.5 m becomes points at 0.5 m, only where the mask is."""
+    from PIL import Image
+
+    depth = np.full((48, 64), 500, np.uint16)
+    mask = np.zeros((48, 64), np.uint8)
+    mask[10:20, 30:40] = 255
+    Image.fromarray(depth).save(tmp_path / "depth.png")
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    (tmp_path / "camera.toml").write_text(
+        "width = 64\nheight = 48\nfx = 60.0\nfy = 60.0\ncx = 32.0\ncy = 24.0\n")
+    cloud = read_depth(tmp_path / "depth.png", tmp_path / "camera.toml", tmp_path / "mask.png")
+    assert len(cloud) == 100
+    np.testing.assert_allclose(cloud.points[:, 2], 0.5)

@@ -1,0 +1,127 @@
+"""Cleaning a cloud: digits, duplicates, outliers, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.files import read_points
+from limber.geometry.cloud.preparation import PreparationSettings, prepare
+from limber.geometry.cloud.sheets import find_sheet
+from limber.geometry.generated import generate_branch
+
+RNG = np.random.default_rng(0)
+
+
+def _rod(count=2000):
+    angle = RNG.uniform(0, 2 * np.pi, count)
+    return np.column_stack([0.01 * np.cos(angle), 0.01 * np.sin(angle), RNG.uniform(0, 1, count)])
+
+
+def test_map_coordinates_lose_no_digits():
+    """A rod at UTM coordinates comes out as the rod, to a nanometre."""
+    rod, origin = _rod(), np.array([454321.123, 5412345.678, 312.5])
+    prepared = prepare(Cloud(rod + origin), 1.0, PreparationSettings(outlier_ratio=0))
+    np.testing.assert_allclose(prepared.cloud.points + (prepared.origin - origin), rod, atol=2e-9)
+
+
+def test_duplicates_and_strays_go():
+    """Repeated points and points far from all others are dropped and counted."""
+    rod = _rod()
+    cloud = Cloud(np.vstack([rod, rod[:100], [[0.5, 0.5, 0.5], [-0.6, 0.3, 0.2]]]))
+    counts = prepare(cloud, 1.0).counts
+    assert counts["duplicates"] == 100
+    assert counts["outliers"] == 2
+
+
+def test_crop_box_and_voxels():
+    """The crop box is in the file's coordinates, voxels in metres."""
+    settings = PreparationSettings(crop_low=(-1, -1, 0), crop_high=(1, 1, 500.0), voxel=0.01)
+    prepared = prepare(Cloud(_rod() * 1000), 0.001, PreparationSettings(
+        crop_low=(-100, -100, 0), crop_high=(100, 100, 500), voxel=0.01))
+    assert np.ptp(prepared.cloud.points[:, 2]) == pytest.approx(0.5, abs=0.02)
+    assert prepared.counts["thinned"] > 100
+    with pytest.raises(InputError, match="crop box holds no points"):
+        prepare(Cloud(_rod() + 100), 1.0, settings)
+
+
+@pytest.mark.parametrize(("points", "complaint"), [
+    (np.ones((100, 3)), "at one place"),
+    (_rod(40), "has 40 points"),
+])
+def test_refused(points, complaint):
+    """All points equal, or too few of them."""
+    with pytest.raises(InputError, match=complaint):
+        prepare(Cloud(points), 1.0)
+
+
+def test_millimetres_taken_for_metres_are_noticed():
+    """A kilometre-long branch is a branch in millimetres; the warning has the extent."""
+    rod = _rod()
+    rod[:2, 2] = 0, 1
+    assert "1000 m long" in prepare(Cloud(rod * 1000), 1.0).warnings[0]
+
+
+def _plane(count: int, side: float, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-side / 2, side / 2, (count, 2)),
+                            rng.normal(0, 0.002, count)])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_ground_and_walls_are_cut_out(turned):
+    """A branch on the ground or before a wall is the branch; the user may keep the sheet."""
+    branch = generate_branch(71, length=0.6).cloud.points
+    plane = _plane(2 * len(branch), 1.0, 71)
+    if turned:
+        plane = plane[:, [0, 2, 1]] + [0.0, 0.3, 0.3]
+    both = Cloud(np.vstack([branch, plane]))
+    prepared = prepare(both, 1.0)
+    assert prepared.counts["sheets"] > 0.99 * len(plane)
+    assert len(prepared.cloud) > 0.97 * len(branch)
+    assert any("flat sheet" in text for text in prepared.warnings)
+    assert len(prepare(both, 1.0, PreparationSettings(keep_sheets=True)).cloud) == len(both)
+
+
+def test_branches_are_no_sheets():
+    """Stout, one-sided, noisy, sparse and flat-grown plants lose nothing."""
+    for spec in ({"radius_root": 0.04, "length": 0.3}, {"view": "one-sided", "radius_root": 0.03},
+                 {"noise": 0.003}, {"point_spacing": 0.006}, {"fork_count": 8}):
+        cloud = generate_branch(72, **spec).cloud
+        assert prepare(cloud, 1.0).counts["sheets"] == 0, spec
+        flat = cloud.points * [1.0, 0.2, 1.0]  # as a trained fruit tree is
+        assert prepare(Cloud(flat), 1.0).counts.get("sheets", 0) == 0, spec
+
+
+def test_lost_digits_are_told():
+    """Map coordinates in single precision are refused; coarse rounding is told."""
+    points = generate_branch(73).cloud.points
+    far = points + [500_000.0, 4.6e6, 120.0]
+    assert len(prepare(Cloud(far), 1.0).cloud) == len(points)
+    with pytest.raises(InputError, match=r"steps of 0\.5"):
+        prepare(Cloud(far.astype(np.float32).astype(float)), 1.0)
+    near = (points + [500.0, 4600.0, 12.0]).astype(np.float32).astype(float)
+    assert not prepare(Cloud(near), 1.0).warnings
+    assert "rounded to 5 mm" in " ".join(prepare(Cloud(np.round(points / 5e-3) * 5e-3),
+                                                 1.0).warnings)
+
+
+def test_a_line_is_no_branch():
+    """Points without any thickness are refused before they reach the solver."""
+    line = np.linspace(0, 1, 500)[:, None] * [0.3, 0.2, 1.0]
+    with pytest.raises(InputError, match="straight line"):
+        prepare(Cloud(line), 1.0)
+
+
+def test_leaves_are_no_sheets():
+    """The lower half of a leafy seedling, where two leaves lie flat, keeps them."""
+    path = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "tomato_maize"
+    if not path.is_dir():
+        pytest.skip("no ../shared/data")
+    points = read_points(path / "tomato_03-05.xyz").points / 1000
+    for axis in range(3):
+        middle = (points[:, axis].min() + points[:, axis].max()) / 2
+        for half in (points[points[:, axis] < middle], points[points[:, axis] > middle]):
+            assert find_sheet(half, 0.08 * len(half)) is None

@@ -1,0 +1,106 @@
+"""Clouds of one depth camera: recognised as such, and rid of their flying pixels."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.geometry import score_skeleton
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.files import read_points
+from limber.geometry.cloud.preparation import PreparationSettings, prepare
+from limber.geometry.cloud.sight import find_sight, flying_pixels
+from limber.geometry.generated import GeneratedBranch, generate_branch
+from limber.geometry.skeleton.skeletonise import skeletonise
+from limber.perception.camera import D455, Camera, depth_to_cloud
+from limber.perception.simulated_camera import render_depth, with_noise
+
+DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
+AHEAD = np.array([1.0, 0.0, 0.1])
+
+
+def seen(seed: int, flying_share: float, **spec: object,
+         ) -> tuple[GeneratedBranch, Camera, np.ndarray, np.ndarray]:
+    """A branch, a camera before it, its depth image, and which pixels were moved off."""
+    branch = generate_branch(seed, **({"length": 0.6, "fork_count": 2} | spec))
+    middle = (branch.skeleton.nodes.min(axis=0) + branch.skeleton.nodes.max(axis=0)) / 2
+    camera = D455.looking(eye=middle + AHEAD, target=middle, up=(0.0, 1.0, 0.0))
+    exact = render_depth(camera, branch.surface.vertices, branch.surface.faces)
+    depth = with_noise(camera, exact, np.random.default_rng(seed), flying_share=flying_share)
+    flies = (depth > 0) & (np.abs(depth - exact) > 0.02)
+    return branch, camera, depth, flies
+
+
+def in_camera_axes(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Points [m] in the camera's own frame, as an RGB-D camera's PLY file has them."""
+    return depth_to_cloud(camera.model_copy(update={"pose": (0.0,) * 6}), depth).points
+
+
+def test_flying_pixels_are_found_and_the_branch_stays() -> None:
+    """More than 95 % of what flies 20 mm or more goes, less than 1 % of what is on the branch."""
+    _, camera, depth, flies = seen(61, 0.05)
+    sight = find_sight(in_camera_axes(camera, depth))
+    assert sight is not None
+    assert sight.pitch == pytest.approx(1 / camera.fx, rel=1e-3)
+    found = flying_pixels(sight, 78.0, 20)
+    truth = flies[depth > 0]
+    assert found[truth].mean() > 0.95
+    assert found[~truth].mean() < 0.01
+
+
+def test_the_image_is_found_in_turned_axes_and_beside_nothing_else() -> None:
+    """An image stays one when its frame is turned; a scan from all around is none."""
+    branch, camera, depth, _ = seen(62, 0.0)
+    points = in_camera_axes(camera, depth)
+    turn = Rotation.from_rotvec([0.4, 1.9, -0.3]).as_matrix()
+    assert find_sight(points @ turn.T) is not None
+    assert find_sight(branch.cloud.points) is None
+    assert find_sight(branch.cloud.points + [0.0, 0.0, 3.0]) is None
+    assert find_sight(points + [0.3, 0.0, 0.5]) is None  # seen from where no camera stood
+    assert find_sight(points + [0.3, 0.0, 0.5], np.array([0.3, 0.0, 0.5])) is not None
+
+
+def test_scanned_clouds_are_no_images() -> None:
+    """Laser scans from many sides and map coordinates are not mistaken for one camera's."""
+    if not DATA.is_dir():
+        pytest.skip("no ../shared/data")
+    for name in ("coffeetree_branch/branch.xyz", "aRchi_tree_1/Tree_1.ply",
+                 "tomato_maize/tomato_03-05.xyz"):
+        assert find_sight(read_points(DATA / name).points) is None, name
+    for name in ("apple_rgbd/frame_00025.ply", "apple_rgbd/frame_00125.ply"):
+        assert find_sight(read_points(DATA / name).points) is not None, name
+
+
+def test_the_user_decides_about_flying_pixels() -> None:
+    """They are counted and told; angle 0 keeps all; the camera's place can be given."""
+    _, camera, depth, _ = seen(63, 0.05)
+    points = in_camera_axes(camera, depth)
+    prepared = prepare(Cloud(points), 1.0)
+    assert prepared.counts["flying"] > 0.03 * len(points)
+    assert any("flying" in text for text in prepared.warnings)
+    kept = prepare(Cloud(points), 1.0, PreparationSettings(flying_angle=0.0))
+    assert "flying" not in kept.counts
+    moved = PreparationSettings(camera_at=(500.0, 100.0, 20.0))
+    away = prepare(Cloud(1000 * points + np.array(moved.camera_at)), 1e-3, moved)
+    assert away.counts["flying"] == prepared.counts["flying"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [64, 65])
+def test_flying_pixels_grow_no_twigs(seed: int) -> None:
+    """Without the rule they made false forks; with it the true ones alone are found."""
+    branch, camera, depth, _ = seen(seed, 0.05)
+    points = in_camera_axes(camera, depth)
+    false = []
+    for angle in (78.0, 0.0):
+        prepared = prepare(Cloud(points), 1.0, PreparationSettings(flying_angle=angle))
+        root = camera.to_camera(branch.skeleton.nodes[:1])[0]
+        found = skeletonise(prepared.cloud.points, root=root - prepared.origin,
+                            up=np.array([0.0, 0.0, 1.0]) @ camera.rotation).skeleton
+        score = score_skeleton(branch.skeleton, found.moved(
+            camera.to_branch(found.nodes + prepared.origin)))
+        false.append(score["forks_false"])
+        if angle > 0:
+            assert score["forks_found"] == score["forks"]
+    assert false[0] == 0 < false[1]

@@ -1,0 +1,84 @@
+"""Branches as likely as the fitted one: what a scan leaves open, and a mesh that follows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.axis_fit import fit_axes, fit_precision
+from limber.geometry.skeleton.likely_shapes import likely_skeletons, reshaped
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
+
+NOISE = 1e-3
+
+
+def _tube() -> Skeleton:
+    z = np.linspace(0, 0.4, 51)
+    return Skeleton.from_edges(np.column_stack([0 * z, 0 * z, z]), np.arange(-1, 50),
+                               np.full(51, 0.008))
+
+
+def _scan(rng: np.random.Generator, arc: float = 2 * np.pi) -> np.ndarray:
+    """3000 points all around a tube, or on the side that faces x."""
+    angle, z = rng.uniform(-arc / 2, arc / 2, 3000), rng.uniform(0, 0.4, 3000)
+    on = np.column_stack([0.008 * np.cos(angle), 0.008 * np.sin(angle), z])
+    return on + NOISE * rng.standard_normal(on.shape)
+
+
+def test_drawn_shapes_scatter_as_the_fit_says():
+    """Of 300 shapes each radius has the deviation that the precision's inverse gives it."""
+    points = _scan(np.random.default_rng(0))
+    tube = fit_axes(_tube(), points).skeleton
+    drawn = likely_skeletons(tube, points, 300, np.random.default_rng(1))
+    matrix, noise = fit_precision(tube, points)
+    assert noise == pytest.approx(NOISE, rel=0.1)
+    exact = noise * np.sqrt(np.diag(np.linalg.inv(matrix.toarray())).reshape(-1, 4)[:, 3])
+    found = np.std([shape.radius - tube.radius for shape in drawn], axis=0)
+    assert found == pytest.approx(exact, rel=0.2)
+    moved = np.array([shape.nodes - tube.nodes for shape in drawn])
+    assert np.abs(moved[..., 2]).max() < 0.1 * np.abs(moved[..., 0]).max()  # across only
+
+
+def test_new_scans_scatter_as_the_drawn_shapes_foretell():
+    """20 scans with fresh noise, fitted: mean radius and axis scatter as the shapes of one do."""
+    def means(shape: Skeleton) -> list[float]:
+        return [shape.radius[15:35].mean(), shape.nodes[15:35, 0].mean()]
+
+    rng = np.random.default_rng(2)
+    for arc in (2 * np.pi, np.pi):
+        fits = [fit_axes(_tube(), _scan(rng, arc)).skeleton for _ in range(20)]
+        points = _scan(rng, arc)
+        drawn = likely_skeletons(fit_axes(_tube(), points).skeleton, points, 200, rng)
+        found, foretold = (np.std([means(shape) for shape in shapes], axis=0)
+                           for shapes in (fits, drawn))
+        assert found == pytest.approx(foretold, rel=0.5)
+
+
+def test_seen_from_one_side_thick_and_far_go_together():
+    """An arc leaves open whether a branch is thick or near: the two errors cancel on its skin."""
+    rng = np.random.default_rng(3)
+    correlation = []
+    for arc in (2 * np.pi, 0.8 * np.pi):
+        points = _scan(rng, arc)
+        tube = fit_axes(_tube(), points).skeleton
+        drawn = likely_skeletons(tube, points, 200, rng)
+        radius, axis = (np.array([values(shape) for shape in drawn]) for values in (
+            lambda shape: shape.radius[25], lambda shape: shape.nodes[25, 0]))
+        correlation.append(np.corrcoef(radius, axis)[0, 1])
+    assert abs(correlation[0]) < 0.3 and correlation[1] < -0.7
+
+
+def test_a_mesh_follows_its_skeleton():
+    """Aside by 1 mm and thicker by a tenth: volume grows by 1.21, edges stay straight."""
+    tube = _tube()
+    mesh = mesh_branch(tube, MeshSettings(mesher="sweep")).mesh
+    other = replace(tube, nodes=tube.nodes + [1e-3, 0, 0], radius=1.1 * tube.radius)
+    found = reshaped(mesh, tube, other)
+    assert found.volumes.sum() == pytest.approx(1.21 * mesh.volumes.sum(), rel=0.01)
+    assert found.volumes.min() > 0
+    middle = found.nodes[np.abs(found.nodes[:, 2] - 0.2) < 0.05].mean(axis=0)
+    assert middle[:2] == pytest.approx([1e-3, 0], abs=1e-4)
+    assert found.nodes[found.tets[:, 4]] == pytest.approx(
+        found.nodes[found.tets[:, :2]].mean(axis=1))
+    assert reshaped(mesh, tube, tube).nodes == pytest.approx(mesh.nodes, abs=1e-12)

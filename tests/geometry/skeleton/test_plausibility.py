@@ -1,0 +1,40 @@
+"""What is refused as no plant, and what is not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.geometry.cloud.files import read_points
+from limber.geometry.skeleton.skeletonise import skeletonise
+
+DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_leafy_plant_is_told_not_refused(seed: int) -> None:
+    """Few points of a seedling whose leaves outweigh its stem make a skeleton and a warning."""
+    path = DATA / "tomato_maize" / "tomato_03-05.xyz"
+    if not path.is_file():
+        pytest.skip("no ../shared/data")
+    points = read_points(path).points / 1000
+    chosen = np.random.default_rng(seed).permutation(len(points))[:1500]
+    result = skeletonise(points[chosen])
+    assert any("no round axis" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("shape", ["rough ball", "half ball", "heap", "can"])
+def test_what_has_no_axis_is_refused(shape: str) -> None:
+    """Balls, seen whole or from one side, a filled box and a can are no branches."""
+    rng = np.random.default_rng(12)
+    ball = rng.normal(size=(4000, 3))
+    ball /= np.linalg.norm(ball, axis=1)[:, None]
+    angle = rng.uniform(0, 2 * np.pi, 4000)
+    points = {"rough ball": 0.1 * ball * (1 + 0.05 * rng.normal(size=(4000, 1))),
+              "half ball": 0.1 * ball[ball[:, 0] > 0],
+              "heap": rng.random((4000, 3)) * [0.5, 0.5, 0.7],
+              "can": np.column_stack([0.1 * np.cos(angle), 0.1 * np.sin(angle),
+                                      rng.uniform(0, 0.3, 4000)])}[shape]
+    with pytest.raises(InputError, match="not branch-like"):
+        skeletonise(points)

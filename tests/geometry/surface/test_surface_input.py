@@ -1,0 +1,131 @@
+"""A user's own surface: what is refused and why, and what is put right."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from limber.cli import call
+from limber.errors import InputError
+from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
+from limber.geometry.surface.input import usable_surface
+from limber.geometry.surface.surface import Surface
+
+FILE = Path("bar.stl")
+
+
+def bar(at=(0.0, 0.0, 0.0), size=(0.02, 0.02, 0.2), turned=False) -> Surface:
+    """A closed box [m]."""
+    box = trimesh.creation.box(size)
+    faces = np.asarray(box.faces)[:, ::-1] if turned else np.asarray(box.faces)
+    return Surface(np.asarray(box.vertices) + at, faces)
+
+
+def joined(*parts: Surface) -> Surface:
+    """Several surfaces as one, without uniting them."""
+    first = np.cumsum([0] + [len(part.vertices) for part in parts])
+    return Surface(np.vstack([part.vertices for part in parts]),
+                   np.vstack([part.faces + k for part, k in zip(parts, first, strict=False)]))
+
+
+def test_a_sound_surface_passes_unchanged():
+    """Nothing to say about a bar of 20 cm."""
+    surface, warnings = usable_surface(bar(), FILE)
+    assert not warnings and surface.volume == pytest.approx(8e-5)
+
+
+def test_holes_are_refused_at_their_place():
+    """A missing face: three open edges, one of them named."""
+    whole = bar()
+    with pytest.raises(InputError, match=r"has holes: 3 open edges, one at \(") as told:
+        usable_surface(Surface(whole.vertices, whole.faces[1:]), FILE)
+    assert "fill" in str(told.value)
+
+
+def test_edges_of_more_than_two_faces_are_refused():
+    """A face that is there three times."""
+    whole = bar()
+    double = Surface(whole.vertices, np.vstack([whole.faces, whole.faces[:1], whole.faces[:1]]))
+    with pytest.raises(InputError, match="3 edges with more than two faces") as told:
+        usable_surface(double, FILE)
+    assert "Merge by Distance" in str(told.value)
+
+
+def test_faces_turned_inwards_are_turned_back():
+    """An inverted surface is put right, with a word about it."""
+    surface, warnings = usable_surface(bar(turned=True), FILE)
+    assert surface.volume > 0 and "turned" in warnings[0]
+
+
+def test_faces_in_and_out_are_refused():
+    """One face turned over: named, with what to do."""
+    whole = bar()
+    faces = whole.faces.copy()
+    faces[3] = faces[3, ::-1]
+    with pytest.raises(InputError, match="point in and out") as told:
+        usable_surface(Surface(whole.vertices, faces), FILE)
+    assert "normals" in str(told.value)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_several_bodies_are_refused(turned):
+    """Two bars apart, whichever way the second one faces."""
+    with pytest.raises(InputError, match="2 separate bodies, with 80 %, 20 %"):
+        usable_surface(joined(bar(), bar((0.1, 0, 0), (0.01, 0.01, 0.2), turned)), FILE)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_cavities_are_refused(turned):
+    """A shell within the body, whichever way it faces."""
+    with pytest.raises(InputError, match="within its largest one"):
+        usable_surface(joined(bar(), bar((0, 0, 0), (0.005, 0.005, 0.1), turned)), FILE)
+
+
+def test_a_surface_that_crosses_itself_is_refused():
+    """A bar whose end is pushed through its own side."""
+    tube = trimesh.creation.cylinder(0.01, 0.2, sections=12).subdivide_loop(2)
+    vertices = np.asarray(tube.vertices).copy()
+    top = vertices[:, 2] > 0.099
+    vertices[top] += [0.0, 0.0, -0.25]
+    with pytest.raises(InputError, match="crosses itself") as told:
+        usable_surface(Surface(vertices, np.asarray(tube.faces)), FILE)
+    assert "Boolean" in str(told.value)
+
+
+def test_a_sheet_is_refused():
+    """Two faces back to back are closed and hold nothing."""
+    flat = Surface(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 1]]))
+    with pytest.raises(InputError, match="encloses no volume"):
+        usable_surface(flat, FILE)
+
+
+def test_faces_without_area_are_left_out():
+    """A face with a corner twice goes, and the rest is sound."""
+    whole = bar()
+    surface, warnings = usable_surface(
+        Surface(whole.vertices, np.vstack([whole.faces, [[0, 0, 1]]])), FILE)
+    assert len(surface.faces) == len(whole.faces) and "without area" in warnings[0]
+
+
+@pytest.mark.parametrize(("scale", "text"), [(1000.0, "200 m long: is its unit millimetres"),
+                                             (0.001, "0.2 mm long: is its unit")])
+def test_a_wrong_unit_is_suspected(scale, text):
+    """Millimetres read as metres, and the other way round."""
+    whole = bar()
+    _, warnings = usable_surface(Surface(whole.vertices * scale, whole.faces), FILE)
+    assert text in warnings[0]
+
+
+def test_refused_surfaces_leave_no_folder(tmp_path, capsys):
+    """`limber mesh` on an open surface ends with 2, says why, and makes nothing."""
+    whole = bar()
+    Surface(whole.vertices, whole.faces[2:]).write_ply(tmp_path / "open.ply")
+    assert call(["mesh", str(tmp_path / "open.ply"), "-o", str(tmp_path / "b.branch")]) == 2
+    assert "has holes" in capsys.readouterr().err
+    assert not (tmp_path / "b.branch").exists()
+    (tmp_path / "text.stl").write_text("solid nothing\nendsolid nothing\n")
+    with pytest.raises(InputError):
+        mesh_surface(tmp_path / "text.stl", tmp_path / "b.branch")
+    with pytest.raises(InputError, match="no file"):
+        mesh_surface(tmp_path / "none.stl", tmp_path / "b.branch", MeshSurfaceSettings())

@@ -1,0 +1,220 @@
+"""Forces and stiffness against rigid motion, patch test and finite differences."""
+
+import sys
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from tests.subjects.meshes import box_mesh
+
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics import BranchModel, Grasp, factor
+from limber.mechanics.grasp import rotation_matrix
+from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.linear.fronts import make_fronts, postordered
+from limber.mechanics.statics.solve import solve_prescribed
+from limber.mechanics.strain import deformation_gradients, principal_stretch
+
+MATERIALS = ("st_venant_kirchhoff", "stable_neo_hookean", "linear")
+
+
+def make_model(mesh, material="st_venant_kirchhoff", **options):
+    values = {"young": 1e7, "poisson": 0.3, "density": 900, "gravity": None} | options
+    return BranchModel(mesh, material=material, **values)
+
+
+def curved_box():
+    mesh = box_mesh()
+    nodes = mesh.nodes.copy()
+    nodes[:, 0] += 10 * nodes[:, 2] ** 2
+    return TetMesh(nodes, mesh.tets, point_data=mesh.point_data)
+
+
+def full_stiffness(model, equations):
+    pattern = equations.pattern
+    lower = sp.csc_matrix((equations._values[:pattern.value_count],
+                           pattern.entries()), shape=(pattern.size,) * 2)
+    return lower + sp.tril(lower, -1).T
+
+
+@pytest.mark.parametrize("material", MATERIALS[:2])
+@pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
+                         ids=["quadratic", "linear", "curved"])
+def test_rigid_motion_costs_nothing(mesh, material):
+    """A large rotation with a shift gives no force and no energy, to round-off."""
+    model = make_model(mesh, material)
+    turn = rotation_matrix(np.array([0.9, -1.4, 0.7]))
+    moved = mesh.nodes @ turn.T + [0.4, -2.0, 1.0] - mesh.nodes
+    state = model.internal(moved)
+    reference = model.internal(mesh.nodes * 0.01)
+    scale = np.linalg.norm(reference.force)
+    assert np.linalg.norm(state.force) < 1e-10 * scale
+    assert abs(state.strain_energy) < 1e-10 * reference.strain_energy
+    assert state.min_det_f == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("quadratic", [True, False])
+def test_patch_test(material, quadratic):
+    """Boundary nodes moved by a linear map: all inner nodes follow it, to 1e-10."""
+    mesh = box_mesh((0.03, 0.02, 0.02), (3, 3, 3), quadratic=quadratic)
+    inside = np.abs(mesh.nodes - mesh.nodes.mean(axis=0)) < np.array([0.0149, 0.0099, 0.0099])
+    boundary = ~inside.all(axis=1)
+    shift = mesh.nodes @ np.array([[0.02, 0.01, 0], [0.03, -0.01, 0.02], [0, 0.01, 0.03]])
+    model = make_model(mesh, material, fixed=boundary)
+    result = solve_prescribed(model, shift).require()
+    assert (~boundary).sum() > 5
+    assert np.abs(result.displacement - shift).max() < 1e-10 * np.abs(shift).max()
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
+                         ids=["quadratic", "linear", "curved"])
+def test_force_and_stiffness_are_derivatives(mesh, material):
+    """Force is the energy's derivative, stiffness the force's, both kernels of it alike."""
+    rng = np.random.default_rng(3)
+    model = make_model(mesh, material, young=rng.uniform(1e6, 5e6, mesh.tet_count))
+    u = 4e-4 * rng.standard_normal(mesh.nodes.shape)
+    d = rng.standard_normal(mesh.nodes.shape)
+    d[model.fixed] = 0
+    h = 2e-8
+    ahead, behind = model.internal(u + h * d), model.internal(u - h * d)
+    by_energy = (ahead.strain_energy - behind.strain_energy) / (2 * h)
+    assert by_energy == pytest.approx((model.internal(u).force * d).sum(), rel=1e-6)
+    by_force = ((ahead.force - behind.force) / (2 * h))[~model.fixed]
+    product = model.tangent_times(u, d)[~model.fixed]
+    assert np.linalg.norm(product - by_force) < 1e-6 * np.linalg.norm(by_force)
+    equations = model.equations()
+    equations.assemble(model, u)
+    assembled = full_stiffness(model, equations) @ d[equations.pattern.order].ravel()
+    exact = model.tangent_times(u, d)[equations.pattern.order].ravel()
+    assert np.linalg.norm(assembled - exact) < 1e-12 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("material", MATERIALS)
+def test_viscous_stiffness_is_the_derivative(material):
+    """With a viscous memory the stiffness is still the force's derivative."""
+    rng = np.random.default_rng(4)
+    model = make_model(box_mesh(), material)
+    u = 4e-4 * rng.standard_normal(model.mesh.nodes.shape)
+    d = rng.standard_normal(u.shape)
+    d[model.fixed] = 0
+    viscous = Viscous(1.7, 0.02 * rng.standard_normal((*model.weights.shape, 6)))
+    h = 2e-8
+    change = (model.internal(u + h * d, viscous=viscous).force
+              - model.internal(u - h * d, viscous=viscous).force) / (2 * h)
+    equations = model.equations()
+    equations.assemble(model, u, viscous=viscous)
+    order = equations.pattern.order
+    assembled = full_stiffness(model, equations) @ d[order].ravel()
+    assert np.linalg.norm(assembled - change[order].ravel()) < 1e-6 * np.linalg.norm(change)
+
+
+def test_force_is_linear_in_young_and_superposes(short_box):
+    """Forces of two fields of Young's modulus add up to that of their sum."""
+    rng = np.random.default_rng(5)
+    first, second = rng.uniform(1e6, 1e7, (2, short_box.tet_count))
+    u = 1e-4 * rng.standard_normal(short_box.nodes.shape)
+    model = make_model(short_box, young=first)
+    together = model.with_young(first + second).internal(u).force
+    apart = model.internal(u).force + model.with_young(second).internal(u).force
+    assert together == pytest.approx(apart, rel=1e-12, abs=1e-12 * np.abs(apart).max())
+
+
+def test_pinned_solution_keeps_the_mean_and_balances(short_box):
+    """A pinned patch moves in the mean as told, and the factored equations are satisfied."""
+    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "pinned")
+    model = make_model(short_box)
+    equations = model.equations([grasp])
+    zero = np.zeros_like(short_box.nodes)
+    equations.assemble(model, zero)
+    assert equations.factorise()
+    move = np.array([[1e-4, 2e-4, -1e-4]])
+    solution = equations.solve(zero, move)
+    assert grasp.weights @ solution[grasp.nodes] == pytest.approx(move[0], rel=1e-9)
+    left = equations.free_part(model.tangent_times(zero, solution))
+    assert np.linalg.norm(left) < 1e-9 * np.linalg.norm(model.tangent_times(zero, solution))
+
+
+FACTORS = ("SupernodalFactor", "CholmodFactor", "SuperLuFactor")
+
+
+def factor_of(name, pattern):
+    if name == "SupernodalFactor":
+        return factor.SupernodalFactor(make_fronts(pattern.node_starts, pattern.node_rows))
+    return getattr(factor, name)(*pattern.entries(), pattern.size)
+
+
+@pytest.mark.parametrize("name", FACTORS)
+@pytest.mark.parametrize("quadratic", [True, False])
+def test_every_factor_solves_and_refuses(name, quadratic):
+    """Each factor solves to round-off, for one and several right sides, refuses an indefinite
+    matrix, and is as good as before when it gets a definite one again."""
+    mesh = box_mesh((0.03, 0.02, 0.05), (3, 2, 5), quadratic=quadratic)
+    model = make_model(mesh)
+    equations = model.equations()
+    pattern = equations.pattern
+    equations.assemble(model, np.zeros_like(mesh.nodes))
+    values = equations._values[:pattern.value_count].copy()
+    matrix = full_stiffness(model, equations)
+    right = np.random.default_rng(0).standard_normal((pattern.size, 4))
+    candidate = factor_of(name, pattern)
+    for _ in range(2):
+        candidate.factorise(values)
+        for sides in (right, right[:, 1]):
+            solution = candidate.solve(sides)
+            assert solution.shape == sides.shape
+            scale = abs(matrix).sum(axis=1).max() * np.abs(solution).max()
+            assert np.abs(matrix @ solution - sides).max() < 1e-14 * scale
+        raised = values.copy()
+        raised[pattern.diagonal] -= 0.5 * values[pattern.diagonal].mean()
+        with pytest.raises(factor.NotPositiveDefiniteError):
+            candidate.factorise(raised)
+
+
+def test_fronts_hold_all_that_fills_in():
+    """No fill of a random matrix is missed: the factor's columns are those of dense Cholesky."""
+    rng = np.random.default_rng(6)
+    for count, density in ((1, 0.5), (7, 0.3), (60, 0.03), (60, 0.2)):
+        graph = sp.random(count, count, density, random_state=7) + sp.eye(count)
+        graph = ((graph + graph.T) != 0).tocsr()
+        order = postordered(graph, rng.permutation(count))
+        lower = sp.tril(graph[order][:, order]).tocsc()
+        lower.sort_indices()
+        block = sp.kron(lower, np.ones((3, 3))).tocsc()
+        part = sp.tril(block).tocsc()
+        part.data = rng.uniform(-1, 1, len(part.data))
+        whole = (part + sp.tril(part, -1).T + 3 * part.shape[0] * sp.eye(part.shape[0])).tocsc()
+        values = sp.tril(whole).tocsc()
+        values.sort_indices()
+        own = factor.SupernodalFactor(make_fronts(lower.indptr, lower.indices))
+        own.factorise(values.data)
+        right = rng.standard_normal(part.shape[0])
+        assert own.solve(right) == pytest.approx(np.linalg.solve(whole.toarray(), right),
+                                                 rel=1e-10)
+
+
+def test_bulky_meshes_go_to_a_general_library(short_box, monkeypatch):
+    """Above a number of operations CHOLMOD takes over, without cvxopt SuperLU."""
+    pattern = make_model(short_box).equations().pattern
+    assert isinstance(factor.make_factor(pattern), factor.SupernodalFactor)
+    monkeypatch.setattr(factor, "_MOST_FLOPS", 1.0)
+    assert isinstance(factor.make_factor(pattern), factor.CholmodFactor)
+    monkeypatch.setitem(sys.modules, "cvxopt.cholmod", None)
+    assert isinstance(factor.make_factor(pattern), factor.SuperLuFactor)
+
+
+@pytest.mark.parametrize("mesh", [box_mesh(), box_mesh(quadratic=False), curved_box()],
+                         ids=["quadratic", "linear", "curved"])
+def test_largest_stretch_is_the_largest_eigenvalue(mesh):
+    """The closed form agrees with an eigenvalue solver, and points at the same tetrahedron."""
+    model = make_model(mesh)
+    rng = np.random.default_rng(8)
+    for size in (0.0, 1e-7, 1e-3):
+        u = size * rng.standard_normal(mesh.nodes.shape)
+        F = deformation_gradients(model, u).mean(axis=1)
+        stretches = np.sqrt(np.linalg.eigvalsh(np.swapaxes(F, 1, 2) @ F)[:, -1])
+        value, tet = model.largest_stretch(u)
+        assert value == pytest.approx(stretches.max(), rel=1e-12)
+        assert stretches[tet] == pytest.approx(stretches.max(), rel=1e-12)
+        assert principal_stretch(model, u).position == pytest.approx(mesh.centroids[tet])

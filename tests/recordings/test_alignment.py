@@ -1,0 +1,82 @@
+"""Streams with clocks of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError
+from limber.recordings.alignment import estimate_offset, frames_of, poses_at
+from limber.recordings.recording import Observations
+
+
+def test_frames_are_the_observers_instants(plain_pull):
+    """Poses are interpolated, the faster wrench is averaged: its noise falls with the count."""
+    frames = frames_of(plain_pull)
+    assert np.array_equal(frames.times, plain_pull.observations.times)
+    expected = np.interp(frames.times, plain_pull.times, plain_pull.poses[:, 0])
+    assert np.allclose(frames.poses[:, 0], expected)
+    error = frames.wrenches[:, 0] - 50 * expected
+    assert np.std(error) < 0.02 and abs(np.mean(error)) < 0.01
+
+
+def test_rotations_take_the_short_way():
+    """Halfway between turns of 0 and 170 degrees about an axis is 85 degrees about it."""
+    poses = np.zeros((2, 6))
+    poses[1, 3:] = np.radians(170) * np.array([0.6, 0.0, 0.8])
+    middle = poses_at(np.array([0.0, 1.0]), poses, np.array([0.5]))[0, 3:]
+    assert np.degrees(Rotation.from_rotvec(middle).magnitude()) == pytest.approx(85)
+
+
+def there_and_back(pull):
+    """The pull, and the way back after it."""
+    half = pull.times[::2]
+    return replace(pull, times=np.r_[half, half + 4.02][:-1],
+                   poses=np.vstack([pull.poses[::2], pull.poses[::-2]])[:-1],
+                   wrenches=np.vstack([pull.wrenches[::2], pull.wrenches[::-2]])[:-1])
+
+
+@pytest.mark.parametrize("offset", [-0.37, 0.0, 0.154])
+def test_clock_offset_is_found(plain_pull, offset):
+    """An observer's clock that is off is found to a few milliseconds, from the motion alone."""
+    rng = np.random.default_rng(1)
+    pull = there_and_back(plain_pull)
+    seen = np.linspace(0.5, 7.5, 120)
+    way = np.interp(seen, pull.times, pull.poses[:, 0])
+    positions = np.zeros((120, 2, 3))
+    positions[:, 0, 0], positions[:, 1, 0], positions[:, 1, 2] = 0.3 * way, 0.7 * way, -way**2
+    positions += 5e-4 * rng.standard_normal(positions.shape)
+    pull = replace(pull, observations=Observations(seen - offset, positions))
+    found, sigma = estimate_offset(pull)
+    assert sigma < 5e-3
+    assert abs(found - offset) < 4 * sigma
+
+
+def test_an_offset_that_nothing_shows_is_not_invented(plain_pull):
+    """Of a branch that does not move, no offset is claimed."""
+    seen = plain_pull.observations
+    still = np.broadcast_to(seen.positions[0], seen.positions.shape)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(seen.positions.shape)
+    pull = replace(plain_pull, poses=np.tile(plain_pull.poses[0], (201, 1)),
+                   observations=Observations(seen.times, still + noise))
+    found, sigma = estimate_offset(pull)
+    assert found == 0.0 and np.isinf(sigma)
+
+
+def test_nothing_is_interpolated_across_a_gap(plain_pull):
+    """Observed frames inside a gap of the robot's stream are left out, with a word."""
+    keep = (plain_pull.times < 1.0) | (plain_pull.times > 2.0)
+    pull = replace(plain_pull, times=plain_pull.times[keep], poses=plain_pull.poses[keep],
+                   wrenches=plain_pull.wrenches[keep])
+    frames = frames_of(pull)
+    assert not np.any((frames.times > 1.0) & (frames.times < 2.0))
+    assert "gap" in frames.warnings[0]
+
+
+def test_clocks_that_do_not_overlap(plain_pull):
+    """Streams hours apart are refused with both ranges."""
+    seen = plain_pull.observations
+    pull = replace(plain_pull, observations=Observations(seen.times + 3600, seen.positions))
+    with pytest.raises(InputError, match="time_offset"):
+        frames_of(pull)

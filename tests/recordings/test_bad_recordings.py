@@ -1,0 +1,232 @@
+"""What goes wrong in recordings, each through the command that a user runs."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from limber.cli import call
+from limber.perception.camera import D455, write_camera
+from limber.perception.observe import write_depth
+from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.streams import Stream, read_stream, write_stream
+
+
+@pytest.fixture
+def tables(tmp_path, plain_pull):
+    """The hand-made spring as robot.csv and markers.csv."""
+    write_pull(tmp_path / "made", plain_pull)
+    for name in ("robot.csv", "markers.csv"):
+        (tmp_path / name).write_bytes((tmp_path / "made" / name).read_bytes())
+    return tmp_path
+
+
+def rewritten(path, change):
+    """Apply ``change`` to the lines of a table."""
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(change(lines)) + "\n")
+
+
+def changed(path, change):
+    """Apply ``change`` to times and values of a table."""
+    stream = read_stream(path)
+    times, values = change(stream.times.copy(), stream.values.copy())
+    write_stream(path, Stream(times, values, stream.columns))
+
+
+def imported(folder, tables, capsys, *options, code=0):
+    """The last line of import-pull of the two tables, as ``m``."""
+    assert call(["import-pull", str(folder), str(tables / "markers.csv"), "--name", "m", "--robot",
+                 str(tables / "robot.csv"), "--time-offset", "0", "--force-sigma", "0.02",
+                 "--json", "--progress", "none", *options]) == code
+    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+
+def warned(line, *words):
+    return any(all(word in warning for word in words) for warning in line["warnings"])
+
+
+def test_a_good_recording_raises_no_word(branch_folder, tables, capsys):
+    """Nothing wrong, nothing said."""
+    assert imported(branch_folder, tables, capsys)["warnings"] == []
+
+
+def test_stamps_out_of_order_and_twice(branch_folder, tables, capsys):
+    """Two rows exchanged and one doubled: sorted, the first kept, both told."""
+    def change(lines):
+        lines[20], lines[21] = lines[21], lines[20]
+        return [*lines[:40], lines[39], *lines[40:]]
+    rewritten(tables / "robot.csv", change)
+    line = imported(branch_folder, tables, capsys)
+    assert warned(line, "robot.csv", "out of order") and warned(line, "duplicate")
+    assert len(read_pull(branch_folder / "pulls" / "m").times) == 201
+
+
+def test_a_clock_that_runs_backwards_is_refused(branch_folder, tables, capsys):
+    """A tenth of the stamps backwards is no clock: exit 2, and no pull is left behind."""
+    rng = np.random.default_rng(0)
+    rewritten(tables / "markers.csv", lambda lines: [
+        lines[0], *rng.permutation(lines[1:]).tolist()])
+    line = imported(branch_folder, tables, capsys, code=2)
+    assert "run backwards" in line["error"]
+    assert not (branch_folder / "pulls" / "m").exists()
+
+
+def test_a_gap(branch_folder, tables, capsys):
+    """A second without robot: its length is told."""
+    def change(times, values):
+        keep = (times < 1.5) | (times > 2.5)
+        return times[keep], values[keep]
+    changed(tables / "robot.csv", change)
+    assert warned(imported(branch_folder, tables, capsys), "gap", "1.0")
+
+
+def test_spike_saturation_offset_and_sign(branch_folder, tables, capsys):
+    """Each fault of a force sensor alone: named, with what was done about it."""
+    good = (tables / "robot.csv").read_bytes()
+
+    def spike(times, values):
+        values[100, 8] += 6.0
+        return times, values
+
+    def flat(times, values):
+        values[:, 6] = np.minimum(values[:, 6], 3.0)
+        return times, values
+
+    def untared(times, values):
+        values[:, 6:9] += [0.5, 0.3, -0.4]
+        return times, values
+
+    def turned(times, values):
+        values[:, 6:] *= -1
+        return times, values
+
+    for change, words in ((spike, ("spike", "not used")), (flat, ("saturated",)),
+                          (untared, ("not tared", "subtracted")), (turned, ("sign was turned",))):
+        (tables / "robot.csv").write_bytes(good)
+        changed(tables / "robot.csv", change)
+        line = imported(branch_folder, tables, capsys)
+        assert warned(line, *words), (change.__name__, line["warnings"])
+
+
+def test_markers_that_swap(branch_folder, tables, capsys):
+    """Two markers exchange names at frame 30: told, and put right when the pull is used."""
+    def change(times, values):
+        values[30:] = values[30:, [3, 4, 5, 0, 1, 2]]
+        return times, values
+    changed(tables / "markers.csv", change)
+    assert warned(imported(branch_folder, tables, capsys), "swapped", "30")
+
+
+@pytest.mark.parametrize("table", ["robot.csv", "markers.csv"])
+def test_a_recording_that_ends_inside_a_line(branch_folder, tables, capsys, table):
+    """The power went off: the cut line is dropped with a word."""
+    path = tables / table
+    path.write_text(path.read_text()[:-25])
+    assert warned(imported(branch_folder, tables, capsys), table, "unfinished")
+
+
+def test_clocks_without_a_common_moment(branch_folder, tables, capsys):
+    """One clock counts from 1970, the other from its start: taken to start together, and told."""
+    changed(tables / "markers.csv", lambda times, values: (times - times[0] + 1.7e9, values))
+    assert call(["import-pull", str(branch_folder), str(tables / "markers.csv"), "--name", "m",
+                 "--robot", str(tables / "robot.csv"), "--json", "--progress", "none"]) == 0
+    line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    assert warned(line, "no moment in common")
+    assert line["time_offset_s"] == pytest.approx(0.2 - 1.7e9, abs=0.2)
+
+
+def pull_with(branch_folder, name, change):
+    """A copy of the virtual pull with a changed robot or marker table, imported as ``name``."""
+    source = branch_folder.parent / f"{name}-source"
+    source.mkdir()
+    for file in (branch_folder / "pulls" / "pull-1").iterdir():
+        (source / file.name).write_bytes(file.read_bytes())
+    change(source)
+    assert call(["import-pull", str(branch_folder), str(source), "--name", name,
+                 "--progress", "none"]) == 0
+
+
+def estimated(branch_folder, capsys, *options, code=0):
+    capsys.readouterr()
+    assert call(["estimate", str(branch_folder), "--key-frames", "6", "--no-mesh-check", "--json",
+                 "--progress", "none", *options]) == code
+    return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+
+@pytest.mark.slow
+def test_a_pull_of_another_branch(branch_folder, capsys):
+    """Markers 3 cm from where this branch has them, moving otherwise: the rest, then the loss say
+    so.
+    """
+    def change(source):
+        def stretched(times, values):
+            points = values.reshape(len(values), -1, 3)
+            points = points * [1.0, 0.3, 1.0] + [0.0, 0.03, 0.0]
+            return times, points.reshape(values.shape)
+        changed(source / "markers.csv", stretched)
+    pull_with(branch_folder, "stranger", change)
+    line = estimated(branch_folder, capsys, "--pull", "stranger")
+    assert warned(line, "at rest", "another branch") and warned(line, "fit is poor")
+
+
+@pytest.mark.slow
+def test_force_in_another_unit_and_a_modulus_at_its_bound(branch_folder, capsys):
+    """Kilonewtons taken for newtons: the unit is named; what asks for less than the least modulus
+    stops at the bound and says so.
+    """
+    def change(source):
+        def scaled(times, values):
+            values[:, 6:] *= 1e-4
+            return times, values
+        changed(source / "robot.csv", scaled)
+        text = (source / "pull.toml").read_text()
+        (source / "pull.toml").write_text("\n".join(
+            "force_sigma_n = 1e-6" if row.startswith("force_sigma_n") else row
+            for row in text.splitlines()) + "\n")
+    pull_with(branch_folder, "tiny", change)
+    line = estimated(branch_folder, capsys, "--pull", "tiny")
+    assert warned(line, "another unit") and warned(line, "--force-unit")
+    assert warned(line, "ran to its bound")
+
+
+def test_rgbd_faults(branch_folder, tables, capsys):
+    """A missing image, no intrinsics, a camera that moves, no list: each its own sentence."""
+    folder = tables / "rgbd"
+    (folder / "depth").mkdir(parents=True)
+    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    rows = []
+    for k in range(4):
+        write_depth(folder / "depth" / f"f{k}.png", np.full((6, 8), 1.2), camera)
+        rows.append(f"{0.5 * k:.3f} depth/f{k}.png")
+    (folder / "depth.txt").write_text("# list\n" + "\n".join(rows) + "\n2.0")
+
+    def run(code):
+        assert call(["import-pull", str(branch_folder), str(folder), "--name", "d", "--robot",
+                     str(tables / "robot.csv"), "--json", "--progress", "none"]) == code
+        return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+
+    assert "intrinsics" in run(2)["error"]
+    (folder / "calibration.txt").write_text("525.0 525.0 319.5 239.5\n")
+    assert run(0)["warnings"] == []
+    (folder / "groundtruth.txt").write_text("0.0 0 0 0 0 0 0 1\n1.0 0.1 0 0 0 0 0 1\n")
+    assert "camera moves" in run(2)["error"]
+    (folder / "groundtruth.txt").unlink()
+    (folder / "depth" / "f2.png").unlink()
+    assert warned(run(0), "1 of 4 depth images are missing")
+    write_camera(folder / "camera.toml", camera)
+    (folder / "mask").mkdir()
+    Image.fromarray(np.full((6, 8), 255, np.uint8)).save(folder / "mask" / "f0.png")
+    assert warned(run(0), "2 of 3 frames have no mask")
+
+
+def test_markers_in_another_unit_are_refused(branch_folder, capsys):
+    """Millimetres taken for metres: refused at once, and the moduli in the mesh stay."""
+    def change(source):
+        changed(source / "markers.csv", lambda times, values: (times, 1000 * values))
+    before = (branch_folder / "mesh.vtu").read_bytes()
+    pull_with(branch_folder, "millimetres", change)
+    line = estimated(branch_folder, capsys, "--pull", "millimetres", code=2)
+    assert "another unit" in line["error"] and "--unit" in line["error"]
+    assert (branch_folder / "mesh.vtu").read_bytes() == before

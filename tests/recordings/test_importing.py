@@ -1,0 +1,191 @@
+"""Recordings of other programs."""
+
+import json
+import sys
+import types
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from limber.cli import call
+from limber.errors import InputError
+from limber.perception.camera import D455, read_camera, write_camera
+from limber.perception.masks import read_mask
+from limber.perception.observe import list_frames, read_depth, write_depth
+from limber.recordings.importing import (
+    ImportSettings,
+    import_pull,
+    markers_from_c3d,
+)
+from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.registration import rigid_fit
+from limber.recordings.streams import Stream, read_stream, write_stream
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+
+
+@pytest.fixture
+def source(tmp_path, plain_pull):
+    """The hand-made pull as two tables, markers in millimetres, forces in gram-force."""
+    write_pull(tmp_path / "made", plain_pull)
+    robot = read_stream(tmp_path / "made" / "robot.csv")
+    scaled = robot.values / np.r_[np.ones(6), np.full(6, 9.80665e-3)]
+    write_stream(tmp_path / "robot.csv", Stream(robot.times, scaled, robot.columns))
+    seen = plain_pull.observations
+    write_stream(tmp_path / "markers.csv", Stream(
+        seen.times - 0.05, seen.positions.reshape(60, -1) * 1e3,
+        tuple(f"tip{k}_{axis}_mm" for k in range(2) for axis in "xyz")))
+    return tmp_path
+
+
+def test_markers_in_millimetres_and_gram_force(branch_folder, source, plain_pull):
+    """Units are converted at the door; the pull in the folder is in metres and newtons."""
+    result = import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(
+        robot=str(source / "robot.csv"), unit="mm", force_unit="gf", time_offset=0.05,
+        torque_sigma=0.002))
+    assert result["frame_count"] == 60 and result["point_count"] == 2
+    pull = read_pull(branch_folder / "pulls" / "m")
+    assert np.allclose(pull.observations.positions, plain_pull.observations.positions, atol=1e-6)
+    assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-6)
+    assert pull.entry.time_offset_s == 0.05
+    assert pull.entry.sensor.torque_sigma_nm == 0.002
+    assert pull.entry.grasp.point_m == (0.0, 0.0, 0.5)
+
+
+def test_a_robot_table_is_needed_and_its_columns_are_named(branch_folder, source):
+    """What is missing is said, with the columns that are expected."""
+    with pytest.raises(InputError, match="--robot"):
+        import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(unit="mm"))
+    with pytest.raises(InputError, match="x_m"):
+        import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(
+            unit="mm", robot=str(source / "markers.csv")))
+    with pytest.raises(InputError, match="no "):
+        import_pull(branch_folder, source / "nothing.csv", "m", ImportSettings())
+    assert "m" not in json.loads((branch_folder / "branch.json").read_text())["files"]
+
+
+def test_rigid_fit_of_a_turned_copy():
+    """Kabsch: a turned and shifted cloud comes back, and a mirror image is never used."""
+    rng = np.random.default_rng(0)
+    points = rng.standard_normal((6, 3))
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    found, shift = rigid_fit(points, points @ turn.T + [1, 2, 3])
+    assert np.allclose(found, turn) and np.allclose(shift, [1, 2, 3])
+    mirrored, _ = rigid_fit(points, points * [1, 1, -1])
+    assert np.linalg.det(mirrored) == pytest.approx(1)
+
+
+def test_rgbd_folder_in_the_layout_of_tum(branch_folder, source):
+    """depth.txt gives stamps, groundtruth.txt the camera's pose, masks go along."""
+    folder = source / "rgbd"
+    (folder / "depth").mkdir(parents=True)
+    (folder / "mask").mkdir()
+    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    write_camera(folder / "camera.toml", camera)
+    depth = np.full((6, 8), 1.25)
+    lines = ["# depth maps"]
+    for k in range(3):
+        write_depth(folder / "depth" / f"f{k}.png", depth + 0.01 * k, camera)
+        write_depth(folder / "mask" / f"f{k}.png", depth, camera)
+        lines.append(f"{10.0 + 0.5 * k:.6f} depth/f{k}.png")
+    (folder / "depth.txt").write_text("\n".join(lines) + "\n")
+    (folder / "groundtruth.txt").write_text("10.0 1 2 3 0 0 0.70710678 0.70710678\n")
+    import_pull(branch_folder, folder, "rgbd", ImportSettings(robot=str(source / "robot.csv")))
+    target = branch_folder / "pulls" / "rgbd"
+    frames = list_frames(target, "depth")
+    assert [time for time, _ in frames] == [10.0, 10.5, 11.0]
+    moved = read_camera(target / "camera.toml")
+    assert np.allclose(moved.pose, [1, 2, 3, 0, 0, np.pi / 2], atol=1e-6)
+    assert np.allclose(read_depth(frames[1][1], moved), 1.26, atol=1e-4)
+    assert len(list((target / "mask").iterdir())) == 3
+
+
+def test_folder_of_clouds(branch_folder, source):
+    """PLY files with numbers for names need a rate, and become metres with time stamps."""
+    from limber.geometry.cloud.cloud import Cloud
+
+    folder = source / "clouds"
+    folder.mkdir()
+    for k in range(3):
+        Cloud(np.full((20, 3), 100.0 * k)).write_ply(folder / f"cloud_{k}.ply")
+    robot = str(source / "robot.csv")
+    with pytest.raises(InputError, match="--rate-hz"):
+        import_pull(branch_folder, folder, "c", ImportSettings(robot=robot, unit="mm"))
+    import_pull(branch_folder, folder, "c", ImportSettings(robot=robot, unit="mm", rate_hz=10))
+    assert [t for t, _ in list_frames(branch_folder / "pulls" / "c", "clouds")] == [0.0, 0.1, 0.2]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
+def test_a_force_table_gives_a_slope_and_the_reason_why_no_modulus(tmp_path, capsys):
+    """A recorded cane push through the command: a slope with interval, and the explanation."""
+    source = sorted((SHARED / "blueberry_cane_push").glob("*.csv"))[5]
+    assert call(["import-pull", str(tmp_path / "cane.branch"), str(source), "--name", "push",
+                 "--json", "--progress", "none"]) == 0
+    line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
+    low, high = line["slope_interval_n_per_m"]
+    assert low < line["slope_n_per_m"] < high
+    assert "fourth power" in line["why_no_modulus"]
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
+def test_c3d_holds_what_its_table_holds():
+    """The silicone beam's C3D file and its CSV table are the same motion."""
+    folder = SHARED / "silicone_beam"
+    stream, labels = markers_from_c3d(folder / "beam_load52_V2_a.c3d")
+    table = read_stream(folder / "beam_load52_V2_a.csv")
+    assert labels[0] == "Tip - 1" and len(labels) == 6
+    assert np.allclose(stream.values, table.values, atol=2e-6)
+    assert np.allclose(stream.times, table.times, atol=1e-6)
+
+
+def test_masks_of_a_yolo_model_of_ones_own(branch_folder, source, monkeypatch, capsys):
+    """Colour images of an RGB-D folder go through ultralytics' interface (a stand-in here, with
+    its call and its shapes); each depth image gets the mask of the colour image nearest in time.
+    """
+    class StandIn:
+        names = {58: "potted plant"}  # noqa: RUF012
+
+        def __init__(self, _weights):
+            self.classes = None
+
+        def set_classes(self, classes):
+            self.classes = classes
+
+        def predict(self, image, **_options):
+            assert self.classes == ["branch"]
+            data = np.zeros((1, *image.shape[:2]))
+            data[0, :, image[0, 0, 2] // 50] = 1.0
+            return [types.SimpleNamespace(masks=types.SimpleNamespace(data=data))]
+
+    module = types.ModuleType("ultralytics")
+    module.YOLO = StandIn
+    monkeypatch.setitem(sys.modules, "ultralytics", module)
+    folder = source / "rgbd"
+    for sub in ("depth", "rgb"):
+        (folder / sub).mkdir(parents=True)
+    camera = D455.model_copy(update={"width": 8, "height": 6, "depth_scale": 5000.0})
+    write_camera(folder / "camera.toml", camera)
+    lists = {"depth": [], "rgb": []}
+    for k in range(3):
+        write_depth(folder / "depth" / f"d{k}.png", np.full((6, 8), 1.25), camera)
+        Image.fromarray(np.full((6, 8, 3), 50 * k, np.uint8)).save(folder / "rgb" / f"c{k}.png")
+        lists["depth"].append(f"{k:.6f} depth/d{k}.png")
+        lists["rgb"].append(f"{k + 0.02:.6f} rgb/c{k}.png")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    weights = source / "mine.pt"
+    weights.write_bytes(b"weights")
+    arguments = ["import-pull", str(branch_folder), str(folder), "--name", "seen", "--robot",
+                 str(source / "robot.csv"), "--yolo-weights", str(weights), "--yolo-prompt",
+                 "branch", "--json", "--progress", "none"]
+    assert call(arguments) == 0
+    masks = [read_mask(path) for path in sorted(
+        (branch_folder / "pulls" / "seen" / "mask").iterdir())]
+    assert [np.flatnonzero(mask.any(axis=0)).tolist() for mask in masks] == [[0], [1], [2]]
+    monkeypatch.setitem(sys.modules, "ultralytics", None)
+    capsys.readouterr()
+    assert call([*arguments, "--force"]) != 0
+    assert "ultralytics" in json.loads(capsys.readouterr().out.strip().splitlines()[-1])["error"]

@@ -1,0 +1,108 @@
+"""Time-stamped tables and what is wrong with them."""
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.recordings.streams import (
+    Stream,
+    gaps,
+    inside_gap,
+    read_stream,
+    saturated,
+    spikes,
+    write_stream,
+)
+
+
+def written(tmp_path, text: str):
+    path = tmp_path / "robot.csv"
+    path.write_text(text)
+    return path
+
+
+def test_round_trip_keeps_numbers_and_gaps(tmp_path):
+    """What is written comes back, with NaN as an empty field."""
+    values = np.array([[1.25, np.nan], [2.5, -3e-4], [0.0, 7.0]])
+    write_stream(tmp_path / "s.csv", Stream(np.array([0.0, 0.1, 0.25]), values, ("a", "b")))
+    stream = read_stream(tmp_path / "s.csv")
+    assert stream.columns == ("a", "b") and not stream.warnings
+    assert np.array_equal(stream.times, [0.0, 0.1, 0.25])
+    assert np.allclose(stream.values, values, equal_nan=True)
+
+
+def test_out_of_order_and_duplicates_are_repaired_with_a_word(tmp_path):
+    """Rows are sorted, of equal stamps the first stays; both are told."""
+    rows = [f"{0.1 * k:.1f},{k}" for k in range(30)]
+    rows[10], rows[11] = rows[11], rows[10]
+    rows.insert(21, "2.0,99")
+    stream = read_stream(written(tmp_path, "t_s,x\n" + "\n".join(rows) + "\n"))
+    assert np.array_equal(stream.values[:, 0], np.arange(30))
+    assert any("out of order" in w for w in stream.warnings)
+    assert any("duplicate" in w for w in stream.warnings)
+
+
+def test_a_clock_that_runs_backwards_is_refused(tmp_path):
+    """Too many backward steps are no clock: sorting would invent a motion."""
+    rows = [f"{t},{k}" for k, t in enumerate([3, 1, 4, 1.5, 9, 2, 6])]
+    with pytest.raises(InputError, match="backwards"):
+        read_stream(written(tmp_path, "t_s,x\n" + "\n".join(rows) + "\n"))
+
+
+def test_a_recording_that_ends_inside_a_line(tmp_path):
+    """The unfinished line goes, also where the cut leaves as many numbers as there should be."""
+    for tail in ("0.3,3.1", "0.3", "0.3,-"):
+        stream = read_stream(written(tmp_path, f"t_s,x\n0.1,1\n0.2,2\n{tail}"))
+        assert len(stream) == 2 and "unfinished" in stream.warnings[0]
+
+
+def test_rubbish_in_the_middle_is_named_by_line(tmp_path):
+    """A line that is no numbers stops the reading: skipping it could hide a shifted column."""
+    with pytest.raises(InputError, match="line 3"):
+        read_stream(written(tmp_path, "t_s,x\n0.1,1\n0.2,abc\n0.3,2\n"))
+    with pytest.raises(InputError, match="t_s"):
+        read_stream(written(tmp_path, "time,x\n0.1,1\n"))
+    with pytest.raises(InputError, match="empty"):
+        read_stream(written(tmp_path, ""))
+    with pytest.raises(InputError, match="two samples"):
+        read_stream(written(tmp_path, "t_s,x\n0.1,1\n"))
+
+
+def test_gaps():
+    """A step of over five median steps is a gap; times strictly inside it are known."""
+    times = np.r_[np.arange(0, 1, 0.01), np.arange(1.5, 2, 0.01)]
+    found = gaps(times)
+    assert found.shape == (1, 2) and np.allclose(found, [[0.99, 1.5]])
+    assert inside_gap(np.array([0.99, 1.2, 1.5]), found).tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_spikes_are_found_and_a_fast_pull_is_not_one(seed):
+    """Single and double spikes in a noisy ramp are found, the ramp itself never."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 1, 80)
+    force = np.column_stack([8 * time**2, -3 * time, 0 * time]) + 0.05 * rng.standard_normal(
+        (80, 3))
+    assert not spikes(force).any()
+    force[30, 1] += 4.0
+    force[50:52, 0] -= 3.0
+    assert np.flatnonzero(spikes(force)).tolist() == [30, 50, 51]
+
+
+def test_few_frames_with_noise_have_no_spikes():
+    """24 frames of a virtual pull's force: monotonic axes must not make the scale vanish."""
+    hits = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        time = np.linspace(0, 1, 24)
+        force = np.column_stack([time**2, np.sin(2 * time), 0 * time])
+        hits += int(spikes(force + 0.02 * rng.standard_normal((24, 3))).sum())
+    assert hits <= 2
+
+
+def test_saturation_is_a_run_at_the_extreme():
+    """Equal readings at the top are saturation; one single maximum is not."""
+    force = np.array([[1.0], [2.0], [5.0], [5.0], [5.0], [5.0], [3.0], [1.0]])
+    assert np.flatnonzero(saturated(force)).tolist() == [2, 3, 4, 5]
+    assert not saturated(np.array([[1.0], [2.0], [5.0], [4.0], [3.0], [1.0]])).any()
+    assert not saturated(np.zeros((10, 3))).any()

@@ -1,0 +1,132 @@
+"""Tables as other programs write them."""
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.recordings.tables import (
+    marker_stream,
+    read_table,
+    robot_stream,
+    same_label,
+    split_title,
+    time_stream,
+)
+
+ROWS = [(0.0, 1.5, -2.0, 3.25), (0.01, 1.6, -2.1, 3.25), (0.02, 1.7, -2.2, 3.25)]
+
+
+def written(tmp_path, text, name="table.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+@pytest.mark.parametrize(("header", "separator", "decimal", "scale"), [
+    ("t_s,tip_x_m,tip_y_m,tip_z_m", ",", ".", 1.0),
+    ("Time (s),Tip X (mm),Tip Y (mm),Tip Z (mm)", ",", ".", 1e-3),
+    ("timestamp;tip.X;tip.Y;tip.Z", ";", ",", 1.0),
+    ("Time\ttip_x_cm\ttip_y_cm\ttip_z_cm", "\t", ".", 1e-2),
+    ("time tip:x_mm tip:y_mm tip:z_mm", " ", ".", 1e-3),
+])
+def test_one_motion_in_many_dresses(tmp_path, header, separator, decimal, scale):
+    """Separators, decimal commas, brackets and units make the same markers."""
+    lines = [separator.join(str(value).replace(".", decimal) for value in row) for row in ROWS]
+    path = written(tmp_path, "\n".join([header, *lines]) + "\n")
+    stream, labels = marker_stream(path)
+    assert len(labels) == 1 and same_label(labels[0], "tip")
+    assert np.allclose(stream.times, [0.0, 0.01, 0.02])
+    assert np.allclose(stream.values, scale * np.array(ROWS)[:, 1:])
+
+
+def test_preamble_units_row_and_other_encodings(tmp_path):
+    """Lines above the header, a row of units below it, a byte order mark, UTF-16, CRLF."""
+    body = ("NO_OF_FRAMES,3\r\nDESCRIPTION,Grünling\r\nTime,A_x,A_y,A_z\r\n(ms),(mm),(mm),(mm)\r\n"
+            "0,1,2,3\r\n10,2,3,4\r\n20,3,4,5\r\n")
+    for encoding in ("utf-8-sig", "utf-16", "latin-1"):
+        stream, labels = marker_stream(written(tmp_path, body, encoding=encoding))
+        assert labels == ["A"] and stream.times[-1] == pytest.approx(0.02)
+        assert stream.values[0] == pytest.approx([1e-3, 2e-3, 3e-3])
+
+
+def test_header_in_a_comment(tmp_path):
+    """numpy's savetxt puts a # before the names."""
+    path = written(tmp_path, "# t_s,m_x_m,m_y_m,m_z_m\n0,1,2,3\n1,2,3,4\n")
+    assert marker_stream(path)[1] == ["m"]
+
+
+def test_no_time_needs_a_rate(tmp_path):
+    """Frame numbers become times with --rate-hz; without it the columns are named."""
+    path = written(tmp_path, "Frame,a_x,a_y,a_z\n10,1,2,3\n12,1,2,3\n13,1,2,3\n")
+    with pytest.raises(InputError, match="rate-hz"):
+        marker_stream(path)
+    stream, _ = marker_stream(path, rate_hz=100)
+    assert np.allclose(stream.times, [0.0, 0.02, 0.03])
+
+
+def test_unseen_markers_and_other_columns(tmp_path):
+    """(0, 0, 0) and empty fields are "not seen"; columns that are no marker are named."""
+    path = written(tmp_path, "t_s,a_x_m,a_y_m,a_z_m,residual\n0,1,2,3,9\n1,0,0,0,9\n2,,,,9\n")
+    stream, _ = marker_stream(path)
+    assert np.isnan(stream.values[1:]).all() and np.isfinite(stream.values[0]).all()
+    assert any("residual" in warning for warning in stream.warnings)
+
+
+def test_robot_tables_of_ur_and_with_quaternions(tmp_path):
+    """RTDE's names, and a quaternion instead of a rotation vector; forces in gram-force."""
+    ur = "timestamp " + " ".join(f"actual_TCP_pose_{k}" for k in range(6)) + " " + " ".join(
+        f"actual_TCP_force_{k}" for k in range(6))
+    rows = "\n".join(" ".join(map(str, [k, *range(12)])) for k in range(3))
+    stream = robot_stream(written(tmp_path, f"{ur}\n{rows}\n"))
+    assert stream.columns[3] == "rx_rad" and stream.columns[-1] == "tz_nm"
+    assert np.allclose(stream.values[0], range(12))
+    half = np.sqrt(0.5)
+    path = written(tmp_path, "t_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw,Fx (gf),Fy (gf),Fz (gf)\n"
+                   f"0,1,2,3,0,0,{half},{half},100,0,0\n500,1,2,3,0,0,{half},{half},100,0,0\n")
+    stream = robot_stream(path)
+    found = dict(zip(stream.columns, stream.values[1], strict=True))
+    assert stream.times[1] == 0.5 and found["x_m"] == pytest.approx(1e-3)
+    assert found["rz_rad"] == pytest.approx(np.pi / 2)
+    assert found["fx_n"] == pytest.approx(0.980665)
+
+
+def test_pose_without_rotation_is_told(tmp_path):
+    """A gripper of which only the place is known is taken not to turn, with a word."""
+    stream = robot_stream(written(tmp_path, "t_s,x_m,y_m,z_m\n0,1,2,3\n1,1,2,3\n"))
+    assert np.all(stream.values[:, 3:] == 0) and "pinned" in stream.warnings[0]
+
+
+def test_what_is_no_table(tmp_path):
+    """Rubbish, an empty file, numbers without names: each refused with a reason."""
+    for text, match in (("", "empty"), ("hello\nworld\n", "row of numbers"),
+                        ("1,2,3\n4,5,6\n", "header")):
+        with pytest.raises(InputError, match=match):
+            read_table(written(tmp_path, text))
+    rows = "\n".join("0,1,2" if k % 3 else "broken" for k in range(30))
+    with pytest.raises(InputError, match="cannot be trusted"):
+        read_table(written(tmp_path, f"t_s,a,b\n0,1,2\n0,1,2\n{rows}\n0,1,2\n"))
+
+
+def test_unfinished_line_and_a_bad_one(tmp_path):
+    """The last line is dropped where it is cut; one bad line in many is named and dropped."""
+    rows = "".join(f"{k},1,2\n" for k in range(60))
+    table = read_table(written(tmp_path, f"t_s,a,b\n{rows}oops\n{rows}99,1"))
+    assert len(table.values) == 120
+    text = " ".join(table.warnings)
+    assert "oops" in text and "unfinished" in text
+
+
+def test_a_clock_that_counts_milliseconds_raises_a_question(tmp_path):
+    """Whole numbers that step by 10 are seconds by their name only."""
+    rows = "".join(f"{10 * k},1\n" for k in range(9))
+    stream = time_stream(read_table(written(tmp_path, f"time,a\n{rows}")))
+    assert any("t_ms" in warning for warning in stream.warnings)
+
+
+def test_titles():
+    """Unit and name are told apart."""
+    title = split_title("Load Cell Reading (gf)")
+    assert (title.name, title.unit) == ("Load Cell Reading", "gf")
+    assert split_title("tip1_x_mm").unit == "mm" and split_title("tip1_x").unit is None
+    assert same_label("Tip - 1", "tip1") and same_label("beam:tip1", "Tip 1")
+    assert not same_label("tip1", "tip2")

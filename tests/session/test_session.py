@@ -1,0 +1,187 @@
+"""The interactive session: what it answers, which pose wins, who dies when the other does."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from limber.errors import InputError, WorkError
+from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.mechanics import BranchModel, Grasp, solve_static
+from limber.session.client import InteractiveSession
+from limber.session.frames import FrameReader, FrameWriter
+from limber.store import Branch
+
+SMALL = ("--grasps", "24", "--size", "36", "--fields", "70", "--no-cache")
+
+
+@pytest.fixture(scope="module")
+def branch_folder(tmp_path_factory) -> Path:
+    """A branch folder with a beam of 20 cm."""
+    folder = tmp_path_factory.mktemp("session") / "beam.branch"
+    mesh = straight_beam(0.2, 0.004, 0.003, slice_count=10, young=1e8, grasp_fraction=0.7)
+    branch = Branch.create(folder)
+    with branch.stage("mesh") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def session(branch_folder):
+    """A session whose reduced model is ready."""
+    with InteractiveSession(branch_folder, mode="pinned", options=SMALL) as running:
+        assert running.wait_for("model", 90) is not None, running.events
+        yield running
+
+
+def rest(session) -> np.ndarray:
+    """The rest pose."""
+    return np.array(session.hello["rest_pose"])
+
+
+def moved(session, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """The rest pose, displaced."""
+    return rest(session) + [x, y, z, 0, 0, 0]
+
+
+def test_frames_hand_over_what_was_published(tmp_path):
+    """A reader sees the newest frame bit for bit, and nothing before the first."""
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    writer = FrameWriter(tmp_path / "frames", faces, 5)
+    reader = FrameReader(tmp_path / "frames")
+    assert reader.read() is None
+    positions = np.arange(15.0).reshape(5, 3)
+    for number in range(1, 6):
+        writer.publish(positions * number, id=number, energy_j=0.5 * number, is_reduced=1,
+                       force_y_n=-2.0, delay_s=0.25)
+    frame = reader.read()
+    assert (frame.sequence, frame.move_id, frame.strain_energy, frame.delay) == (5, 5, 2.5, 0.25)
+    assert frame.is_reduced and not frame.is_trusted
+    np.testing.assert_array_equal(frame.positions, np.float32(positions * 5))
+    np.testing.assert_array_equal(frame.reaction_force, [0, -2, 0])
+    np.testing.assert_array_equal(reader.faces, faces)
+    reader.close()
+    writer.close()
+    assert not (tmp_path / "frames").exists()
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    """A reader does not take any file for a session's."""
+    path = tmp_path / "other"
+    path.write_bytes(b"something else" * 20)
+    with pytest.raises(InputError, match="LIMBPOS1"):
+        FrameReader(path)
+
+
+def test_answers_agree_with_the_full_model(session, branch_folder):
+    """A session's energy, force and surface are the full model's."""
+    pose = moved(session, x=0.03, y=0.01, z=-0.006)
+    frame = session.wait(session.move(pose))
+    model = BranchModel.from_branch(Branch.open(branch_folder))
+    full = solve_static(model, grasp=Grasp.from_mesh(model.mesh, "pinned"), pose=pose).require()
+    assert frame.is_converged and frame.is_reduced
+    assert frame.strain_energy == pytest.approx(full.strain_energy, rel=0.02)
+    np.testing.assert_allclose(frame.reaction_force, full.reaction_force,
+                               atol=0.03 * np.linalg.norm(full.reaction_force))
+    surface = np.unique(model.mesh.surface_faces())
+    expected = (model.mesh.nodes + full.displacement)[surface]
+    np.testing.assert_allclose(frame.positions, expected, atol=0.005 * 0.2)
+
+
+def test_the_newest_pose_wins(session):
+    """Of many poses sent at once the last is answered, and not all the others."""
+    before = session.latest().sequence
+    for number in range(200):
+        last = session.move(moved(session, x=0.0001 * number, z=-0.00001 * number))
+    frame = session.wait(last)
+    assert frame.move_id == last
+    assert frame.sequence - before < 200
+    target = session.wait(session.move(moved(session)))
+    assert np.abs(frame.positions - target.positions).max() > 0.01
+
+
+def test_a_stiffer_branch_pulls_harder(session):
+    """A change of Young's modulus takes effect on the next answer."""
+    young = np.array(session.hello["young_pa"])
+    pose = moved(session, x=0.02, z=-0.003)
+    soft = session.wait(session.move(pose))
+    session.set_young(2 * young)
+    time.sleep(0.2)
+    stiff = session.wait(session.move(pose))
+    session.set_young(young)
+    assert stiff.strain_energy == pytest.approx(2 * soft.strain_energy, rel=0.05)
+
+
+def test_what_is_not_understood_is_named_and_survived(session):
+    """A broken command gives a warning; the session goes on."""
+    session._process.stdin.write('{"command": "move", "pose": [1, 2]}\nnonsense\n')
+    session._process.stdin.flush()
+    assert session.wait_for("warning", 5, count=2) is not None
+    assert session.wait(session.move(moved(session, y=0.01))) is not None
+
+
+def test_motion_goes_on_and_comes_to_rest(session):
+    """In dynamics frames keep coming, time advances, and the branch swings after a move."""
+    session.wait(session.move(moved(session)))
+    session.set_dynamics(True)
+    session.move(moved(session, y=0.02, z=-0.003))
+    time.sleep(1.0)
+    first = session.latest()
+    time.sleep(0.5)
+    second = session.latest()
+    session.set_dynamics(False)
+    assert first.time > 0 and second.time > first.time
+    assert second.sequence - first.sequence > 10
+    assert second.kinetic_energy < 0.01 * second.strain_energy
+
+
+def test_a_strange_client_needs_no_limber(branch_folder):
+    """A program that knows only JSON and the file's layout gets positions; leaving ends it all."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "limber.session.worker", str(branch_folder), "--full-only"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    hello = json.loads(process.stdout.readline())
+    process.stdin.write(json.dumps({"command": "move", "id": 1, "pose": hello["rest_pose"]}) + "\n")
+    process.stdin.flush()
+    data = np.memmap(hello["positions"], np.uint8, "r")
+    end = time.monotonic() + 30
+    while (sequence := int(data[24:32].view("<u8")[0])) == 0 and time.monotonic() < end:
+        time.sleep(0.01)
+    start, slot = data[40:56].view("<u8")
+    at = int(start + sequence % 3 * slot) + 128
+    positions = data[at:at + 12 * hello["vertex_count"]].view("<f4").reshape(-1, 3)
+    assert np.ptp(positions[:, 2]) == pytest.approx(0.2, rel=0.02)
+    del data, positions
+    process.stdin.close()
+    assert process.wait(10) == 0
+    process.stdout.close()
+    assert not Path(hello["positions"]).exists()
+
+
+def test_the_session_dies_alone_and_its_client_says_so(branch_folder):
+    """A killed session is an error at the next call, and leaves no file and no trainer."""
+    session = InteractiveSession(branch_folder, options=SMALL)
+    children = psutil.Process(session.process_id).children()
+    path = Path(session.hello["positions"])
+    os.kill(session.process_id, signal.SIGKILL)
+    with pytest.raises(WorkError, match="has ended"):
+        for _ in range(200):
+            session.move(moved(session))
+            time.sleep(0.01)
+    session.close()
+    assert not path.exists()
+    _, left = psutil.wait_procs(children, timeout=20)
+    assert not left
+
+
+def test_no_branch_no_session(tmp_path):
+    """A folder that is none gives the reason."""
+    with pytest.raises(WorkError, match=r"no folder|branch folder"):
+        InteractiveSession(tmp_path / "none.branch")

@@ -1,0 +1,140 @@
+"""The paper's three branches: its table of E and nu as truth, on geometry of that size."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.estimation.fit import Estimate, fit_pulls
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.objective import Objective
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.virtual_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.cylinder_mesh import curved_beam
+from limber.geometry.tets.marks import base_nodes
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.model import BranchModel
+from limber.mechanics.young_field import young_weights
+from limber.recordings.alignment import frames_of
+from limber.recordings.recording import Observations, Pull
+
+FRACTIONS = (0.2, 0.4, 0.6, 0.8)
+
+
+@dataclass(frozen=True)
+class PaperBranch:
+    """A row of the paper's table of estimated parameters, and a shape to go with it.
+
+    Attributes:
+        name: The paper's.
+        young: [Pa], shape [4].
+        poisson: Poisson's ratio.
+        length: [m].
+        radius: At base and tip [m].
+        bend: Turn of the axis from base to tip [rad].
+    """
+
+    name: str
+    young: tuple[float, float, float, float]
+    poisson: float
+    length: float
+    radius: tuple[float, float]
+    bend: float
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """An arc that leaves its plane a little, as a branch does."""
+        s = np.linspace(0.0, 1.0, 81)
+        angle = self.bend * s
+        tangent = np.column_stack([np.sin(angle), 0.3 * np.sin(angle) * s, np.cos(angle)])
+        tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+        steps = (tangent[1:] + tangent[:-1]) / 2 * self.length / 80
+        nodes = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        return Skeleton.from_edges(nodes, np.arange(-1, 80), np.interp(s, [0, 1], self.radius))
+
+    def mesh(self, *, slice_length: float, sides: int) -> TetMesh:
+        """Swept tetrahedra with the base marked."""
+        skeleton = self.skeleton
+        mesh = curved_beam(skeleton.nodes, skeleton.radius, slice_length=slice_length,
+                           sides=sides)
+        return mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
+
+    def truth(self) -> TrueBranch:
+        """The branch on its fine mesh."""
+        skeleton = self.skeleton
+        return TrueBranch(self.mesh(slice_length=1.3, sides=10), skeleton,
+                          control_points(skeleton, FRACTIONS), FRACTIONS, np.array(self.young))
+
+
+BRANCHES = (
+    PaperBranch("young", (8.21e6, 3.35e6, 1.82e6, 0.29e6), 0.382, 0.50, (0.008, 0.006), 0.3),
+    PaperBranch("mature", (26.1e6, 9.13e6, 7.58e6, 1.04e6), 0.351, 0.60, (0.009, 0.007), 0.5),
+    PaperBranch("artificial", (122e6, 86e6, 44e6, 16e6), 0.336, 0.70, (0.008, 0.006), 0.2),
+)
+"""The paper's table, in pascals."""
+
+
+def exact_pull(branch: PaperBranch, number: int, frames: int = 100) -> Pull:
+    """One pull of the true branch without noise; ``number`` chooses its direction."""
+    settings = VirtualPullSettings(
+        young=branch.young, poisson=branch.poisson, frames=frames, position_noise=0.0,
+        force_noise=0.0, reach=0.4, phase=2.1 * number + 0.3, seed=number)
+    return simulate_pull(branch.truth(), f"pull-{number + 1}", settings)[0]
+
+
+def measured(pull: Pull, seed: int, *, points: float = 1e-3, force: float = 0.02) -> Pull:
+    """Add noise: [m] to points, a share of its largest size to the force.
+
+    What the recording says of its noise stays 1 mm and 2 %: an estimator does not know that its
+    data are exact.
+    """
+    rng = np.random.default_rng([seed, int(pull.name.rsplit("-", 1)[1])])
+    peak = float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max())
+    wrenches = pull.wrenches.copy()
+    wrenches[:, :3] += force * peak * rng.standard_normal((len(wrenches), 3))
+    seen = pull.observations
+    positions = seen.positions + points * rng.standard_normal(seen.positions.shape)
+    sensor = pull.entry.sensor.model_copy(update={
+        "position_sigma_m": max(points, 1e-3), "force_sigma_n": max(force, 0.02) * peak})
+    return replace(pull, entry=pull.entry.model_copy(update={"sensor": sensor}),
+                   wrenches=wrenches, observations=Observations(seen.times, positions))
+
+
+class Bench:
+    """One branch's fitting mesh; fits pulls of it."""
+
+    def __init__(self, branch: PaperBranch, *, slice_length: float = 1.7, sides: int = 8):
+        self.branch = branch
+        self.mesh = branch.mesh(slice_length=slice_length, sides=sides)
+        self.points = control_points(branch.skeleton, FRACTIONS)
+        self.weights = young_weights(self.mesh, self.points)
+        self.model = BranchModel(self.mesh, young=1e7, poisson=0.35, density=900.0, gravity=None)
+
+    def objective(self, pulls: list[Pull], settings: EstimateSettings) -> Objective:
+        """The objective that ``limber estimate`` would have."""
+        forwards = [QuasiStaticForward(pull.name, self.model, self.weights, pull.entry,
+                                       frames_of(pull), np.array(pull.entry.rest_points_m
+                                                                 or self.points),
+                                       key_count=settings.key_frames) for pull in pulls]
+        poisson = 0.35 if settings.poisson is None else settings.poisson
+        extra = ("poisson",) if settings.fit_poisson else ()
+        start = Values(np.full(4, 1e7), poisson, 900.0)
+        return Objective(forwards, ParameterSpace.separate(start, extra),
+                         force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])
+
+    def fit(self, pulls: list[Pull], settings: EstimateSettings, *, cache: Path | None = None,
+            ) -> Estimate:
+        """Fit as ``limber estimate`` does; warnings are in the result, bases in ``cache``."""
+        objective = self.objective(pulls, settings)
+        messages: list[str] = []
+        found = fit_pulls(objective, objective.space.base, settings, messages.append,
+                          cache=cache, digest=self.branch.name)
+        found.warnings = messages
+        return found
+
+    def errors(self, found: Estimate) -> np.ndarray:
+        """Relative errors of the moduli, shape [4]."""
+        return found.values.young / np.array(self.branch.young) - 1

@@ -1,0 +1,169 @@
+"""The paper's three branches under noise, over many seeds; a stopped run goes on.
+
+Each trial is a fit of one pull or of three with fresh noise on points and force; what is kept of
+it tells error, interval and whether the truth lies inside.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
+
+from benchmarks.table import Row
+from limber.estimation.settings import EstimateSettings
+from limber.progress import Progress
+
+SETTINGS = EstimateSettings(hold_out=False)
+PULL_COUNTS = (1, 3)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One fit under noise.
+
+    Attributes:
+        branch: Number of the branch in :data:`benchmarks.paper_branches.BRANCHES`.
+        seed: Of the noise.
+        pulls: How many pulls were fitted together.
+        errors: Relative errors of the moduli, shape [4].
+        low, high: 95 % interval over the true modulus, shape [4].
+        variance_factor: Mean squared residual over the stated.
+        group_count: Moduli fitted; fewer than 4 where some were tied.
+        seconds: Of the fit.
+        source: Digest of the estimator's source; another one's trials are not taken over.
+    """
+
+    branch: int
+    seed: int
+    pulls: int
+    errors: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    variance_factor: float
+    group_count: int
+    seconds: float
+    source: str
+
+    @property
+    def worst(self) -> float:
+        return float(np.abs(self.errors).max())
+
+    @property
+    def covered(self) -> np.ndarray:
+        """Whether each interval holds the truth, shape [4] of bool."""
+        return (np.array(self.low) <= 1) & (np.array(self.high) >= 1)
+
+
+def noise_rows(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Row]:
+    """Measure ``seeds`` noises of each branch; with ``kept``, a file of trials, go on with it."""
+    trials = run_trials(seeds, progress, kept, workers)
+    table = []
+    for label, asked, count in (("one pull", 0.06, 1), ("three pulls", 0.03, 3)):
+        medians = [float(np.median([trial.worst for trial in trials
+                                    if (trial.branch, trial.pulls) == (number, count)]))
+                   for number in range(len(BRANCHES))]
+        each = ", ".join(f"{branch.name} {100 * median:.1f} %"
+                         for branch, median in zip(BRANCHES, medians, strict=True))
+        table.append(Row(
+            f"1 mm, 2 % force noise, {label}: median over {seeds} seeds of the worst E error",
+            f"{100 * asked:.0f} %", each, max(medians) <= asked))
+    covered = np.concatenate([trial.covered for trial in trials])
+    share = float(np.mean(covered))
+    each = ", ".join(
+        f"{branch.name} {100 * np.mean([t.covered for t in trials if t.branch == number]):.0f} %"
+        for number, branch in enumerate(BRANCHES))
+    table.append(Row("95 % intervals that cover the truth", "88 to 99 %",
+                     f"{100 * share:.1f} % of {len(covered)} ({each})",
+                     0.88 <= share <= 0.99))
+    return table
+
+
+def run_trials(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Trial]:
+    """All trials, those that ``kept`` has from the same estimator included."""
+    source = _source_digest()
+    known = {(t.branch, t.seed, t.pulls): t for t in _read(kept) if t.source == source}
+    wanted = [(branch, seed) for seed in range(seeds) for branch in range(len(BRANCHES))]
+    missing = [task for task in wanted
+               if any((*task, count) not in known for count in PULL_COUNTS)]
+    done = len(wanted) - len(missing)
+    for trial in _computed(missing, workers):
+        known[trial.branch, trial.seed, trial.pulls] = trial
+        if kept is not None:
+            with open(kept, "a", encoding="utf-8") as stream:
+                stream.write(json.dumps(asdict(trial)) + "\n")
+        if trial.pulls == PULL_COUNTS[-1]:
+            done += 1
+            progress(done / len(wanted), "noise over seeds")
+    return [known[(*task, count)] for task in wanted for count in PULL_COUNTS]
+
+
+def trials_of(task: tuple[int, int]) -> list[Trial]:
+    """Fit one branch under one noise: with one pull and with three."""
+    number, seed = task
+    branch = BRANCHES[number]
+    bench = Bench(branch)
+    noisy = [measured(pull, 1000 + seed) for pull in _exact_pulls(number)]
+    truth, trials = np.array(branch.young), []
+    for count in PULL_COUNTS:
+        started = time.perf_counter()
+        found = bench.fit(noisy[:count], SETTINGS)
+        low, high = (found.uncertainty.young_interval / truth[:, None]).T
+        trials.append(Trial(
+            number, seed, count, tuple(bench.errors(found).tolist()), tuple(low.tolist()),
+            tuple(high.tolist()), found.uncertainty.variance_factor,
+            found.objective.space.group_count, round(time.perf_counter() - started, 2),
+            _source_digest()))
+    return trials
+
+
+def _computed(tasks: list[tuple[int, int]], workers: int) -> Iterator[Trial]:
+    if workers < 2:
+        for task in tasks:
+            yield from trials_of(task)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(trials_of, task) for task in tasks]):
+            yield from future.result()
+
+
+_PULLS: dict[int, list] = {}
+
+
+def _exact_pulls(number: int) -> list:
+    """Pulls without noise, simulated once a process."""
+    if number not in _PULLS:
+        _PULLS[number] = [exact_pull(BRANCHES[number], pull) for pull in range(3)]
+    return _PULLS[number]
+
+
+def _source_digest() -> str:
+    """What an estimate depends on: the estimator's own files and this campaign's."""
+    from tests.subjects import paper_branches
+
+    import limber.estimation
+
+    files = [*sorted(Path(limber.estimation.__file__).parent.rglob("*.py")),
+             Path(paper_branches.__file__)]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+
+def _read(kept: Path | None) -> list[Trial]:
+    if kept is None or not kept.is_file():
+        return []
+    trials = []
+    for line in kept.read_text(encoding="utf-8").splitlines():
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            # The line that was being written when the run was stopped.
+            continue
+        trials.append(Trial(**{key: tuple(value) if isinstance(value, list) else value
+                               for key, value in record.items()}))
+    return trials

@@ -1,0 +1,202 @@
+"""Intervals where the branch's shape is known from a scan alone; a stopped run goes on.
+
+Each trial is what a user does, from start to end: a branch is generated and scanned, its scan
+reconstructed, the true branch pulled, and the moduli estimated on the reconstructed mesh.
+"""
+
+import hashlib
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.table import Row
+from limber.errors import LimberError
+from limber.estimation.fit import estimate
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+from limber.geometry.generated import generate_branch, write_generated
+from limber.geometry.reconstruct import reconstruct
+from limber.progress import Progress
+from limber.store import Branch
+
+FIRST_SEED = 8100
+"""Seeds from here on are no test's and no other bench's."""
+VIEWS = ("round", "one-sided")
+NOISES = (1e-3, 4e-4)
+"""Of the scan's points [m]; seeds take turns."""
+PARTS = ("sensor", "geometry", "mesh")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One branch from scan to moduli.
+
+    Attributes:
+        seed: Of branch, scan and pull.
+        view: How it was scanned.
+        errors: Of log E, shape [K]; empty where the trial failed.
+        low, high: 95 % interval of log E less the true one, shape [K].
+        total: Stated standard deviation of log E, shape [K].
+        parts: Its parts, median over the control points, in the order of ``PARTS``.
+        is_poor: Whether the estimate itself warned that model and pull do not fit.
+        failure: Why there is no estimate, or nothing.
+        seconds: Of all.
+        source: Digest of the sources; another one's trials are not taken over.
+    """
+
+    seed: int
+    view: str
+    errors: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    total: tuple[float, ...]
+    parts: tuple[float, ...]
+    is_poor: bool
+    failure: str
+    seconds: float
+    source: str
+
+    @property
+    def covered(self) -> np.ndarray:
+        """Whether each interval holds the truth, shape [K] of bool."""
+        return (np.array(self.low) <= 0) & (np.array(self.high) >= 0)
+
+
+def scan_rows(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Row]:
+    """Measure ``seeds`` branches, each scanned in both ways; ``kept``: go on with its trials."""
+    trials = run_trials(seeds, progress, kept, workers)
+    return [coverage_row(trials), size_row(trials)]
+
+
+def coverage_row(trials: list[Trial]) -> Row:
+    """How many intervals hold the truth; a trial without an estimate holds nothing."""
+    sound = [trial for trial in trials if not trial.failure]
+    covered = [trial.covered for trial in sound]
+    share = float(np.mean(np.concatenate(covered))) if covered else 0.0
+    by_view = {view: [trial.covered for trial in sound if trial.view == view] for view in VIEWS}
+    told = ", ".join(f"{view} {100 * np.mean(held):.0f} %"
+                     for view, held in by_view.items() if held)
+    poor = sum(trial.is_poor for trial in trials)
+    failed = sum(bool(trial.failure) for trial in trials)
+    return Row("reconstructed from a scan: 95 % intervals that cover the truth", "88 to 99 %",
+               f"{100 * share:.1f} % of {sum(map(len, covered))} ({told}; {poor} of {len(trials)} "
+               f"fits say that they are poor, {failed} failed)",
+               bool(covered) and not failed and 0.88 <= share <= 0.99)
+
+
+def size_row(trials: list[Trial]) -> Row:
+    """How far off the moduli are, and what the intervals say."""
+    told = []
+    for view in VIEWS:
+        chosen = [trial for trial in trials if trial.view == view and not trial.failure]
+        if not chosen:
+            continue
+        errors = np.concatenate([trial.errors for trial in chosen])
+        over = errors / np.concatenate([trial.total for trial in chosen])
+        parts = np.median([trial.parts for trial in chosen], axis=0)
+        each = ", ".join(f"{name} {100 * part:.1f} %"
+                         for name, part in zip(PARTS, parts, strict=True))
+        told.append(f"{view}: median {100 * np.median(np.abs(errors)):.1f} %, "
+                    f"{np.median(np.abs(over)) / 0.6745:.2f} of what is stated ({each})")
+    return Row("the same: error of E", "-", "; ".join(told), None)
+
+
+def run_trials(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Trial]:
+    """All trials, those that ``kept`` has from the same sources included."""
+    source = _source_digest()
+    known = {(trial.seed, trial.view): trial for trial in read_trials(kept)
+             if trial.source == source}
+    wanted = [(FIRST_SEED + number, view) for number in range(seeds) for view in VIEWS]
+    done = sum(task in known for task in wanted)
+    for trial in _computed([task for task in wanted if task not in known], workers):
+        known[trial.seed, trial.view] = trial
+        if kept is not None:
+            with open(kept, "a", encoding="utf-8") as stream:
+                stream.write(json.dumps(asdict(trial)) + "\n")
+        done += 1
+        progress(done / len(wanted), "from scans to moduli")
+    return [known[task] for task in wanted]
+
+
+def trial_of(task: tuple[int, str]) -> Trial:
+    """Generate, scan, reconstruct, pull and estimate one branch."""
+    seed, view = task
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        try:
+            found = from_scan(folder, seed, view)
+            failure = ""
+        except LimberError as error:
+            found, failure = {}, str(error)
+        truth = np.array(json.loads((folder / "scan" / "truth.json").read_text(
+            encoding="utf-8"))["young_pa"])
+    seconds = round(time.perf_counter() - started, 1)
+    if failure:
+        return Trial(seed, view, (), (), (), (), (), False, failure, seconds, _source_digest())
+    interval = np.log(np.array(found["young_interval_pa"]) / truth[:, None])
+    deviation = found["young_deviation"]
+    medians = [np.nan if deviation[name] is None else float(np.median(deviation[name]))
+               for name in PARTS]
+    return Trial(seed, view, _told(np.log(np.array(found["young_pa"]) / truth)),
+                 _told(interval[:, 0]), _told(interval[:, 1]), _told(deviation["total"]),
+                 tuple(medians), any("fit is poor" in text for text in found["warnings"]), "",
+                 seconds, _source_digest())
+
+
+def from_scan(folder: Path, seed: int, view: str) -> dict:
+    """Return the estimate of one branch; its files are left in ``folder``."""
+    write_generated(generate_branch(seed, view=view, noise=NOISES[seed % len(NOISES)]),
+                    folder / "scan")
+    branch = folder / "branch"
+    reconstruct(folder / "scan" / "cloud.ply", branch)
+    virtual_pull(branch, "pull-1", VirtualPullSettings(seed=seed))
+    estimate(branch, EstimateSettings())
+    return json.loads(Branch.open(branch).path("estimate.json").read_text(encoding="utf-8"))
+
+
+def read_trials(kept: Path | None) -> list[Trial]:
+    """Read the trials of a file; a line that was cut off is left out."""
+    if kept is None or not kept.is_file():
+        return []
+    trials = []
+    for line in kept.read_text(encoding="utf-8").splitlines():
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            # The line that was being written when the run was stopped.
+            continue
+        trials.append(Trial(**{key: tuple(value) if isinstance(value, list) else value
+                               for key, value in record.items()}))
+    return trials
+
+
+def _computed(tasks: list[tuple[int, str]], workers: int) -> Iterator[Trial]:
+    if workers < 2:
+        yield from map(trial_of, tasks)
+        return
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(trial_of, task) for task in tasks]):
+            yield future.result()
+
+
+def _told(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(np.asarray(values, float).tolist())
+
+
+def _source_digest() -> str:
+    """What a trial depends on: geometry, mechanics, the estimator and this campaign."""
+    import limber
+
+    here = Path(limber.__file__).parent
+    files = [file for name in ("geometry", "mechanics", "estimation")
+             for file in sorted((here / name).rglob("*.py"))]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in [*files, Path(__file__)])
+                          ).hexdigest()[:16]

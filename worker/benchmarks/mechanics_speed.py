@@ -1,0 +1,267 @@
+"""Mechanics against the clock.
+
+Times are processor seconds of this process, the least of several runs: other work on the machine
+disturbs them least. Ratios are taken within one run.
+"""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+
+import numpy as np
+
+from benchmarks.mechanics import DENSITY, LENGTH, YOUNG
+from benchmarks.mechanics_reduced import bench_branch
+from benchmarks.table import Row
+from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics import (
+    BranchModel,
+    Grasp,
+    NewmarkSettings,
+    StaticSettings,
+    follow_poses,
+    simulate_dynamics,
+    solve_static,
+)
+from limber.progress import SILENT, Progress
+
+
+def rows(quick: bool, progress: Progress = SILENT) -> list[Row]:
+    """Measure; ``quick`` takes fewer grasps and the smaller meshes."""
+    steps: list[Callable[[], list[Row]]] = [
+        lambda: speed_rows(quick), lambda: [linear_row()], lambda: [grasp_row(quick)],
+        lambda: [memory_row(quick)]]
+    found = []
+    for number, step in enumerate(steps):
+        progress(number / len(steps), "measuring")
+        found += step()
+    return found
+
+
+def bench_mesh(spacing: float) -> TetMesh:
+    """Return the notes' branch (0.6 m, radius 6 to 2 mm, curved, one fork), by the sweep."""
+    return bench_branch(spacing).model.mesh
+
+
+def _sized_mesh(tet_count: int) -> TetMesh:
+    """Return the branch with so many quadratic tetrahedra, or the fewest above."""
+    spacings = np.geomspace(0.15, 6, 24)
+    low, high = 0, len(spacings) - 1
+    meshes = {}
+    while high - low > 1:
+        middle = (low + high) // 2
+        meshes[middle] = bench_mesh(float(spacings[middle]))
+        low, high = (middle, high) if meshes[middle].tet_count > tet_count else (low, middle)
+    enough = [mesh for mesh in meshes.values() if mesh.tet_count >= tet_count]
+    return min(enough, key=lambda mesh: mesh.tet_count)
+
+
+def least_seconds(work: Callable[[], object], count: int = 15) -> float:
+    """Return the least processor time [s] of ``work`` after one run to warm up."""
+    work()
+    times = []
+    for _ in range(count):
+        start = time.process_time()
+        work()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Processor times [s] of the parts of an iteration."""
+
+    assembly: float
+    factorisation: float
+    solve: float
+
+    @property
+    def total(self) -> float:
+        return self.assembly + self.factorisation + self.solve
+
+
+def parts_of(model: BranchModel, count: int = 15) -> Parts:
+    """Time assembly of force and stiffness, factorisation and solve.
+
+    One after the other as in an iteration, so that each finds in the caches what it finds there;
+    the least of each.
+    """
+    equations = model.equations()
+    zero = np.zeros_like(model.mesh.nodes)
+    right = np.ones_like(zero)
+    times = []
+    for _ in range(count + 1):
+        stamps = [time.process_time()]
+        model.internal(zero)
+        equations.assemble(model, zero)
+        stamps.append(time.process_time())
+        equations.factorise()
+        stamps.append(time.process_time())
+        equations.solve(right)
+        stamps.append(time.process_time())
+        times.append(np.diff(stamps))
+    return Parts(*np.min(times[1:], axis=0))
+
+
+def cholmod_seconds(model: BranchModel) -> float:
+    """Return the least time [s] in which CHOLMOD factorises what the model has assembled."""
+    from limber.mechanics.linear.factor import CholmodFactor
+
+    equations = model.equations()
+    equations.assemble(model, np.zeros_like(model.mesh.nodes))
+    pattern = equations.pattern
+    general = CholmodFactor(*pattern.entries(), pattern.size)
+    values = equations._values[:pattern.value_count]
+    return least_seconds(lambda: general.factorise(values), 7)
+
+
+def _stepping(model: BranchModel, count: int = 40) -> tuple[float, float]:
+    """Return processor seconds and iterations a converged step, dt 1/60, load at the tip."""
+    tip = int(model.mesh.nodes[:, 2].argmax())
+    force = np.zeros_like(model.mesh.nodes)
+    force[tip, 0] = 0.05
+    settings = NewmarkSettings(tolerance=1e-4)
+    best, iterations = np.inf, 0.0
+    for _ in range(3):
+        start = time.process_time()
+        result = simulate_dynamics(model, nodal_forces=force, times=np.arange(count + 1) / 60,
+                                   start="rest", settings=settings).require()
+        best = min(best, (time.process_time() - start) / count)
+        iterations = result.iteration_count / result.step_count
+    return best, iterations
+
+
+def speed_rows(quick: bool) -> list[Row]:
+    """Assembly against factorisation, converged steps."""
+    found = []
+    model = _branch_model(_sized_mesh(2800))
+    parts, general = parts_of(model), cholmod_seconds(model)
+    ratio = 100 * parts.assembly / parts.factorisation
+    count = model.mesh.tet_count
+    found.append(Row(
+        f"assembly of stiffness and force, {count} quadratic tetrahedra, one thread",
+        "under 30 % of the factorisation",
+        f"{ratio:.0f} % ({1e3 * parts.assembly:.1f} of {1e3 * parts.factorisation:.1f} ms;"
+        f" CHOLMOD, which the row was set for, takes {1e3 * general:.1f} ms:"
+        f" {100 * parts.assembly / general:.0f} %; prototype 7.1 of 27.1)", bool(ratio < 30)))
+    step, iterations = _stepping(model, 20 if quick else 40)
+    units = step / parts.total
+    found.append(Row(
+        "converged implicit step, same mesh, dt 1/60",
+        "under 3.2 times (assembly + factorisation + solve)",
+        f"{units:.2f} times ({1e3 * step:.0f} ms, {iterations:.1f} iterations, residual 1e-4;"
+        " prototype 91 ms)", bool(units < 3.2)))
+    small = _branch_model(_sized_mesh(1000))
+    step, _ = _stepping(small, 20 if quick else 40)
+    found.append(Row(
+        f"converged implicit steps, {small.mesh.tet_count} quadratic tetrahedra",
+        "40 steps a second", f"{1 / step:.0f} a second (prototype 35)", bool(1 / step >= 40)))
+    return found
+
+
+def _branch_model(mesh: TetMesh) -> BranchModel:
+    return BranchModel(mesh, young=YOUNG, poisson=0.35, density=DENSITY, gravity=None)
+
+
+def linear_row() -> Row:
+    """One Newton step in time with linear tetrahedra."""
+    mesh = _sized_mesh(7500).linear()
+    model = _branch_model(mesh)
+    equations = model.equations()
+    zero = np.zeros_like(mesh.nodes)
+    right = np.ones_like(zero)
+
+    def step() -> None:
+        model.internal(zero)
+        equations.assemble(model, zero, mass_factor=14400.0)
+        equations.factorise()
+        equations.solve(right - model.mass_matrix @ zero)
+
+    seconds = least_seconds(step)
+    return Row(f"linear tetrahedra, one-Newton step, {mesh.tet_count} tetrahedra",
+               "12 ms where the prototype took 11.6", f"{1e3 * seconds:.1f} ms",
+               bool(seconds <= 0.012))
+
+
+def grasp_row(quick: bool) -> Row:
+    """Random grasps to 40 % of the length by the full model, each solved on two paths."""
+    count = 40 if quick else 300
+    model = _branch_model(_sized_mesh(2800))
+    reach = 2 / 3 * LENGTH
+    grasp = Grasp.at(model.mesh, model.mesh.nodes[_node_at(model.mesh, reach)], 0.0, "pinned")
+    poses = np.array([np.concatenate([grasp.centre + move, np.zeros(3)])
+                      for move in _tour(grasp.centre, count)])
+    start = time.process_time()
+    results = follow_poses(model, grasp, poses)
+    seconds = time.process_time() - start
+    careful = StaticSettings(max_step=0.1)
+    again = follow_poses(model, grasp, poses[::-1], settings=careful)[::-1]
+    both = [(a, b) for a, b in zip(results, again, strict=True) if a.converged and b.converged]
+    off = [abs(a.strain_energy / b.strain_energy - 1) for a, b in both]
+    false = sum(a.strain_energy > (1 + 1e-3) * b.strain_energy for a, b in both)
+    failed = sum(not r.converged for r in results)
+    lowest = min(r.min_det_f for r in results)
+    measured = (f"{seconds:.0f} s for {count} ({seconds * 300 / count:.0f} s for 300; prototype"
+                f" 104); {failed} failed; min det F {lowest:.2f}; energy on the way back differs"
+                f" by {max(off):.1e} at most; {false} higher than there")
+    return Row("300 random grasps to 40 % of the length, full model, one process",
+               "105 s; no false equilibrium", measured,
+               bool(seconds * 300 / count <= 105 and not false and lowest > 0 and not failed))
+
+
+def _node_at(mesh: TetMesh, height: float) -> int:
+    corners = np.unique(mesh.tets[:, :4])
+    main = corners[mesh.nodes[corners, 0] > 0.2 * mesh.nodes[corners, 2] - 0.02]
+    return int(main[np.abs(np.linalg.norm(mesh.nodes[main], axis=1) - height).argmin()])
+
+
+def _tour(centre: np.ndarray, count: int) -> np.ndarray:
+    """Return reachable random moves [m] in the order of nearest neighbours, [count, 3]."""
+    rng = np.random.default_rng(0)
+    moves: list[np.ndarray] = []
+    while len(moves) < count:
+        move = rng.standard_normal(3)
+        move *= 0.4 * LENGTH * rng.uniform() ** (1 / 3) / np.linalg.norm(move)
+        place = centre + move
+        if 0.4 < np.linalg.norm(place) / np.linalg.norm(centre) < 0.97 and place[2] > 0.05:
+            moves.append(move)
+    left, order, at = list(range(count)), [], np.zeros(3)
+    while left:
+        nearest = min(left, key=lambda k: float(np.linalg.norm(moves[k] - at)))
+        order.append(nearest)
+        left.remove(nearest)
+        at = moves[nearest]
+    return np.array([moves[k] for k in order])
+
+
+def memory_row(quick: bool) -> Row:
+    """A static solve with 50,000 quadratic tetrahedra, in a process of its own."""
+    count = 10_000 if quick else 50_000
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        found, megabytes, seconds, converged = pool.submit(_solve_large, count).result()
+    return Row("memory at 50,000 quadratic tetrahedra", "4 GB, and it solves",
+               f"{megabytes / 1024:.2f} GB at {found} tetrahedra,"
+               f" {'solved' if converged else 'not solved'} in {seconds:.0f} s",
+               bool(converged and megabytes < 4096 and found >= 45_000) if not quick else None)
+
+
+def _solve_large(count: int) -> tuple[int, float, float, bool]:
+    import psutil
+
+    mesh = straight_beam(LENGTH, 0.01, slice_count=count // (3 * 24), sides=24)
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=DENSITY)
+    start = time.perf_counter()
+    grasp = Grasp.at(mesh, np.array([0, 0, 0.4]), 0.012)
+    pose = grasp.rest_pose + np.array([0.05, 0, -0.004, 0, 0.1, 0])
+    result = solve_static(model, grasp=grasp, pose=pose)
+    process = psutil.Process()
+    memory = process.memory_info()
+    peak = getattr(memory, "peak_wset", None)
+    if peak is None:
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return mesh.tet_count, peak / 2**20, time.perf_counter() - start, result.converged

@@ -1,0 +1,1 @@
+"""Forward simulations of a pull: quasi-static, dynamic, hung load, reduced."""

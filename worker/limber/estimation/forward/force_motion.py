@@ -1,0 +1,95 @@
+"""What errors of a measured force do to a motion that it drives.
+
+The change of a motion by a small change of its force is that of a linear system. Its slowest
+modes carry nearly all of it, the others follow as if there were no inertia. The modes are those
+of the undeformed branch: the change is small, and wanted as a weight, not as a result.
+"""
+
+import numpy as np
+from scipy.linalg import eigh
+
+from limber.mechanics.dynamics.motion import DEFAULT_SETTINGS
+from limber.mechanics.model import BranchModel
+
+MODES = 16
+SPARE = 8
+ITERATIONS = 8
+"""Subspace iteration: with this many vectors more than modes wanted, so often."""
+
+
+def motion_response(model: BranchModel, loads: np.ndarray, observed: object, times: np.ndarray,
+                    ) -> np.ndarray:
+    """Change of observed points along a motion by the force at each frame.
+
+    Args:
+        model: The branch, with its damping.
+        loads: Nodal forces of each of the force's components, shape [c, node_count, 3].
+        observed: Displacement of the points from the nodes', shape [3 m, 3 n]; sparse.
+        times: Of the frames [s], shape [f]; the force is linear between them.
+
+    Returns:
+        [m per N], shape [f, m, 3, f c]; the force's columns by frame, then component.
+    """
+    squares, modes, static = _modes(model, loads)
+    at_points = np.array([observed @ mode.ravel() for mode in modes])
+    pushed = np.einsum("qni,cni->qc", modes, loads)
+    alpha, beta = model.damping.mass, model.damping.stiffness
+    swing = _swing(squares, alpha + beta * squares, times)
+    count, components = len(times), len(loads)
+    points = np.einsum("qfj,qp,qc->fpjc", swing, at_points, pushed, optimize=True)
+    stiff = np.array([observed @ field.ravel() for field in static]).T
+    stiff = stiff - np.einsum("qp,qc,q->pc", at_points, pushed, 1 / squares)
+    frames = np.arange(count)
+    points[frames, :, frames] += stiff
+    return points.reshape(count, -1, 3, count * components)
+
+
+def _modes(model: BranchModel, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squared angular frequencies [1/s^2], modes of unit modal mass, and static solutions."""
+    equations = model.equations(())
+    equations.assemble(model, np.zeros_like(model.mesh.nodes))
+    equations.factorise()
+    static = np.array([equations.solve(load) for load in loads])
+    rng = np.random.default_rng(0)
+    free = rng.standard_normal((MODES + SPARE - len(loads), *model.mesh.nodes.shape))
+    free[:, model.fixed] = 0.0
+    vectors = np.concatenate([static, free])
+    for _ in range(ITERATIONS):
+        pushed = np.array([model.mass_times(vector) for vector in vectors])
+        vectors = np.array([equations.solve(force) for force in pushed])
+        flat = vectors.reshape(len(vectors), -1)
+        stiffness = flat @ pushed.reshape(len(vectors), -1).T
+        mass = flat @ np.array([model.mass_times(v).ravel() for v in vectors]).T
+        squares, mix = eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
+        vectors = np.tensordot(mix.T, vectors, axes=1)
+    return squares[:MODES], vectors[:MODES], static
+
+
+def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Each mode's motion under a unit force at one frame, linear to nothing at those beside it.
+
+    By Newmark's average acceleration with the steps of the simulation; it starts in equilibrium.
+
+    Returns:
+        Shape [modes, f, f]: at each frame, for the force of each.
+    """
+    count = len(times)
+    k, d = squares[:, None], damping[:, None]
+    hats = np.eye(count)
+    place = hats[0] / k
+    speed, push = np.zeros_like(place), np.zeros_like(place)
+    swing = np.empty((len(squares), count, count))
+    swing[:, 0] = place
+    for frame in range(1, count):
+        gap = times[frame] - times[frame - 1]
+        steps = int(np.ceil(gap / DEFAULT_SETTINGS.max_step - 1e-9))
+        dt = gap / steps
+        for step in range(1, steps + 1):
+            share = step / steps
+            force = (1 - share) * hats[frame - 1] + share * hats[frame]
+            foretold = place + dt * speed + dt**2 / 4 * push
+            going = speed + dt / 2 * push
+            push = (force - d * going - k * foretold) / (1 + dt / 2 * d + dt**2 / 4 * k)
+            place, speed = foretold + dt**2 / 4 * push, going + dt / 2 * push
+        swing[:, frame] = place
+    return swing

@@ -1,0 +1,133 @@
+"""A steady load, such as a hung weight: where the branch comes to rest under it.
+
+No robot is needed. Marker tracks show the branch without the load, then swinging, then at rest;
+the rest is found, and becomes a pull of a few frames that a force drives.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.recordings.recording import Observations
+
+FRAMES = 4
+"""Frames that the settled part is averaged into."""
+STILL_SHARE = 0.005
+"""Settled means: within this share of the whole displacement of where it ends."""
+REGISTRATION_SHARE = 0.25
+"""A marker whose place on the body is off by 1 mm is off by so much of that when it moves: the
+displacement changes along a bent body by about its slope."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """Before the load and after the swinging.
+
+    Attributes:
+        rest: Markers without the load [m], shape [m, 3].
+        times: Middle of each block of the settled part [s], shape [f].
+        positions: Mean of each block [m], shape [f, m, 3]; NaN where a marker was not seen.
+        noise: Of one reading, standard deviation per axis [m].
+        moved: Displacement of the marker that moved most [m].
+        duration: Of the settled part [s].
+        warnings: What the user should know.
+    """
+
+    rest: np.ndarray
+    times: np.ndarray
+    positions: np.ndarray
+    noise: float
+    moved: float
+    duration: float
+    warnings: tuple[str, ...] = ()
+
+    def sigma(self, registration: float) -> float:
+        """Standard deviation [m] to state for each frame: what all share does not average out.
+
+        Args:
+            registration: RMS distance of the markers at rest from where they should be [m].
+        """
+        shared = REGISTRATION_SHARE * registration
+        alone = self.noise * np.sqrt(2 / max(len(self.times), 1))
+        return float(np.sqrt(len(self.times) * (shared**2 + alone**2 + 1e-10)))
+
+
+def settled(seen: Observations, name: str) -> Settled:
+    """Find the unloaded start and the settled end of a recording.
+
+    The end is the longest last part in which no marker's running mean leaves a band of 1 % of the
+    whole displacement. A slow creep inside the band is reported.
+
+    Raises:
+        InputError: nothing moved, or the recording ends while it still swings.
+    """
+    times, positions = seen.times, seen.positions
+    whole = seen.visible.mean(axis=0) > 0.5
+    if not whole.any() or not np.isfinite(positions[0, whole]).all(axis=1).any():
+        raise InputError(f"{name}: the first frame shows no marker that stays in view.",
+                         "It must show the branch without the load.",
+                         "Trim the recording so that it starts before the load.")
+    noise = _noise(positions[:, whole])
+    rest = _rest(positions, noise)
+    last = max(len(times) // 20, 3)
+    end = np.nanmean(positions[-last:], axis=0)
+    off = np.linalg.norm(end - rest, axis=1)
+    moved = float(np.nanmax(off[whole]))
+    if moved < 5 * noise:
+        raise InputError(
+            f"{name}: between start and end no marker moves more than {moved * 1e3:.2g} mm.",
+            f"The markers' noise is {noise * 1e3:.2g} mm: no load shows.",
+            "Hang a larger weight, or check that the recording starts without it.")
+    away = np.linalg.norm(_running_mean(positions[:, whole]) - end[whole], axis=2)
+    band = max(STILL_SHARE * moved, 2 * noise)
+    outside = np.flatnonzero(np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=1) > band)
+    first = int(outside[-1]) + 1 if len(outside) else 0
+    if len(times) - first < max(8, 0.03 * len(times)):
+        swing = np.nanmax(np.ptp(positions[-last:, whole], axis=0))
+        raise InputError(
+            f"{name}: the recording ends before the branch is at rest (it still moves by "
+            f"{swing * 1e3:.2g} mm).", "A static fit needs the branch at rest under its load.",
+            "Record until it has settled, or import it as a dynamic pull.")
+    blocks = np.array_split(np.arange(first, len(times)), FRAMES)
+    means = np.array([_mean(positions[block]) for block in blocks])
+    middle = np.array([times[block].mean() for block in blocks])
+    drift = float(np.nanmax(np.linalg.norm(means[-1] - means[0], axis=1)[whole]))
+    warnings = ()
+    if drift > 0.002 * moved + 2 * noise / np.sqrt(len(blocks[0])):
+        warnings = (f"{name}: at rest it still creeps, by {100 * drift / moved:.1f} % of its "
+                    f"displacement over {times[-1] - times[first]:.1f} s. Young's modulus is that "
+                    "of this moment.",)
+    return Settled(rest, middle, means, noise, moved, float(times[-1] - times[first]), warnings)
+
+
+def _noise(positions: np.ndarray) -> float:
+    """Of one coordinate, from second differences: a smooth motion has hardly any."""
+    second = np.diff(positions, n=2, axis=0)
+    second = second[np.isfinite(second)]
+    if not len(second):
+        return 1e-5
+    return max(1.4826 * float(np.median(np.abs(second))) / np.sqrt(6), 1e-6)
+
+
+def _rest(positions: np.ndarray, noise: float) -> np.ndarray:
+    """Mean of the first frames, as long as nothing moves."""
+    away = np.linalg.norm(positions - positions[0], axis=2)
+    still = np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=1) < 6 * noise + 5e-5
+    count = int(np.argmin(still)) if not still.all() else len(still)
+    return _mean(positions[:max(count, 1)])
+
+
+def _mean(positions: np.ndarray) -> np.ndarray:
+    known = np.isfinite(positions).all(axis=2)
+    total = np.where(known[..., None], positions, 0.0).sum(axis=0)
+    count = known.sum(axis=0)[:, None]
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _running_mean(positions: np.ndarray, width: int = 5) -> np.ndarray:
+    pad = np.pad(positions, ((width // 2, width // 2), (0, 0), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(pad, width, axis=0)
+    return np.nanmean(np.where(np.isfinite(windows), windows, np.nan), axis=-1) \
+        if np.isfinite(positions).all() else np.ma.masked_invalid(windows).mean(axis=-1).filled(
+            np.nan)

@@ -1,0 +1,143 @@
+"""The force that drives a simulation was measured, with errors: they are unknowns of the fit.
+
+Taken as exact, an error of the force becomes an error of all points of its frame at once, many
+times their own noise and all in one direction: a fit then bends the moduli to follow it. Here the
+true force is a smooth course through the key frames; its values there are unknowns beside the
+moduli, and each reading is an observation of the course. Points are linear enough in so small a
+change of force that the unknowns can be eliminated: residuals and their derivatives are projected
+across what a change of force could explain. That equals weighing the points by their noise plus
+the force's, carried through the compliance (the effective variance), with all correlations
+between the points of a frame. What the fit says of the force moves the course after each fit, and
+the compliance with it, until both stay (Fuller, Measurement Error Models, 1987, ch. 3).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.estimation.forward.key_frames import key_frames, smoothed
+from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.mechanics.model import BranchModel
+from limber.mechanics.sensitivities import refined_solve
+from limber.recordings.alignment import Frames
+from limber.recordings.recording import GraspEntry
+
+COURSE_MISFIT = 1.5
+"""Mean squared deviation of readings from their course, over the stated, from which the course
+gets more key frames."""
+CLIPPED = 4.0
+"""A reading farther off its course than so many deviations is an outlier, no bend of the course."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """How a simulated pull answers to its L unknowns of force, at the place of linearisation.
+
+    Attributes:
+        points: Of the observed points [m per N], shape [f, m, 3, L].
+        wrenches: Of force, and torque where it acts too, at the frames, shape [f, c, L]; c is 3
+            or 6.
+    """
+
+    points: np.ndarray
+    wrenches: np.ndarray
+
+
+@dataclass(frozen=True)
+class Course:
+    """Force, and torque of a clamped grasp, over time.
+
+    Attributes:
+        keys: Key frames, shape [k].
+        spread: Values at all frames from those at the key frames, shape [f, k].
+        values: At the key frames [N, N m], shape [k, c].
+        exact: Whether it is a stated load, not a reading: it has no unknowns.
+    """
+
+    keys: np.ndarray
+    spread: np.ndarray
+    values: np.ndarray
+    exact: bool = False
+
+    @property
+    def at_frames(self) -> np.ndarray:
+        """Shape [f, c]."""
+        return self.spread @ self.values
+
+
+def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:
+    """Lay a smooth course through the readings of the force.
+
+    A noisy force is not a path; time orders the frames. Where ``count`` key frames cannot follow
+    the readings to within their noise, there are more.
+
+    Args:
+        frames: With some readings missing, perhaps.
+        sigma: Deviation of each reading [N, N m], shape [f, c].
+        count: Key frames wanted.
+        components: c: 3 for the force, 6 with the torque.
+    """
+    readings = frames.wrenches[:, :components]
+    known = np.isfinite(readings).all(axis=1)
+    if np.ptp(readings[known], axis=0).max() == 0.0:
+        return Course(np.flatnonzero(known)[:1], np.ones((len(frames), 1)),
+                      readings[known][:1], exact=True)
+    along = frames.times - frames.times[0]
+    while True:
+        keys, spread = key_frames(along, count)
+        weight = 1 / sigma[known]
+        values = smoothed(frames.times, readings, frames.times[keys])
+        for axis in range(components):
+            matrix = weight[:, axis, None] * spread[known]
+            missing = weight[:, axis] * (readings[known, axis] - spread[known] @ values[:, axis])
+            values[:, axis] += np.linalg.lstsq(matrix, missing, rcond=1e-3)[0]
+        off = np.clip((readings[known] - spread[known] @ values) * weight, -CLIPPED, CLIPPED)
+        freedom = max(known.sum() - len(keys), 1) * components
+        if len(keys) >= min(len(frames), known.sum()) or (
+                float(np.sum(off**2)) < COURSE_MISFIT * freedom):
+            return Course(keys, spread, values)
+        count = 2 * len(keys)
+
+
+def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndarray,
+                components: int) -> np.ndarray:
+    """Nodal forces of each component of the gripper's wrench, shape [c, node_count, 3].
+
+    A force acts on the patch's centre. A clamped gripper's torque, about the recorded point,
+    turns the patch by a couple of forces on its nodes, with the arms that they have at the
+    recorded rotation.
+
+    Args:
+        pose: Recorded [m, rad], shape [6].
+        rest: Nodes of the mesh [m], shape [node_count, 3].
+    """
+    loads = np.zeros((components, *rest.shape))
+    for axis in range(3):
+        loads[axis, grasp.nodes, axis] = grasp.weights
+    if components == 3:
+        return loads
+    turn = rotation_matrix(pose[3:])
+    arms = (rest[grasp.nodes] - grasp.centre) @ turn.T
+    # The force acts on the centre, the torque was taken about the recorded point.
+    offset = turn @ (np.array(entry.point_m) - grasp.centre)
+    inertia = np.einsum("k,kij->ij", grasp.weights, np.einsum("ki,ki->k", arms, arms)[
+        :, None, None] * np.eye(3) - arms[:, :, None] * arms[:, None, :])
+    for axis in range(3):
+        spin = np.linalg.solve(inertia, np.eye(3)[axis])
+        loads[3 + axis, grasp.nodes] = grasp.weights[:, None] * np.cross(spin, arms)
+    for axis in range(3):
+        loads[axis] += np.einsum("t,tni->ni", np.cross(offset, np.eye(3)[axis]), loads[3:])
+    return loads
+
+
+def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) -> np.ndarray:
+    """Change of an equilibrium by each nodal load, shape [c, node_count, 3]."""
+    equations = model.equations(())
+    equations.assemble(model, displacement)
+    equations.factorise()
+
+    def tangent(direction: np.ndarray) -> np.ndarray:
+        return model.tangent_times(displacement, direction)
+
+    return np.array([refined_solve(equations, tangent, load) for load in loads])
+

@@ -1,0 +1,362 @@
+"""A slow pull, simulated frame by frame as a chain of equilibria, with exact derivatives."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from limber.errors import InputError, WorkError
+from limber.estimation.forward.input_force import (
+    Course,
+    Response,
+    compliance,
+    course_of,
+    nodal_loads,
+)
+from limber.estimation.forward.key_frames import key_frames, travel
+from limber.estimation.gripper_path import force_for_travel
+from limber.estimation.objective import Simulated
+from limber.estimation.parameters import Values
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.linear.factor import NotPositiveDefiniteError
+from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
+from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
+from limber.recordings.alignment import Frames
+from limber.recordings.grasping import grasp_on, pose_on
+from limber.recordings.points import point_operator
+from limber.recordings.recording import PullEntry
+
+SETTINGS = StaticSettings(tolerance=1e-6)
+YOUNG_STEP_LIMIT = 0.7
+"""A state is carried over to parameters by its derivative up to this change of a log E."""
+
+
+@dataclass
+class _Memory:
+    """State of one key frame under the last parameters: where the next solve starts."""
+
+    result: StaticResult
+    slope: np.ndarray | None = None
+
+    @property
+    def displacement(self) -> np.ndarray:
+        return self.result.displacement
+
+
+class QuasiStaticForward:
+    """Simulates one pull in equilibrium; see :class:`limber.estimation.objective.Forward`.
+
+    States of the key frames are kept from call to call: parameters change little from one
+    evaluation to the next, so that two Newton iterations a frame are enough.
+
+    Args:
+        name: The pull's name.
+        model: The branch; its Young's modulus is replaced.
+        weights: Young's modulus of the tetrahedra from the control points', [tet_count, K].
+        entry: The pull's settings.
+        frames: Aligned frames.
+        rest_points: Observed points at rest [m], shape [m, 3].
+        key_count: Frames that are simulated at most.
+    """
+
+    def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
+                 frames: Frames, rest_points: np.ndarray, *, key_count: int = 12):
+        self.name, self.frames = name, frames
+        self.drive = entry.drive
+        measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+        if self.drive == "force" and measured.sum() < 2:
+            raise InputError(f"{name}: a force-driven simulation without measured force.",
+                             "Nothing would pull.", "Use --drive pose, or record the force.")
+        if self.drive == "force" and entry.grasp.mode == "clamped":
+            _require_torque(name, entry, frames)
+        self.uses_force = bool(measured.any())
+        self.weights = weights
+        self.rest_points = np.asarray(rest_points, float)
+        self.entry = entry
+        gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
+        self._model = model.with_parameters(gravity=gravity)
+        self.uses_torque = uses_torque(entry, frames)
+        self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._operator = point_operator(model.mesh, self.rest_points)
+        self.set_key_count(key_count)
+
+    def set_key_count(self, count: int) -> None:
+        """Simulate at most ``count`` frames from now on; more where the force asks for it."""
+        frames = self.frames
+        self._course: Course | None = None
+        self.response: Response | None = None
+        if self.drive == "pose":
+            self.keys, self.spread = key_frames(travel(frames.poses), count)
+            self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
+                            for pose in frames.poses[self.keys]]
+        else:
+            components = 6 if self.uses_torque else 3
+            self._course = course_of(frames, self._wrench_sigma(components), count, components)
+            self.keys, self.spread = self._course.keys, self._course.spread
+            self._measured = self._course.values
+            self._drives = list(self._measured)
+            self._loads = [self._loads_at(key) for key in self.keys]
+        self._memory: list[_Memory | None] = [None] * len(self.keys)
+        self._values: Values | None = None
+        self._hints: list[np.ndarray] | None = None
+
+    @property
+    def key_count(self) -> int:
+        return len(self.keys)
+
+    @property
+    def mesh(self) -> TetMesh:
+        return self._model.mesh
+
+    def model_with(self, values: Values) -> BranchModel:
+        """Return the branch with these parameters."""
+        return self._model.with_parameters(
+            young=self.weights @ values.young, poisson=values.poisson, density=values.density,
+            damping=RayleighDamping(*values.damping))
+
+    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
+                 ) -> Simulated | None:
+        """Return the pull under ``values``; None where a frame finds no equilibrium."""
+        model = self.model_with(values)
+        log_young = np.log(values.young)
+        jump = None if self._values is None else log_young - np.log(self._values.young)
+        shape = (len(self.keys), len(self.rest_points), 3)
+        count = len(values.young) + len(extra)
+        points, forces = np.empty(shape), np.empty((len(self.keys), 3))
+        d_points = np.empty((*shape, count)) if sensitivities else None
+        d_forces = np.empty((len(self.keys), 3, count)) if sensitivities else None
+        with_torque = self.uses_torque
+        torques = np.empty((len(self.keys), 3)) if with_torque else None
+        d_torques = np.empty((len(self.keys), 3, count)) if with_torque and sensitivities else None
+        states: list[_Memory | None] = []
+        before: np.ndarray | None = None
+        for key, drive in enumerate(self._drives):
+            memory = self._memory[key]
+            same = memory is not None and _equal(self._values, values)
+            hint = None if self._hints is None else self._hints[key]
+            result = memory.result if same else self._solved(
+                model, self._load(key, drive), memory, jump, before, hint)
+            if result is None:
+                return None
+            before = result.displacement
+            # An old derivative still foretells most of a small change.
+            slope = None if memory is None else memory.slope
+            points[key] = self.rest_points + self._observed(before)
+            forces[key] = result.reaction_force if self.drive == "pose" else drive[:3]
+            if with_torque and self.drive == "force":
+                torques[key] = drive[3:]
+            elif with_torque:
+                # About the recorded grasp point, which the patch's centre lies beside.
+                arm = drive[:3] - self.frames.poses[self.keys[key], :3]
+                torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
+            if sensitivities:
+                slope, d_forces[key] = self._slopes(model, values, extra, result)
+                for column in range(count):
+                    d_points[key, ..., column] = self._observed(slope[..., column])
+                if with_torque and self.drive == "force":
+                    d_torques[key] = 0.0
+                elif with_torque:
+                    d_torques[key] = self._torque_slopes(model, values, extra, result, slope,
+                                                         self.frames.poses[self.keys[key], :3])
+            states.append(_Memory(result, slope))
+        self._memory, self._values, self._hints = states, values, None
+        if sensitivities and self.response is None and self.has_force_unknowns:
+            self.response = self._response(model)
+        return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques)
+
+    @property
+    def has_force_unknowns(self) -> bool:
+        """Whether a measured force, with its errors, drives."""
+        return self._course is not None and not self._course.exact
+
+    def shift_force(self, change: np.ndarray) -> None:
+        """Move the course of the force by what a fit says of it; linearise anew from there on.
+
+        Args:
+            change: Of the unknowns, in the order of the response's columns, shape [L].
+        """
+        steps = change.reshape(len(self.keys), -1)
+        self._drives = [drive + step for drive, step in zip(self._drives, steps, strict=True)]
+        self._hints = [memory.displacement + np.tensordot(step, moved, axes=1)
+                       for memory, step, moved in zip(self._memory, steps, self._compliances,
+                                                      strict=True)]
+        self._values, self.response = None, None
+
+    def under_readings(self, simulated: Simulated) -> Simulated:
+        """Foretell a pull from its force's readings alone, without what its points say of it."""
+        if not self.has_force_unknowns or self.response is None:
+            return simulated
+        change = (self._measured - np.array(self._drives)).ravel()
+        return replace(simulated, positions=simulated.positions + self.response.points @ change,
+                       forces=np.full_like(simulated.forces, np.nan))
+
+    def _response(self, model: BranchModel) -> Response:
+        self._compliances = [compliance(model, memory.displacement, loads) for memory, loads in
+                             zip(self._memory, self._loads, strict=True)]
+        components = len(self._loads[0])
+        at_keys = np.array([[self._observed(moved) for moved in each]
+                            for each in self._compliances])
+        points = np.einsum("fk,kcmi->fmikc", self.spread, at_keys)
+        wrenches = np.einsum("fk,cd->fckd", self.spread, np.eye(components))
+        count = len(self.keys) * components
+        return Response(points.reshape(*points.shape[:3], count),
+                        wrenches.reshape(len(self.spread), components, count))
+
+    def _loads_at(self, frame: int) -> np.ndarray:
+        return nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[frame],
+                           self._model.mesh.nodes, 6 if self.uses_torque else 3)
+
+    def _load(self, key: int, drive: np.ndarray) -> np.ndarray:
+        """What a key frame is solved for: a pose, or nodal forces."""
+        return drive if self.drive == "pose" else np.tensordot(drive, self._loads[key], axes=1)
+
+    def _wrench_sigma(self, components: int) -> np.ndarray:
+        sensor = self.entry.sensor
+        each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
+        return np.array(each, float) / np.sqrt(np.maximum(self.frames.wrench_counts, 1))[:, None]
+
+    def hint(self, displacements: list[np.ndarray]) -> None:
+        """Start the next simulation from these displacements [m] of the key frames."""
+        self._hints = displacements
+
+    def force_ratio(self, values: Values) -> float | None:
+        """Measured force over the one that moves a branch of these ``values`` as far.
+
+        The force is let go where the branch wants: at the recorded poses a branch of other
+        ratios of E would be stretched, and a slender branch answers that with thousandfold force.
+        """
+        frames = self.frames
+        known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
+        travel = np.linalg.norm(frames.poses[:, :3] - frames.poses[0, :3], axis=1)[known]
+        row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
+        force = frames.wrenches[row, :3]
+        size = float(np.linalg.norm(force))
+        way = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
+        if size <= 0 or way <= 0:
+            return None
+        try:
+            return float(size / force_for_travel(self.model_with(values), self.grasp,
+                                                 force / size, way))
+        except WorkError:
+            return None
+
+    def displacements(self) -> list[np.ndarray]:
+        """Nodal displacements [m] of the key frames under the last parameters."""
+        return [memory.displacement for memory in self._memory if memory is not None]
+
+    def thinning_error(self, values: Values) -> float:
+        """Largest distance [m] between spline and simulation halfway between key frames."""
+        if len(self.keys) >= len(self.frames) or len(self.keys) < 4:
+            return 0.0
+        known = self.simulate(values, (), False)
+        model, worst = self.model_with(values), 0.0
+        for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
+            middle = (first + second) // 2
+            if middle in (first, second):
+                continue
+            start = self._memory[int(np.flatnonzero(self.keys == first)[0])]
+            result = self._solve(model, self._load_between(middle), start.displacement)
+            if result is not None:
+                exact = self.rest_points + self._observed(result.displacement)
+                off = np.linalg.norm(exact - known.positions[middle], axis=1)
+                worst = max(worst, float(off.max()))
+        return worst
+
+    def _load_between(self, frame: int) -> np.ndarray:
+        if self.drive == "pose":
+            return pose_on(self.grasp, self.entry.grasp, self.frames.poses[frame])
+        return np.tensordot(self.spread[frame] @ np.array(self._drives), self._loads_at(frame),
+                            axes=1)
+
+    def _observed(self, displacement: np.ndarray) -> np.ndarray:
+        return (self._operator @ displacement.ravel()).reshape(-1, 3)
+
+    def _solve(self, model: BranchModel, drive: np.ndarray, start: np.ndarray | None,
+               ) -> StaticResult | None:
+        loads = ({"grasp": self.grasp, "pose": drive} if self.drive == "pose"
+                 else {"nodal_forces": drive})
+        result = solve_static(model, start=start, settings=SETTINGS, **loads)
+        return result if result.converged else None
+
+    def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
+                jump: np.ndarray | None, before: np.ndarray | None,
+                hint: np.ndarray | None) -> StaticResult | None:
+        starts = [] if hint is None else [hint]
+        if memory is not None:
+            start = memory.displacement
+            near = jump is not None and np.abs(jump).max() < YOUNG_STEP_LIMIT
+            if memory.slope is not None and near:
+                start = start + memory.slope[..., :len(jump)] @ jump
+            starts.append(start)
+        starts += [before] if before is not None else []
+        for start in [*starts, None]:
+            try:
+                result = self._solve(model, drive, start)
+            except NotPositiveDefiniteError:
+                continue
+            if result is not None:
+                return result
+        return None
+
+    def _slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
+                result: StaticResult) -> tuple[np.ndarray, np.ndarray]:
+        """Derivatives of displacement [n, 3, p] and reaction [3, p]."""
+        found = static_sensitivities(
+            model, result, self.grasp, self.weights, mechanics_names(extra),
+            is_held=self.drive == "pose", control_young=values.young)
+        return found.displacement, found.reaction_force
+
+    def _torque_slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
+                       result: StaticResult, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
+        """Derivative of the gripper's torque about a point that does not move, shape [3, p]."""
+        wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
+        held = self.grasp.nodes
+        arm = model.mesh.nodes[held] + result.displacement[held] - about
+        columns = []
+        for column, partial in enumerate(explicit_forces(model, wanted, result, None)):
+            out = partial + model.tangent_times(result.displacement,
+                                                np.ascontiguousarray(slope[..., column]))
+            columns.append(np.cross(arm, out[held]).sum(axis=0))
+        return np.array(columns).T
+
+    def _at_all_frames(self, *at_keys: np.ndarray | None) -> Simulated:
+        return Simulated(*(None if values is None else np.tensordot(self.spread, values, axes=1)
+                           for values in at_keys))
+
+
+def uses_torque(entry: PullEntry, frames: Frames) -> bool:
+    """Whether the gripper's torque counts: a clamped grasp, and a sensor that says how well it
+    measures torque. Driven by pose it is an observation, driven by force it acts as well.
+    """
+    return (entry.grasp.mode == "clamped" and entry.sensor.torque_sigma_nm is not None
+            and bool(np.isfinite(frames.wrenches[:, 3:]).all(axis=1).any()))
+
+
+def _require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
+    """A clamped gripper also turns the branch: its force alone is not what drives.
+
+    Raises:
+        InputError: its torque was not measured.
+    """
+    if not uses_torque(entry, frames):
+        raise InputError(
+            f"{name}: the force of a clamped gripper is to drive, but its torque is not known.",
+            "A gripper that holds the branch's rotation bends it by a torque as well; a simulation "
+            "with the force alone would be of another pull.",
+            "Use --drive pose; or record the torque, with torque_sigma_nm under [sensor] of "
+            "pull.toml; or set mode = \"pinned\" under [grasp] if the branch could turn.")
+
+
+def _equal(one: Values | None, other: Values) -> bool:
+    return one is not None and np.array_equal(one.young, other.young) and (
+        (one.poisson, one.density, one.damping)
+        == (other.poisson, other.density, other.damping))
+
+
+def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what :mod:`limber.mechanics.sensitivities` calls the parameters."""
+    names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
+             "beta": "damping_stiffness"}
+    return ("log_young", *(names[name] for name in extra))
+

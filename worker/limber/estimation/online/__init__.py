@@ -1,0 +1,1 @@
+"""Estimates while a pull is going on."""

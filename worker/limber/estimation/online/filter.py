@@ -1,0 +1,450 @@
+"""Young's modulus while a pull is going on: a recursive Gauss-Newton on the reduced model.
+
+Each frame adds its linearised residuals to what is known. A linearisation made while the moduli
+were still wrong would stay wrong for ever; so a number of frames spread over the pull are kept,
+and with every new one an old one is linearised again at the moduli of now.
+
+What the reduced model gets wrong is measured beside (limber.estimation.online.exact): the full
+model at a few of the kept frames, interpolated between them. How well a new one was foretold by
+those before widens the intervals: an error of the model is the same in all frames, and does not
+average out as noise does.
+"""
+
+import time
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import stats
+
+from limber.estimation.online.exact import Beside, ExactFrame, Here
+from limber.estimation.parameters import YOUNG_BOUNDS_PA
+from limber.mechanics.reduced.model import ReducedModel, ReducedState, ReducedStaticSettings
+from limber.recordings.grasping import pose_on
+from limber.recordings.points import point_operator
+from limber.recordings.recording import GraspEntry
+
+STEP_LIMIT = 0.7
+"""Largest change of a log E by one frame."""
+BUDGET_SECONDS = 0.033
+"""An old frame is linearised again only where that fits into the time of a frame."""
+ENOUGH_DEVIATION = 0.02
+"""Standard deviation of every log E at which another pull adds nothing that would matter: half a
+percent in a radius does as much."""
+UNCHECKED_ERROR = 0.3
+"""Error of the reduced model over the noise of a measurement, until it is measured."""
+COVERED = 0.1
+"""Part of the way that lies between frames of the full model at the end."""
+QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
+"""A pose that takes more is out of the basis' reach, and another basis is on its way."""
+FINAL_FRAMES = 300
+"""So many frames at most are linearised again when the pull is over."""
+STALE = 0.25
+"""Change of a log E after which a frame of the full model is solved again at the end."""
+IDLE_DEVIATION = 0.3
+"""Nothing is called idle before every log E is known to this: a pull begins slowly."""
+IDLE_GAIN = 0.01
+"""Part by which the last tenth of the frames narrows an interval, below which it is idle."""
+
+
+@dataclass(frozen=True)
+class OnlineFrame:
+    """What was measured at one instant.
+
+    Attributes:
+        time: [s].
+        pose: Of the grasp point [m, rad], shape [6].
+        force: Gripper on branch [N], shape [3]; NaN where not measured.
+        positions: Observed points [m], shape [m, 3]; NaN where not seen.
+    """
+
+    time: float
+    pose: np.ndarray
+    force: np.ndarray
+    positions: np.ndarray
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """The estimate after a frame.
+
+    Attributes:
+        time: [s].
+        young: [Pa], shape [K].
+        interval: 95 % [Pa], shape [K, 2].
+        residual: Root mean square of this frame's standardised residuals before the update; NaN
+            where the frame could not be used.
+        trusted: Whether the reduced model knows such states; False where the frame found none
+            (it is taken up again with another basis).
+        enough: Whether every modulus is known so well that another pull would add nothing.
+        idle: Whether going on like this would add nothing; another pull might.
+    """
+
+    time: float
+    young: np.ndarray
+    interval: np.ndarray
+    residual: float
+    trusted: bool
+    enough: bool
+    idle: bool
+
+
+@dataclass
+class _Kept:
+    frame: OnlineFrame
+    state: ReducedState | None
+    centre: np.ndarray
+    normal: np.ndarray
+    gradient: np.ndarray
+    residual: float
+
+
+@dataclass
+class _Known:
+    normal: np.ndarray
+    gradient: np.ndarray
+    widths: list[np.ndarray] = field(default_factory=list)
+
+
+@dataclass
+class _Correction:
+    """Full model less reduced model at one frame; rows of points, then of the force."""
+
+    frame: OnlineFrame
+    centre: np.ndarray
+    rows: np.ndarray
+    slopes: np.ndarray
+
+    def at(self, log_young: np.ndarray) -> np.ndarray:
+        return self.rows + self.slopes @ (log_young - self.centre)
+
+
+class OnlineEstimator:
+    """Takes frames one by one.
+
+    Args:
+        reduced: Reduced model of the branch held at the recorded grasp; the moduli that it was
+            made around are the start.
+        entry: The recorded grasp.
+        mesh: The mesh of the reduced model.
+        rest_points: Observed points at rest [m], shape [m, 3].
+        position_sigma: Noise of points [m].
+        force_sigma: Noise of the force [N].
+        prior_deviation: Standard deviation of log E at the start.
+        kept_count: Frames that are linearised again and again.
+        exact: The full model; None: the reduced model is taken at its word.
+    """
+
+    def __init__(self, reduced: ReducedModel, entry: GraspEntry, mesh: object,
+                 rest_points: np.ndarray, *, position_sigma: float, force_sigma: float,
+                 prior_deviation: float = 2.0, kept_count: int = 64,
+                 exact: Beside | Here | None = None):
+        self._entry, self._mesh = entry, mesh
+        self.rest_points = np.asarray(rest_points, float)
+        self._use(reduced)
+        self._sigmas = np.r_[np.full(self.rest_points.size, position_sigma),
+                             np.full(3, force_sigma)]
+        self.log_young = np.log(reduced.control_young)
+        count = len(self.log_young)
+        self._prior = self.log_young.copy(), np.eye(count) / prior_deviation**2
+        self._kept: list[_Kept] = []
+        self._kept_count = kept_count
+        self._merged = _Known(np.zeros((count, count)), np.zeros(count))
+        self._turn = self.frame_count = self.refresh_count = 0
+        self._last: ReducedState | None = None
+        self._exact = exact
+        self._corrections: list[_Correction] = []
+        self._asked: tuple[_Kept, Future] | None = None
+        self._making: Future | None = None
+        self._surprises: list[float] = []
+        self._lost: list[OnlineFrame] = []
+        self._past: list[OnlineFrame] = []
+        self._retry: list[OnlineFrame] = []
+        self._untrusted = self._since_basis = 0
+
+    def _use(self, reduced: ReducedModel) -> None:
+        self.reduced = reduced
+        columns = reduced.basis.columns.reshape(reduced.size, -1)
+        self._observe = np.asarray(point_operator(self._mesh, self.rest_points) @ columns.T)
+
+    @property
+    def model_error(self) -> float:
+        """Error of the model over the noise of a measurement, as the last full frames found it."""
+        if self._exact is None:
+            return 0.0
+        return float(np.sqrt(np.mean(np.square(self._surprises[-3:])))
+                     ) if self._surprises else UNCHECKED_ERROR
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of log E, shape [K, K]: of the noise, and of the model's error in all frames alike."""
+        widened = 1 + self.frame_count * self.model_error**2
+        return widened * np.linalg.inv(self._normal_gradient()[0])
+
+    @property
+    def young(self) -> np.ndarray:
+        """[Pa], shape [K]."""
+        return np.exp(self.log_young)
+
+    def update(self, frame: OnlineFrame) -> OnlineState:
+        """Take a frame in; one reduced solution, and a second where time allows."""
+        began = time.perf_counter()
+        self._collect()
+        kept = self._linearised(frame, self._last)
+        self.frame_count += 1
+        self._since_basis += 1
+        if kept is None:
+            # Out of the basis' reach: a basis made again may know it.
+            self._lost.append(frame)
+            if self._kept:
+                self._ask()
+            return self._state(frame.time, np.nan, False)
+        self._untrusted += not kept.state.trusted
+        self._last = kept.state
+        self._keep(kept)
+        self._step()
+        self._ask()
+        if self._retry and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
+            self._try_again()
+        elif len(self._kept) > 1 and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
+            self._relinearise()
+            self._step()
+        return self._state(frame.time, kept.residual, kept.state.trusted)
+
+    def settle(self) -> OnlineState | None:
+        """Wait for the full model, linearise all frames again; None before any frame."""
+        if not self._kept:
+            return None
+        if self._exact is not None:
+            self._await()
+            while self._retry:
+                self._try_again()
+            # A basis that knows these moduli and poses first, then its corrections.
+            for _ in range(2):
+                if not (self._is_away() or self._lost or self._untrusted):
+                    break
+                self._making = self._exact.basis(self._spread_poses(), self.log_young.copy())
+                self._await()
+                while self._retry:
+                    self._try_again()
+            for _ in range(3 * int(1 / COVERED)):
+                if not self._ask(whole=True):
+                    break
+                self._await()
+        self._linearise_all()
+        last = self._kept[-1]
+        return self._state(last.frame.time, last.residual, last.state.trusted)
+
+    def _try_again(self) -> None:
+        """Take up a frame that the basis before did not know."""
+        frame = self._retry.pop(0)
+        found = self._linearised(frame, None)
+        if found is None:
+            self._lost.append(frame)
+        else:
+            self._keep(found)
+            self._step()
+
+    def _linearise_all(self) -> None:
+        """Put in place of what was merged on the way the frames themselves, as seen from now."""
+        states = {id(kept.frame): kept.state for kept in self._kept}
+        frames = sorted([*(kept.frame for kept in self._kept), *self._past, *self._lost],
+                        key=lambda frame: frame.time)
+        chosen = np.unique(np.linspace(0, len(frames) - 1, FINAL_FRAMES).round().astype(int))
+        weight = len(frames) / len(chosen)
+        kept: list[_Kept] = []
+        for _ in range(6):
+            before, kept, state = self.log_young.copy(), [], None
+            for index in chosen:
+                frame = frames[index]
+                found = self._linearised(frame, states.get(id(frame)) or state)
+                if found is not None:
+                    state = states[id(frame)] = found.state
+                    kept.append(replace(found, normal=weight * found.normal,
+                                        gradient=weight * found.gradient))
+            self._kept, self._past = kept, []
+            self._merged.normal[:], self._merged.gradient[:] = 0.0, 0.0
+            self._step()
+            if np.abs(self.log_young - before).max() < 1e-3:
+                break
+
+    def _is_strange(self) -> bool:
+        """Whether the pull has left what the basis was made from, and it is worth another one."""
+        if self._since_basis < 10:
+            return False
+        return (self._is_away() or len(self._lost) > 2
+                or self._untrusted > 0.3 * self._since_basis)
+
+    def _is_away(self) -> bool:
+        away = np.abs(self.log_young - np.log(self.reduced.control_young)).max()
+        return bool(away > np.log(1.05 * self.reduced.young_spread))
+
+    def _await(self) -> None:
+        for future in (self._asked[1] if self._asked else None, self._making):
+            if future is not None:
+                future.exception()
+        self._collect()
+
+    def _collect(self) -> None:
+        """Take what the full model has found meanwhile."""
+        if self._making is not None and self._making.done():
+            making, self._making = self._making, None
+            if making.exception() is None:
+                self._use(making.result())
+                self.refresh_count += 1
+                self._corrections.clear()
+                self._last, self._untrusted, self._since_basis = None, 0, 0
+                # What is known stays known; its coordinates belong to the old basis.
+                for old in self._kept:
+                    old.state = None
+                self._retry, self._lost = self._retry + self._lost, []
+        if self._asked is None or not self._asked[1].done():
+            return
+        (kept, future), self._asked = self._asked, None
+        found = None if future.exception() is not None else future.result()
+        # Compared at the moduli that the full model was solved with.
+        reduced = None if found is None else self._answer(kept.frame, kept.state, found.log_young)
+        if reduced is None:
+            return
+        rows, slopes = _stacked(found)
+        new = _Correction(kept.frame, found.log_young, rows - reduced[1], slopes - reduced[2])
+        foretold = self._correction(kept.frame, found.log_young)[0]
+        self._surprises.append(float(np.sqrt(np.mean(((new.rows - foretold) / self._sigmas)**2))))
+        self._corrections = [old for old in self._corrections if old.frame is not kept.frame]
+        self._corrections.append(new)
+
+    def _ask(self, whole: bool = False) -> bool:
+        """Have the kept frame solved that lies farthest from those that were; whether one was."""
+        if self._exact is None or self._asked is not None or self._making is not None:
+            return False
+        if not whole and self._is_strange():
+            self._making = self._exact.basis(self._spread_poses(), self.log_young.copy())
+            return True
+        poses = np.array([kept.frame.pose[:3] for kept in self._kept])
+        far = np.full(len(poses), np.inf)
+        for known in self._corrections:
+            near = np.linalg.norm(poses - known.frame.pose[:3], axis=1)
+            if np.abs(known.centre - self.log_young).max() < STALE:
+                far = np.minimum(far, near)
+        far[[kept.state is None for kept in self._kept]] = -1.0
+        index = int(np.argmax(far))
+        if far[index] < 0:
+            return False
+        if far[index] < COVERED * np.linalg.norm(np.ptp(poses, axis=0)):
+            return False
+        chosen = self._kept[index]
+        start = self.reduced.displacement(chosen.state)
+        self._asked = chosen, self._exact.frame(chosen.frame.pose, self.log_young.copy(), start)
+        return True
+
+    def _spread_poses(self) -> np.ndarray:
+        """Poses spread over what has been seen, the lost ones among them."""
+        frames = sorted([*(kept.frame for kept in self._kept), *self._lost],
+                        key=lambda frame: frame.time)
+        chosen = np.unique(np.linspace(0, len(frames) - 1, 24).round().astype(int))
+        return np.array([frames[index].pose for index in chosen])
+
+    def _correction(self, frame: OnlineFrame,
+                    log_young: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Full less reduced model at a frame, from the two nearest at which it is known."""
+        count = len(self._sigmas)
+        if not self._corrections:
+            return np.zeros(count), np.zeros((count, len(log_young)))
+        far = np.array([np.linalg.norm(known.frame.pose[:3] - frame.pose[:3])
+                        for known in self._corrections])
+        near = np.argsort(far)[:2]
+        share = 1 / np.maximum(far[near], 1e-9)
+        share /= share.sum()
+        chosen = [self._corrections[index] for index in near]
+        return (sum(part * known.at(log_young) for part, known in zip(share, chosen, strict=True)),
+                sum(part * known.slopes for part, known in zip(share, chosen, strict=True)))
+
+    def _answer(self, frame: OnlineFrame, start: ReducedState | None, log_young: np.ndarray,
+                ) -> tuple[ReducedState, np.ndarray, np.ndarray] | None:
+        """The reduced model's state, rows of points and force, and their derivatives."""
+        model = self.reduced.with_young(np.exp(log_young))
+        state = model.solve_static(pose_on(self.reduced.grasp, self._entry, frame.pose),
+                                   start=start, settings=QUICK)
+        if not state.converged:
+            return None
+        slopes = model.sensitivities(state)
+        return (state, np.r_[self._observe @ state.coordinates, state.reaction_force],
+                np.vstack([self._observe @ slopes.coordinates, slopes.reaction_force]))
+
+    def _linearised(self, frame: OnlineFrame, start: ReducedState | None) -> _Kept | None:
+        found = self._answer(frame, start, self.log_young)
+        if found is None:
+            return None
+        state, rows, slopes = found
+        more, steeper = self._correction(frame, self.log_young)
+        measured = np.r_[(frame.positions - self.rest_points).ravel(), frame.force]
+        seen = np.isfinite(measured)
+        off = ((rows + more - measured) / self._sigmas)[seen]
+        jacobian = ((slopes + steeper) / self._sigmas[:, None])[seen]
+        # A robust share: beyond 4 deviations a residual counts less, once the fit is near.
+        typical = max(1.0, 1.4826 * float(np.median(np.abs(off))) if len(off) else 1.0)
+        weight = 1.0 / np.maximum(np.abs(off) / (4.0 * typical), 1.0)
+        scaled = jacobian.T * weight
+        return _Kept(frame, state, self.log_young.copy(), scaled @ jacobian, scaled @ off,
+                     float(np.sqrt(np.mean(off**2))) if len(off) else 0.0)
+
+    def _keep(self, new: _Kept) -> None:
+        self._kept.append(new)
+        self._kept.sort(key=lambda kept: kept.frame.time)
+        if len(self._kept) <= self._kept_count:
+            return
+        # The frame whose pose is nearest to its neighbours' says least of its own: it is merged.
+        poses = np.array([kept.frame.pose for kept in self._kept])
+        steps = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1)
+        gone = self._kept.pop(int(np.argmin(steps[:-1] + steps[1:])) + 1)
+        self._past.append(gone.frame)
+        self._merged.normal += gone.normal
+        self._merged.gradient += gone.gradient - gone.normal @ gone.centre
+
+    def _relinearise(self) -> None:
+        self._turn = (self._turn + 1) % (len(self._kept) - 1)
+        old = self._kept[self._turn]
+        again = self._linearised(old.frame, old.state)
+        if again is not None:
+            self._kept[self._turn] = again
+
+    def _normal_gradient(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of all that is known, at the moduli of now."""
+        centre, precision = self._prior
+        normal = precision + self._merged.normal
+        gradient = precision @ (self.log_young - centre)
+        gradient = gradient + self._merged.gradient + self._merged.normal @ self.log_young
+        for kept in self._kept:
+            normal = normal + kept.normal
+            gradient = gradient + kept.gradient + kept.normal @ (self.log_young - kept.centre)
+        return normal, gradient
+
+    def _step(self) -> None:
+        normal, gradient = self._normal_gradient()
+        step = -np.linalg.solve(normal, gradient)
+        step *= min(1.0, STEP_LIMIT / max(np.abs(step).max(), 1e-12))
+        self.log_young = np.clip(self.log_young + step, *np.log(YOUNG_BOUNDS_PA))
+
+    def _state(self, time: float, residual: float, trusted: bool) -> OnlineState:
+        deviation = np.sqrt(np.diag(self.covariance))
+        width = stats.norm.ppf(0.975) * deviation
+        interval = np.exp(self.log_young[:, None] + np.column_stack([-width, width]))
+        # Nobody knows before the first frames of the full model how far off the reduced one is.
+        checked = self._exact is None or len(self._surprises) >= 3
+        enough = bool(checked and deviation.max() < ENOUGH_DEVIATION)
+        return OnlineState(time, self.young, interval, residual, trusted, enough, self._idle())
+
+    def _idle(self) -> bool:
+        """By the noise alone: what the full model says now and then is no frame's doing."""
+        widths = self._merged.widths
+        widths.append(np.sqrt(np.diag(np.linalg.inv(self._normal_gradient()[0]))))
+        unknown = self._lost or self._retry or self._is_strange()
+        if len(widths) < 30 or (self._exact is not None and unknown):
+            return False
+        return bool(np.max(1 - widths[-1] / widths[-1 - len(widths) // 10]) < IDLE_GAIN
+                    and widths[-1].max() < IDLE_DEVIATION)
+
+
+def _stacked(found: ExactFrame) -> tuple[np.ndarray, np.ndarray]:
+    return (np.r_[found.moved.ravel(), found.force],
+            np.vstack([found.d_moved.reshape(-1, found.d_moved.shape[-1]), found.d_force]))

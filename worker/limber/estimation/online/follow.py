@@ -1,0 +1,254 @@
+"""``limber estimate --follow``: read a pull while it is recorded, or replay one at its own pace."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import Cancelled, InputError
+from limber.estimation.model_error import ModelError, geometry_error, total_interval
+from limber.estimation.objective import Objective
+from limber.estimation.online.exact import Beside, FullBranch, Here
+from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
+from limber.estimation.optimise import gauss_newton
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.preparation import Subject, forwards_of, pull_names, subject_of
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.start import scaled_start
+from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, build_reduced
+from limber.mechanics.reduced.training import TrainingSettings
+from limber.progress import SILENT, Progress
+from limber.recordings.alignment import frames_of
+from limber.recordings.checks import clean
+from limber.recordings.grasping import grasp_on
+from limber.recordings.recording import Observations, Pull, read_pull
+from limber.store import Branch, plain
+
+SAID = {
+    "enough": "every modulus is known to 2 %; another pull would add nothing that matters.",
+    "idle": "going on like this adds nothing: the last tenth of the frames narrowed no interval "
+    "by 1 %. A pull farther, elsewhere or another way might."}
+QUIET_SECONDS = 3.0
+"""A recording that has not grown for so long has ended."""
+BLIND_DEVIATION = 1.5
+"""Of log E where nothing is known."""
+MOVED = 0.03
+"""Travel over the branch's extent from which a recording can be fitted at all."""
+PRIOR_DEVIATION = 0.4
+"""Of log E around what the reduced model was built for: it knows no more than twice or half."""
+
+
+def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
+           progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
+           training_count: int = 60) -> dict[str, Any]:
+    """Estimate frame by frame from the first pull that is named (or the only one).
+
+    A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
+    replayed at ``pace`` times its own speed (0: as fast as it goes). The full model corrects the
+    reduced one from a second process; when the pull is over it is waited for. Writes
+    ``estimate-online.json`` with the estimate after every frame; `limber estimate` afterwards
+    gives the final word.
+
+    Raises:
+        InputError: no such pull, or one without markers.
+    """
+    branch = Branch.open(branch_folder)
+    name = _name(branch, settings)
+    subject = subject_of(branch, settings)
+    folder = branch.path(f"pulls/{name}")
+    size = _size(folder)
+    first = read_pull(folder)
+    if first.observations is None:
+        raise InputError(f"{name} has images.", "They are tracked when the pull is over.",
+                         "Follow a pull with markers, or run `limber estimate` afterwards.")
+    begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count, warn)
+    if _size(folder) != size:
+        # It is being recorded now: what has been missed is caught up with.
+        pace = np.inf
+    states: list[OnlineState] = []
+    slowest, told, stopped = 0.0, set(), False
+    with Beside(begun.branch) as beside:
+        estimator = begun.estimator(beside)
+        try:
+            for frame, share in paced(folder, pace):
+                started = time.perf_counter()
+                states.append(estimator.update(frame))
+                slowest = max(slowest, time.perf_counter() - started)
+                latest = states[-1]
+                progress(0.5 + 0.45 * share, "following", time_s=frame.time,
+                         young_mpa=" ".join(f"{young / 1e6:.4g}" for young in latest.young),
+                         enough=latest.enough)
+                for kind in ("enough", "idle"):
+                    if getattr(latest, kind) and kind not in told:
+                        warn(f"{name}: {frame.time:.2f} s: {SAID[kind]}")
+                        told.add(kind)
+            progress(0.95, "waiting for the full model")
+            settled = estimator.settle()
+            states += [settled] if settled is not None else []
+        except (Cancelled, KeyboardInterrupt):
+            if not states:
+                raise
+            stopped = True
+            warn(f"Stopped at {states[-1].time:.2f} s; what was known then is kept.")
+    if not states:
+        raise InputError(f"{name} has no frames.", "Nothing could be followed.", "Record a pull.")
+    if estimator.refresh_count:
+        warn(f"{name}: the moduli left what the reduced model knew; it was made again "
+             f"{estimator.refresh_count} times on the way.")
+    result = _result(name, states, slowest) | _with_radii(branch, subject, states[-1]) | {
+        "frame_count": estimator.frame_count, "stopped": stopped,
+        "model_error": estimator.model_error, "refresh_count": estimator.refresh_count}
+    with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
+        stage.path("estimate-online.json").write_text(
+            json.dumps(plain(result | _history(states)), indent=1), encoding="utf-8")
+        stage.result.update(result)
+    return stage.result
+
+
+def _with_radii(branch: Branch, subject: Subject, last: OnlineState) -> dict[str, Any]:
+    """The last interval together with what the scan's radii leave open, as an estimate's."""
+    if not branch.has("skeleton.csv"):
+        return {}
+    radii = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
+    return {"young_interval_sensor_pa": last.interval, "young_interval_pa": total_interval(
+        last.young, last.interval, ModelError(geometry=radii))}
+
+
+def _name(branch: Branch, settings: EstimateSettings) -> str:
+    """The pull to follow; one that a recorder writes is not in the branch's manifest."""
+    if settings.pull and (branch.folder / "pulls" / settings.pull[0] / "pull.toml").is_file():
+        return settings.pull[0]
+    return pull_names(branch, settings)[0]
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What an online estimate starts with.
+
+    Attributes:
+        reduced: The reduced model.
+        branch: What the full model is made of.
+        pull: As far as it was recorded.
+        prior_deviation: Of log E.
+    """
+
+    reduced: ReducedModel
+    branch: FullBranch
+    pull: Pull
+    prior_deviation: float
+
+    def estimator(self, exact: Beside | Here | None) -> OnlineEstimator:
+        """Return the estimator that takes the frames."""
+        sensor = self.pull.entry.sensor
+        return OnlineEstimator(
+            self.reduced, self.pull.entry.grasp, self.branch.mesh, self.branch.rest_points,
+            position_sigma=sensor.position_sigma_m, force_sigma=sensor.force_sigma_n,
+            prior_deviation=self.prior_deviation, exact=exact)
+
+
+def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Progress,
+          training_count: int, warn: Callable[[str], None] = lambda text: None) -> Begun:
+    """Make the reduced model around what is known: an earlier estimate, or a rough fit.
+
+    A basis knows moduli within its training's spread; around a uniform guess that spread would
+    have to be so wide that the basis is good nowhere. Where nothing has moved yet there is no
+    better; the basis is then made again on the way.
+    """
+    start, deviation, spread = subject.start, PRIOR_DEVIATION, 2.0
+    field = subject.mesh.cell_data["young"]
+    if settings.young is None and np.ptp(field) > 0.02 * field.mean():
+        known = np.linalg.lstsq(subject.weights, field, rcond=None)[0]
+        start = replace(start, young=np.maximum(known, 0.05 * field.min()))
+    else:
+        rough = _rough(pull, subject, settings)
+        if rough is None:
+            deviation, spread = BLIND_DEVIATION, 4.0
+            warn(f"{pull.name}: nothing has moved yet. The reduced model is made around "
+                 f"E = {start.young[0] / 1e6:.3g} MPa throughout (--young gives another).")
+        else:
+            start = rough
+    gravity = pull.entry.gravity_m_s2 or (0.0, 0.0, 0.0)
+    model = subject.model.with_parameters(young=subject.weights @ start.young, gravity=gravity)
+    training = TrainingSettings(grasp_count=training_count, young_spread=spread)
+    reduced, _ = build_reduced(model, grasp_on(subject.mesh, pull.entry.grasp), subject.weights,
+                               start.young, ReducedSettings(training=training), progress)
+    rest = subject.control_points if pull.entry.rest_points_m is None else np.array(
+        pull.entry.rest_points_m)
+    branch = FullBranch(subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson,
+                        start.density, tuple(gravity), subject.model.point_masses)
+    return Begun(reduced, branch, pull, deviation)
+
+
+def _rough(pull: Pull, subject: Subject, settings: EstimateSettings) -> Values | None:
+    """A quick fit of what there is; None where the branch has not moved yet."""
+    way = np.linalg.norm(pull.poses[:, :3] - pull.entry.grasp.point_m, axis=1)
+    if way.max(initial=0.0) < MOVED * subject.model.extent:
+        return None
+    few = settings.model_copy(update={"key_frames": 4})
+    forwards = forwards_of([clean(pull)], subject, few, lambda _message: None)
+    objective = Objective(forwards, ParameterSpace.separate(subject.start),
+                          force_sigma=[pull.entry.sensor.force_sigma_n])
+    start = scaled_start(objective, subject.start)
+    rough = gauss_newton(objective, objective.space.pack(start), evaluation_limit=8,
+                         tolerance=1e-2)
+    return objective.space.unpack(rough.evaluation.free)
+
+
+def _size(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.glob("*.csv"))
+
+
+def paced(folder: Path, pace: float) -> Iterator[tuple[OnlineFrame, float]]:
+    """Yield frames of a pull as they come, each with the share of what is there that is done."""
+    sent, start, last_growth, size = -np.inf, None, time.monotonic(), -1
+    frames: list[OnlineFrame] = []
+    while True:
+        now = _size(folder)
+        if now != size:
+            size, last_growth = now, time.monotonic()
+            try:
+                frames = list(online_frames(clean(read_pull(folder))))
+            except InputError:
+                # Caught in the middle of being written, or too little yet: the next look tells.
+                if pace == 0:
+                    raise
+        fresh = [frame for frame in frames if frame.time > sent]
+        for number, frame in enumerate(fresh):
+            if start is None:
+                start = time.monotonic(), frame.time
+            if pace > 0:
+                due = start[0] + (frame.time - start[1]) / pace
+                time.sleep(max(due - time.monotonic(), 0.0))
+            sent = frame.time
+            yield frame, (len(frames) - len(fresh) + number + 1) / len(frames)
+        if not fresh and (pace == 0 or time.monotonic() - last_growth > QUIET_SECONDS):
+            return
+        if not fresh:
+            time.sleep(0.02)
+
+
+def online_frames(pull: Pull) -> Iterator[OnlineFrame]:
+    """Return the aligned frames of what has been recorded so far."""
+    frames = frames_of(replace(pull, observations=Observations(
+        pull.observations.times, pull.observations.positions)))
+    for index in range(len(frames)):
+        yield OnlineFrame(float(frames.times[index]), frames.poses[index],
+                          frames.wrenches[index, :3], frames.positions[index])
+
+
+def _result(name: str, states: list[OnlineState], slowest: float) -> dict[str, Any]:
+    last = states[-1]
+    return {"method": "online", "pull": name, "young_pa": last.young,
+            "young_interval_pa": last.interval, "frame_count": len(states),
+            "slowest_update_s": slowest, "enough": last.enough, "idle": last.idle,
+            "untrusted_frames": sum(not state.trusted for state in states)}
+
+
+def _history(states: list[OnlineState]) -> dict[str, Any]:
+    return {"history": [{"time_s": state.time, "young_pa": state.young,
+                         "young_interval_pa": state.interval, "residual": state.residual,
+                         "enough": state.enough, "idle": state.idle} for state in states]}

@@ -1,0 +1,1 @@
+"""Point clouds: files, noise and what is no branch, made ready for a skeleton."""

@@ -1,0 +1,191 @@
+"""Readers of point clouds: PLY, PCD, XYZ/TXT/CSV, LAS/LAZ, OBJ/STL/OFF vertices, NPZ.
+
+All give coordinates as the file has them, as float64, and keep normals, colours and scalars.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError, MissingDependencyError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.text import read_table
+
+_AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("X", "Y", "Z"),
+         ("//X", "Y", "Z"))
+_NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("Nx", "Ny", "Nz"))
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("R", "G", "B"))
+
+
+def read_points(path: Path) -> Cloud:
+    """Read a cloud, in the file's own units.
+
+    Raises:
+        InputError: the file is missing, empty, cut short, of an unknown format, holds text where
+            numbers belong, or has no finite coordinates.
+        MissingDependencyError: the format needs a package that is not installed.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"There is no file {path}.", "A point cloud was expected.",
+                         "Check the path.")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder.", "A point cloud file was expected.",
+                         "Name one of its files, or give the folder to `limber reconstruct`.")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        known = " ".join(sorted(READERS))
+        raise InputError(f"{path.name} has a suffix that is not known.",
+                         f"Known are: {known}.", "Export the cloud as one of these.")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path} is empty.", "A point cloud was expected.", "Export it again.")
+    try:
+        cloud = reader(path)
+    except InputError:
+        raise
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"Reading {path.suffix} needs the package {error.name}.", "It is not installed.",
+            "Install it, or export the cloud as PLY.") from error
+    except MemoryError:
+        raise
+    except Exception as error:  # each format's package raises its own
+        raise InputError(f"{path} cannot be read ({type(error).__name__}: {error}).",
+                         "It is damaged, cut short, or not what its suffix says.",
+                         "Export it again.") from error
+    return _checked(path, cloud)
+
+
+def _checked(path: Path, cloud: Cloud) -> Cloud:
+    if len(cloud) == 0:
+        raise InputError(f"{path} has no points.", "A point cloud was expected.",
+                         "Export it again.")
+    finite = np.isfinite(cloud.points).all(axis=1)
+    if not finite.any():
+        raise InputError(f"{path}: none of {len(cloud)} points is finite.",
+                         "Coordinates must be numbers; NaN and infinity are not.",
+                         "Export it again.")
+    if finite.all():
+        return cloud
+    # Depth cameras' drivers write NaN where a pixel saw nothing.
+    return replace(cloud.subset(finite), not_finite=cloud.not_finite + int((~finite).sum()))
+
+
+def _from_columns(names: list[str], columns: dict[str, np.ndarray]) -> Cloud:
+    """Sort named columns into positions, normals, colours and scalars."""
+    axes = next((a for a in _AXES if all(name in columns for name in a)), None)
+    if axes is None:
+        raise InputError(f"There are columns {', '.join(names)}.", "x, y and z are missing.",
+                         "Name the coordinates x, y, z.")
+    used = set(axes)
+    attributes: dict[str, np.ndarray] = {}
+    for target, choices in (("normal", _NORMALS), ("color", _COLORS)):
+        found = next((c for c in choices if all(name in columns for name in c)), None)
+        if found:
+            attributes[target] = np.stack([columns[name] for name in found], axis=1)
+            used |= set(found)
+    for name in names:
+        if name not in used and columns[name].ndim == 1:
+            attributes[name] = np.ascontiguousarray(columns[name])
+    points = np.stack([np.asarray(columns[name], np.float64) for name in axes], axis=1)
+    return Cloud(points, attributes)
+
+
+def _read_ply(path: Path) -> Cloud:
+    from plyfile import PlyData
+
+    content = PlyData.read(str(path))
+    if "vertex" not in content:
+        raise InputError(f"{path} has no vertices.", "A cloud is an element `vertex`.",
+                         "Export it again.")
+    table = content["vertex"].data
+    names = list(table.dtype.names)
+    scalar = {name: np.asarray(table[name]) for name in names if table.dtype[name].kind in "iuf"}
+    return _from_columns([name for name in names if name in scalar], scalar)
+
+
+def _read_pcd(path: Path) -> Cloud:
+    from pypcd4 import PointCloud
+
+    content = PointCloud.from_path(path)
+    names = [name for name in content.fields if name != "_"]
+    columns = {name: np.asarray(content.pc_data[name]).ravel() for name in names}
+    if "rgb" in columns:
+        packed = columns.pop("rgb")
+        packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
+        columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
+        names = [name for name in names if name != "rgb"] + ["r", "g", "b"]
+    return _from_columns(names, columns)
+
+
+def _read_text(path: Path) -> Cloud:
+    """XYZ, TXT, CSV; see :mod:`limber.geometry.cloud.text`."""
+    names, table = read_table(path)
+    return _from_columns(names, {name: table[:, k] for k, name in enumerate(names)})
+
+
+def _read_las(path: Path) -> Cloud:
+    import laspy
+
+    content = laspy.read(path)
+    attributes = {}
+    names = set(content.point_format.dimension_names)
+    if {"red", "green", "blue"} <= names:
+        color = np.stack([np.asarray(content[c]) for c in ("red", "green", "blue")], axis=1)
+        # 16 bits a channel by the standard, though many programs write 8.
+        attributes["color"] = color // 257 if color.max(initial=0) > 255 else color
+    for name in sorted(names - {"X", "Y", "Z", "red", "green", "blue"}):
+        values = np.asarray(content[name])
+        if values.ndim == 1 and values.any():
+            attributes[name] = values
+    return Cloud(np.asarray(content.xyz, np.float64), attributes)
+
+
+def _read_vertices(path: Path) -> Cloud:
+    import trimesh
+
+    mesh = trimesh.load(path, process=False)
+    if isinstance(mesh, trimesh.Scene):
+        parts = [g.vertices for g in mesh.geometry.values()]
+        return Cloud(np.vstack(parts).astype(np.float64) if parts else np.empty((0, 3)))
+    points = np.asarray(mesh.vertices, np.float64)
+    # STL repeats a vertex in each of its triangles.
+    return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points)
+
+
+def _read_npz(path: Path) -> Cloud:
+    with np.load(path, allow_pickle=False) as content:
+        arrays = {name: content[name] for name in content.files}
+    return _from_arrays(path, arrays)
+
+
+def _read_npy(path: Path) -> Cloud:
+    return _from_arrays(path, {"points": np.load(path, allow_pickle=False)})
+
+
+def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> Cloud:
+    names = ("points", "xyz", "positions", "vertices", "arr_0")
+    key = next((name for name in names if name in arrays), None)
+    if key is None:
+        return _from_columns(list(arrays), arrays)
+    points = np.asarray(arrays.pop(key), np.float64)
+    if points.ndim != 2 or points.shape[1] < 3 or points.shape[0] == 3 < points.shape[1]:
+        raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
+                         "Points have shape [n, 3].", "Save them so.")
+    renamed = {"normals": "normal", "colors": "color"}
+    attributes = {renamed.get(k, k): v for k, v in arrays.items()
+                  if v.ndim in (1, 2) and len(v) == len(points) and v.dtype.kind in "iufb"}
+    return Cloud(points[:, :3], attributes)
+
+
+READERS: dict[str, Callable[[Path], Cloud]] = {
+    ".ply": _read_ply, ".pcd": _read_pcd,
+    ".xyz": _read_text, ".txt": _read_text, ".csv": _read_text, ".asc": _read_text,
+    ".pts": _read_text, ".xyzrgb": _read_text,
+    ".las": _read_las, ".laz": _read_las,
+    ".obj": _read_vertices, ".stl": _read_vertices, ".off": _read_vertices,
+    ".npz": _read_npz, ".npy": _read_npy,
+}
+"""Suffix to reader; each may raise what its package raises, :func:`read_points` explains it."""

@@ -1,0 +1,259 @@
+"""From a file's points to a cloud that can be worked on: unit, origin, crop, outliers, thinning."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial import cKDTree
+
+from limber.errors import InputError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.sheets import find_sheet
+from limber.geometry.cloud.sight import find_sight, flying_pixels
+from limber.geometry.skeleton.silhouette import View
+
+POINT_MINIMUM = 50
+_LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans as a branch
+_SMALLEST_EXTENT = 0.02
+_SHEET_LEAST = 0.08  # share of points that makes a wall or the ground
+_SHEETS_MOST = 6  # a box has no more
+_COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
+
+
+class PreparationSettings(BaseModel):
+    """How the cloud is cleaned."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    crop_low: tuple[float, float, float] | None = Field(
+        None, description="Lower corner of the part to keep, in the file's coordinates.")
+    crop_high: tuple[float, float, float] | None = Field(
+        None, description="Upper corner of the part to keep.")
+    camera_at: tuple[float, float, float] | None = Field(
+        None, description="Where the one depth camera stood, in the file's coordinates; else the "
+        "origin, if the cloud looks like an image from there.")
+    flying_angle: float = Field(
+        78.0, ge=0, lt=90, description="Depth camera: a step between neighbouring pixels is no "
+        "surface if that would be seen at more than so many degrees; 0 keeps flying pixels.")
+    flying_speck: int = Field(
+        20, ge=1, description="Depth camera: groups of fewer pixels than that are dropped as "
+        "flying.")
+    silhouette_reach: float = Field(
+        1.5, ge=0, description="Depth camera: a twig stays if, as the camera saw it, it reaches "
+        "so many radii of its carrier beyond the carrier's axis; 0 keeps all.")
+    keep_sheets: bool = Field(
+        False, description="Keep walls and ground: wide flat sheets are else cut out.")
+    outlier_ratio: float = Field(
+        5.0, ge=0, description="Drop points whose neighbours are so many times as far as is usual "
+        "around them; 0 keeps all.")
+    outlier_neighbours: int = Field(8, ge=2, le=64, description="Neighbours that are looked at.")
+    outlier_radius: float = Field(
+        0.0, ge=0, description="Drop points with fewer neighbours than that within this radius "
+        "[m]; 0: off.")
+    voxel: float = Field(
+        0.0, ge=0, description="Keep one point a cell of this size [m]; 0 keeps all.")
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A cleaned cloud in metres near the origin, and what was done.
+
+    Attributes:
+        cloud: The points that stayed, recentred.
+        origin: What was subtracted [m], in the file's axes, shape [3].
+        counts: Number of points dropped, by reason.
+        warnings: What the user should know.
+        view: Where the one depth camera stood, in the cloud's frame, if it was one.
+    """
+
+    cloud: Cloud
+    origin: np.ndarray
+    counts: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    view: View | None = None
+
+
+def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
+            eye: np.ndarray | None = None) -> Prepared:
+    """Crop, convert to metres, recentre, and drop flying pixels, duplicates and outliers.
+
+    Args:
+        cloud: As the file has it.
+        scale: Metres per unit of the file.
+        settings: How.
+        eye: Where the camera stood, if it is known, in the file's coordinates, shape [3].
+
+    Raises:
+        InputError: too few points, or all of them at one place.
+    """
+    settings = settings or PreparationSettings()
+    counts = {"read": len(cloud), "not_finite": cloud.not_finite}
+    cloud = _cropped(cloud, settings)
+    counts["cropped"] = counts["read"] - len(cloud)
+    _enough(cloud, "The cloud")
+    cloud, view = _without_flying(cloud, scale, settings, eye, counts)
+    # Subtracted in float64 before anything else: map coordinates leave no digits to a float32.
+    scaled = cloud.points * scale
+    origin = np.round(scaled.mean(axis=0), 3)
+    points = scaled - origin
+    if np.ptp(points, axis=0).max() <= 1e-9 * max(float(np.abs(scaled).max()), 1e-9):
+        raise InputError(f"All {len(points)} points are at one place.",
+                         "A branch has an extent.", "Check the export's columns and digits.")
+    _enough_digits(cloud.points)
+    spread = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[1]
+    if spread[1] < 1e-6 * spread[0]:
+        raise InputError(f"All {len(points)} points lie on one straight line.",
+                         "A branch has a thickness.", "Check the export's columns and digits.")
+    cloud = cloud.with_points(points)
+    _, first = np.unique(points, axis=0, return_index=True)
+    counts["duplicates"] = len(cloud) - len(first)
+    cloud = cloud.subset(np.sort(first))
+    keep = _without_outliers(cloud.points, settings)
+    counts["outliers"] = int((~keep).sum())
+    cloud = cloud.subset(keep)
+    if not settings.keep_sheets:
+        cloud = _without_sheets(cloud, counts)
+    if settings.voxel > 0:
+        chosen = voxel_thinned(cloud.points, settings.voxel)
+        counts["thinned"] = len(cloud) - len(chosen)
+        cloud = cloud.subset(chosen)
+    _enough(cloud, "After cropping and cleaning the cloud")
+    if view is not None:
+        view = View(view.eye - origin, view.pitch)
+    return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view)
+
+
+def voxel_thinned(points: np.ndarray, size: float) -> np.ndarray:
+    """Indices of the first point in each cell of ``size`` [m], sorted."""
+    cell = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+    extent = cell.max(axis=0) + 1
+    if float(extent[0]) * float(extent[1]) * float(extent[2]) > 2.0**62:
+        raise InputError(f"Cells of {size:g} m are too small for this cloud.",
+                         "Their number overflows.", "Choose a larger --voxel.")
+    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    return np.sort(np.unique(key, return_index=True)[1])
+
+
+def _cropped(cloud: Cloud, settings: PreparationSettings) -> Cloud:
+    keep = np.ones(len(cloud), bool)
+    if settings.crop_low is not None:
+        keep &= (cloud.points >= np.array(settings.crop_low)).all(axis=1)
+    if settings.crop_high is not None:
+        keep &= (cloud.points <= np.array(settings.crop_high)).all(axis=1)
+    if not keep.any():
+        low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
+        raise InputError("The crop box holds no points.",
+                         f"The cloud reaches from {low.tolist()} to {high.tolist()}.",
+                         "Give the box in the file's own coordinates and unit.")
+    return cloud if keep.all() else cloud.subset(keep)
+
+
+def _without_sheets(cloud: Cloud, counts: dict[str, int]) -> Cloud:
+    """Cut out walls and ground, unless little else is there: that is refused later."""
+    count = len(cloud)
+    rest = cloud
+    for _ in range(_SHEETS_MOST):
+        sheet = find_sheet(rest.points, _SHEET_LEAST * count)
+        if sheet is None:
+            break
+        rest = rest.subset(~sheet)
+    if len(rest) < max(0.1 * count, POINT_MINIMUM):
+        return cloud
+    counts["sheets"] = count - len(rest)
+    return rest
+
+
+def _enough_digits(points: np.ndarray) -> None:
+    """Refuse coordinates that lost their digits in single precision, far from the origin."""
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    step = float(np.spacing(np.float32(np.abs(points).max())))
+    if step > _COARSEST_STEP * extent and (points == points.astype(np.float32)).all():
+        raise InputError(
+            f"The coordinates, up to {np.abs(points).max():.7g}, have steps of {step:g}: the cloud "
+            f"is {extent:.3g} long.", "They were kept in single precision (7 digits), and the "
+            "shape is lost.", "Export in double precision, or with an offset subtracted.")
+
+
+def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
+                    eye: np.ndarray | None, counts: dict[str, int]) -> tuple[Cloud, View | None]:
+    """Drop flying pixels, if this is what one depth camera saw; and where that stood."""
+    eye = settings.camera_at if eye is None else eye
+    place = None if eye is None else np.array(eye) * scale
+    sight = find_sight(cloud.points * scale, place)
+    if sight is None:
+        return cloud, None
+    view = View(np.zeros(3) if place is None else place, sight.pitch)
+    if settings.flying_angle == 0:
+        return cloud, view
+    flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
+    counts["flying"] = int(flying.sum())
+    rest = cloud.subset(~flying)
+    _enough(rest, "Without its flying pixels (--flying-angle 0 keeps them) the depth camera's "
+            "cloud")
+    return rest, view
+
+
+def _enough(cloud: Cloud, what: str) -> None:
+    if len(cloud) < POINT_MINIMUM:
+        raise InputError(f"{what} has {len(cloud)} point{'s' * (len(cloud) != 1)}.",
+                         f"A skeleton needs at least {POINT_MINIMUM}.",
+                         "Scan more densely, or crop less.")
+
+
+def _without_outliers(points: np.ndarray, settings: PreparationSettings) -> np.ndarray:
+    """Mask of the points that stay; what is usual is taken nearby, since scans are uneven."""
+    keep = np.ones(len(points), bool)
+    if settings.outlier_ratio > 0:
+        count = min(settings.outlier_neighbours + 1, len(points))
+        distance, near = cKDTree(points).query(points, k=count)
+        own = distance[:, 1:].mean(axis=1)
+        # The median over the neighbours is itself wide for a lone point among lone points, so
+        # the whole cloud's counts too.
+        usual = np.maximum(np.median(own[near], axis=1), np.median(own))
+        keep &= own <= settings.outlier_ratio * np.minimum(usual, 3 * np.median(own))
+    if settings.outlier_radius > 0:
+        number = cKDTree(points).query_ball_point(
+            points, settings.outlier_radius, return_length=True)
+        keep &= number > settings.outlier_neighbours
+    return keep
+
+
+def _rounding(points: np.ndarray) -> float:
+    """Step [m] that coordinates are rounded to, if it blurs branches; else 0."""
+    steps = []
+    for axis in points.T:
+        apart = np.diff(np.unique(np.round(axis, 9)))
+        if len(apart) < 3 or np.quantile(apart, 0.1) < 0.99 * np.median(apart):
+            return 0.0
+        steps.append(float(np.median(apart)))
+    near = float(np.median(cKDTree(points).query(points[::max(len(points) // 2000, 1)], k=2)[0][
+        :, 1]))
+    return steps[0] if max(steps) < 1.01 * min(steps) and near < 1.5 * steps[0] else 0.0
+
+
+def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
+    texts = []
+    extent = float(np.ptp(points, axis=0).max())
+    if extent > _LARGEST_EXTENT:
+        unit = "millimetres (--unit mm)" if extent > 100 else "centimetres (--unit cm)"
+        texts.append(f"The cloud is {extent:.0f} m long: are its units {unit}?")
+    if extent < _SMALLEST_EXTENT:
+        texts.append(f"The cloud is {1000 * extent:.1f} mm long: are its units really these?")
+    if counts.get("not_finite"):
+        texts.append(f"Points left away since they are no numbers (NaN, infinity): "
+                     f"{counts['not_finite']}.")
+    if counts.get("sheets"):
+        texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
+                     "wall, the ground?) and were cut out (--keep-sheets).")
+    step = _rounding(points)
+    if step > 0:
+        texts.append(f"Coordinates are rounded to {1000 * step:.4g} mm: radii can be no better "
+                     "than that (export with more digits).")
+    flying = counts.get("flying", 0)
+    if flying > 0.02 * counts["read"]:
+        texts.append(f"{flying} of {counts['read']} points were dropped as a depth camera's "
+                     "flying pixels (--flying-angle, --flying-speck).")
+    lost = counts.get("outliers", 0)
+    if lost > 0.1 * len(points):
+        texts.append(f"{lost} points were dropped as outliers (--outlier-ratio).")
+    return texts

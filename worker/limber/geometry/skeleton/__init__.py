@@ -1,0 +1,1 @@
+"""Centreline trees: from a cloud by contraction, with radii, repaired and judged."""

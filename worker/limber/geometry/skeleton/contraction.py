@@ -1,0 +1,179 @@
+"""Laplacian-based contraction: the cloud is drawn together onto the axes of its branches.
+
+Cao, Tagliasacchi, Olson, Zhang, Su: Point Cloud Skeletons via Laplacian-Based Contraction (2010),
+as the paper has it: each iteration solves, in the least-squares sense,
+
+    [W_L L]        [   0   ]
+    [ W_H ]  P'  = [ W_H P ].
+
+The Laplacian is taken once, on the scan. Taken anew on the contracted points, as is usual, it
+follows every hole of the scan and costs several times the time (`scripts/bench geometry`).
+"""
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.spatial import cKDTree
+
+from limber.errors import WorkError
+from limber.geometry.skeleton.recentring import recentred
+from limber.progress import SILENT, Progress
+
+NEIGHBOURS = 12
+"""Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""
+
+_LINE_NEIGHBOURS = 20
+_GROWTH = 3.0
+_STILL_THICK = 0.6  # share of points not yet on a line, down to which the weights grow
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """What the contraction ended with.
+
+    Attributes:
+        points: Contracted points [m], recentred against the scan, shape [n, 3], in the order of
+            the input.
+        linearity: Share of the variance around each point that lies along one line, 1/3 to 1,
+            shape [n]: 1 where the cloud has become a curve.
+        iterations: Number of linear solves.
+        status: ``contracted``, ``stalled`` (points no longer moved) or ``iteration limit``.
+        history: One dict an iteration: ``moved`` [m], ``active`` (share of points not yet on a
+            curve), ``seconds``.
+        drawn: Contracted points [m] before they were recentred: less right, but they tell
+            branches apart up to the fork, where circles mix them, shape [n, 3].
+    """
+
+    points: np.ndarray
+    linearity: np.ndarray
+    iterations: int
+    status: str
+    history: list[dict[str, float]] = field(default_factory=list)
+    drawn: np.ndarray = field(default=None)
+
+
+def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: float = 0.95,
+             active_share: float = 0.03, progress: Progress = SILENT) -> Contraction:
+    """Contract points to the axes of their branches.
+
+    The contraction weight of a point grows while the points around it do not lie on a line yet,
+    and shrinks once they do, so that thin twigs are not shortened while thick ones still close.
+
+    Args:
+        points: Positions [m], shape [n, 3].
+        iteration_limit: At most so many solves.
+        linear_enough: Linearity from which a point counts as contracted.
+        active_share: Stops when so few points are left that are not contracted.
+        progress: Called each iteration.
+
+    Raises:
+        WorkError: the linear system could not be solved.
+    """
+    scale = float(np.linalg.norm(np.ptp(points, axis=0)))
+    centre = points.mean(axis=0)
+    positions = (points - centre) / scale
+    progress(0.0, "laplacian")
+    laplacian = cloud_laplacian(positions)
+    solver = _NormalEquations(laplacian)
+    weight = np.ones(len(points))
+    history: list[dict[str, float]] = []
+    status, linearity = "iteration limit", local_linearity(positions)
+    for iteration in range(iteration_limit):
+        started = time.perf_counter()
+        drawn = solver.solve(weight, positions)
+        moved = float(np.linalg.norm(drawn - positions, axis=1).mean())
+        positions = drawn
+        linearity = local_linearity(positions)
+        active = linearity < linear_enough
+        # Past that share it is forks and noise that never become lines; more weight only pulls
+        # the rest off its axis.
+        growth = _GROWTH if active.mean() > _STILL_THICK else 1.0
+        weight *= np.where(active, growth, 0.1)
+        history.append({"moved": moved * scale, "active": float(active.mean()),
+                        "seconds": time.perf_counter() - started})
+        progress((iteration + 1) / iteration_limit, "contracting", iteration=iteration + 1,
+                 active=float(active.mean()), moved_m=moved * scale)
+        if active.mean() < active_share:
+            status = "contracted"
+            break
+        if iteration > 3 and moved * scale < 0.1 * max(done["moved"] for done in history):
+            status = "stalled"
+            break
+    axes = recentred((points - centre) / scale, positions)
+    return Contraction(axes * scale + centre, linearity, len(history), status, history,
+                       drawn=positions * scale + centre)
+
+
+def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
+    """Return the cotangent Laplacian of a cloud (rows sum to 0), shape [n, n].
+
+    By ``robust_laplacian`` (Sharp and Crane 2020) where it is installed, else by the triangles
+    of each point's neighbours in its tangent plane.
+    """
+    try:
+        import robust_laplacian
+    except ImportError:
+        from limber.geometry.skeleton.tangent_laplacian import tangent_laplacian
+
+        return tangent_laplacian(points, NEIGHBOURS)
+    laplacian, _ = robust_laplacian.point_cloud_laplacian(points, n_neighbors=NEIGHBOURS)
+    return laplacian.tocsc()
+
+
+def local_linearity(points: np.ndarray) -> np.ndarray:
+    """Share of the variance of each point's neighbourhood along its main direction, shape [n]."""
+    count = min(_LINE_NEIGHBOURS, len(points))
+    _, near = cKDTree(points).query(points, k=count)
+    offset = points[near] - points[near].mean(axis=1, keepdims=True)
+    values = np.linalg.eigvalsh(offset.transpose(0, 2, 1) @ offset)
+    return values[:, 2] / np.maximum(values.sum(axis=1), 1e-300)
+
+
+class _NormalEquations:
+    """(L' W_L^2 L + I) P' = P by sparse Cholesky; the pattern is the same in each iteration."""
+
+    def __init__(self, laplacian: sparse.csc_matrix):
+        self._laplacian = laplacian
+        self._symbolic = None
+
+    def solve(self, weight: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Solve for W_L = diag(``weight``) and W_H = 1."""
+        weighted = sparse.diags(weight) @ self._laplacian
+        matrix = (weighted.T @ weighted + sparse.identity(len(points))).tocsc()
+        try:
+            import cvxopt
+            from cvxopt import cholmod
+        except ImportError:
+            return _solve_by_superlu(matrix, points)
+        lower = sparse.tril(matrix).tocoo()
+        entries = cvxopt.spmatrix(lower.data, lower.row, lower.col, matrix.shape)
+        try:
+            if self._symbolic is None:
+                self._symbolic = cholmod.symbolic(entries)
+            cholmod.numeric(entries, self._symbolic)
+        except (ArithmeticError, ValueError):
+            return _solve_by_superlu(matrix, points)
+        right = cvxopt.matrix(np.ascontiguousarray(points.T).reshape(3, -1).T)
+        cholmod.solve(self._symbolic, right)
+        return _finite(np.array(right))
+
+
+def _solve_by_superlu(matrix: sparse.csc_matrix, points: np.ndarray) -> np.ndarray:
+    from scipy.sparse.linalg import splu
+
+    try:
+        return _finite(splu(matrix, permc_spec="MMD_AT_PLUS_A",
+                            options={"SymmetricMode": True}).solve(points))
+    except RuntimeError as error:
+        raise WorkError(f"The contraction's linear system is singular ({error}).",
+                        "Many points may lie on top of each other.",
+                        "Thin the cloud (--voxel).") from error
+
+
+def _finite(points: np.ndarray) -> np.ndarray:
+    if not np.isfinite(points).all():
+        raise WorkError("The contraction gave numbers that are not finite.",
+                        "The cloud's Laplacian may be degenerate.", "Thin the cloud (--voxel).")
+    return points

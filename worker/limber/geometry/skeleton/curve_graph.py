@@ -1,0 +1,261 @@
+"""From contracted points to a tree of nodes: cover, connect, bridge gaps, root, prune."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import (
+    breadth_first_order,
+    dijkstra,
+    minimum_spanning_tree,
+)
+from scipy.spatial import cKDTree
+
+from limber.geometry.skeleton.pieces import Joined, join_pieces
+
+_Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass
+class CurveGraph:
+    """Nodes on the axes and the tree between them.
+
+    Attributes:
+        nodes: Positions [m], shape [n, 3].
+        edges: Node pairs of the forest, shape [e, 2].
+        thickness: Distance that a node's points were drawn [m]: a first radius, shape [n].
+        support: Number of points of each node, shape [n].
+        bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m].
+        split_off: Each piece that was left away: ``points``, ``distance`` [m], ``at``.
+        loops: Length of each closed loop that was opened [m].
+        plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
+            [m], ``at``.
+        owner: The node that each point belongs to, -1 where it was left away, shape [m].
+    """
+
+    nodes: np.ndarray
+    edges: np.ndarray
+    thickness: np.ndarray
+    support: np.ndarray
+    bridges: list[dict] = field(default_factory=list)
+    split_off: list[dict] = field(default_factory=list)
+    loops: list[float] = field(default_factory=list)
+    owner: np.ndarray = field(default=None)
+    plants: list[dict] = field(default_factory=list)
+
+
+def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float,
+                bridge_limit: float, up: np.ndarray = _Z, join_plants: bool = False,
+                ) -> CurveGraph:
+    """Cover contracted points by nodes and connect them to one tree.
+
+    Args:
+        points: Scanned points [m], shape [n, 3].
+        contracted: The same points after contraction [m], shape [n, 3].
+        gap_factor: The paper's gamma: a step longer than so many median steps is a gap.
+        bridge_limit: Gaps up to this length [m] are bridged; beyond, the smaller piece goes.
+        up: Which way is up, shape [3].
+        join_plants: Join even pieces that look like two plants.
+    """
+    links, spacing = neighbour_links(points)
+    drawn = np.linalg.norm(points - contracted, axis=1)
+    thickness = _smoothed(drawn, contracted)
+    owner = _cover(contracted, np.maximum(0.8 * thickness, 1.5 * spacing))
+    count = int(owner.max()) + 1
+    support = np.bincount(owner, minlength=count)
+    nodes = _means(owner, contracted)
+    radius = np.bincount(owner, thickness, count) / support
+    edges = _node_links(owner, links)
+    length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
+    graph = CurveGraph(nodes, edges, radius, support)
+    graph.edges, graph.loops = _spanning_forest(nodes, edges, length, radius)
+    typical = float(np.median(np.linalg.norm(
+        nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
+    joined = join_pieces(graph.nodes, graph.edges, radius, support, gap=gap_factor * typical,
+                         bridge_limit=bridge_limit, up=up, join_plants=join_plants)
+    kept = keep_largest(graph, joined, gap_factor * typical)
+    graph.owner = np.where(kept, np.cumsum(kept) - 1, -1)[owner]
+    return graph
+
+
+def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Pairs of near points, shape [m, 2], and the median distance to the nearest neighbour [m].
+
+    A link is at most four times as long as its ends' own neighbourhoods are wide, so that sparse
+    twigs hold together and neighbouring ones stay apart.
+    """
+    count = min(11, len(points))
+    distance, near = cKDTree(points).query(points, k=count)
+    spacing = float(np.median(distance[:, 1]))
+    own = np.median(distance[:, 1:5], axis=1)
+    limit = 4.0 * np.minimum(np.maximum(own, 0.5 * spacing)[:, None], np.maximum(
+        own[near], 0.5 * spacing))
+    near_enough = (distance <= limit)
+    near_enough[:, 0] = False
+    first, place = np.nonzero(near_enough)
+    return np.stack([first, near[first, place]], axis=1), spacing
+
+
+def prune_spurs(nodes: np.ndarray, parent: np.ndarray, thickness: np.ndarray, factor: float,
+                ) -> tuple[np.ndarray, int]:
+    """Mark the nodes to keep when twigs shorter than ``factor`` radii of their carrier go.
+
+    Args:
+        nodes: Positions [m], shape [n, 3].
+        parent: Parents, -1 for the root, shape [n].
+        thickness: Radii [m], shape [n].
+        factor: A side twig stays if it reaches so many times the radius of the node it starts
+            from beyond that node.
+
+    Returns:
+        Mask [n], and how many spurs went.
+    """
+    keep, pruned = np.ones(len(nodes), bool), 0
+    step = np.where(parent >= 0, np.linalg.norm(nodes - nodes[parent], axis=1), 0.0)
+    while True:
+        children = np.bincount(parent[keep & (parent >= 0)], minlength=len(nodes))
+        spurs = []
+        for tip in np.flatnonzero(keep & (children == 0) & (parent >= 0)):
+            chain, length, node = [], 0.0, tip
+            while parent[node] >= 0 and children[node] <= 1:
+                chain.append(node)
+                length += step[node]
+                node = parent[node]
+            if children[node] > 1 and length < factor * max(
+                    thickness[node], float(np.median(thickness[chain]))):
+                spurs.append((length, chain))
+        if not spurs:
+            return keep, pruned
+        # The shortest alone: what was a fork may then be no fork any more.
+        _, chain = min(spurs, key=lambda spur: spur[0])
+        keep[chain] = False
+        pruned += 1
+
+
+def rooted(nodes: np.ndarray, edges: np.ndarray, root: int) -> np.ndarray:
+    """Parents of the tree of ``edges`` hung up at ``root``; -1 for the root, -2 if not reached."""
+    _, before = breadth_first_order(_matrix(len(nodes), edges), root, directed=False)
+    parent = np.where(before < 0, -2, before).astype(np.int64)
+    parent[root] = -1
+    return parent
+
+
+def end_chain(edges: list[list[int]], nodes: np.ndarray, tip: int, reach: float) -> list[int]:
+    """Nodes from a tip to the first fork, or up to a length of ``reach`` [m].
+
+    Args:
+        edges: Neighbours of each node.
+        nodes: Positions [m], shape [n, 3].
+        tip: Where to start.
+        reach: How far to go.
+    """
+    chain, length, before = [tip], 0.0, -1
+    while length < reach:
+        ahead = [node for node in edges[chain[-1]] if node != before]
+        if len(ahead) != 1:
+            break
+        before = chain[-1]
+        length += float(np.linalg.norm(nodes[ahead[0]] - nodes[before]))
+        chain.append(ahead[0])
+    return chain
+
+
+def _smoothed(drawn: np.ndarray, contracted: np.ndarray) -> np.ndarray:
+    _, near = cKDTree(contracted).query(contracted, k=min(16, len(contracted)))
+    return np.median(drawn[near], axis=1)
+
+
+def _cover(contracted: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """Greedy cover by balls of radius ``reach``; returns the node that owns each point."""
+    tree = cKDTree(contracted)
+    free = np.ones(len(contracted), bool)
+    centres = []
+    # Densest contraction first would need sorting by density; a fixed stride is as good here,
+    # since points are reassigned to the nearest centre below.
+    for point in range(len(contracted)):
+        if free[point]:
+            free[tree.query_ball_point(contracted[point], reach[point])] = False
+            centres.append(point)
+    _, owner = cKDTree(contracted[centres]).query(contracted)
+    _, owner = np.unique(owner, return_inverse=True)
+    return owner
+
+
+def _means(owner: np.ndarray, points: np.ndarray) -> np.ndarray:
+    support = np.bincount(owner)
+    return np.stack([np.bincount(owner, points[:, k]) for k in range(3)], axis=1) / support[:, None]
+
+
+def _node_links(owner: np.ndarray, links: np.ndarray) -> np.ndarray:
+    pairs = np.sort(owner[links], axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0).reshape(-1, 2)
+
+
+def _spanning_forest(nodes: np.ndarray, edges: np.ndarray, length: np.ndarray,
+                     radius: np.ndarray) -> tuple[np.ndarray, list[float]]:
+    """Shortest edges first; an edge that closes a long way round is a loop of the plant."""
+    if len(edges) == 0:
+        return edges, []
+    tree = minimum_spanning_tree(_matrix(len(nodes), edges, length)).tocoo()
+    kept = np.stack([tree.row, tree.col], axis=1).astype(np.int64)
+    known = {tuple(sorted(edge)) for edge in kept.tolist()}
+    extra = np.array([e for e in edges.tolist() if tuple(e) not in known], np.int64).reshape(-1, 2)
+    if len(extra) == 0:
+        return kept, []
+    # Only edges between nodes that the tree holds far apart can close a loop.
+    graph = _matrix(len(nodes), kept, tree.data)
+    loops: list[float] = []
+    seen = np.zeros(len(nodes), bool)
+    for a, b in extra:
+        if seen[a] or seen[b]:
+            continue
+        way = dijkstra(graph, directed=False, indices=int(a), limit=1e3)[b]
+        around = 12.0 * max(radius[a], radius[b], float(np.median(length)))
+        if way > around:
+            loops.append(float(way + np.linalg.norm(nodes[a] - nodes[b])))
+            near = np.linalg.norm(nodes - nodes[a], axis=1) < around
+            seen |= near
+    return kept, loops
+
+
+def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
+    """Take the bridges of the largest piece; the others are left away.
+
+    Returns:
+        Whether each node was kept.
+    """
+    weight = np.bincount(joined.label, graph.support)
+    main = joined.label == int(np.argmax(weight))
+    graph.edges = joined.edges
+    for one, other in joined.bridges[main[joined.bridges[:, 0]]]:
+        length = float(np.linalg.norm(graph.nodes[one] - graph.nodes[other]))
+        if length > gap:
+            graph.bridges.append({"from": graph.nodes[one], "to": graph.nodes[other],
+                                  "length": length})
+    graph.plants = [{"points": int(weight[joined.label[pair]].min()),
+                     "distance": float(np.linalg.norm(np.subtract(*graph.nodes[pair]))),
+                     "at": graph.nodes[pair].mean(axis=0)} for pair in joined.plants]
+    if not main.all():
+        _leave_away(graph, main, joined.label)
+    return main
+
+
+def _leave_away(graph: CurveGraph, main: np.ndarray, label: np.ndarray) -> None:
+    tree = cKDTree(graph.nodes[main])
+    for piece in np.unique(label[~main]):
+        members = label == piece
+        distance, _ = tree.query(graph.nodes[members])
+        graph.split_off.append({"points": int(graph.support[members].sum()),
+                                "distance": float(distance.min()),
+                                "at": graph.nodes[members].mean(axis=0)})
+    new_index = np.cumsum(main) - 1
+    inside = main[graph.edges[:, 0]]
+    graph.edges = new_index[graph.edges[inside]]
+    graph.nodes, graph.thickness = graph.nodes[main], graph.thickness[main]
+    graph.support = graph.support[main]
+
+
+def _matrix(count: int, edges: np.ndarray, weight: np.ndarray | None = None) -> sparse.csr_matrix:
+    values = np.ones(len(edges)) if weight is None else np.maximum(weight, 1e-300)
+    return sparse.coo_matrix(
+        (values, (edges[:, 0], edges[:, 1])), shape=(count, count)).tocsr()

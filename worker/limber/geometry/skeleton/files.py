@@ -1,0 +1,153 @@
+"""Skeletons of other programs: SWC trees and cylinder models (QSM) as CSV."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.geometry.skeleton.skeleton import Skeleton
+
+UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
+
+
+def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
+    """Read a skeleton: ``.swc``, or a cylinder model ``.csv``; see the two readers."""
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return read_cylinders(path, scale=1.0 if scale is None else scale)
+    return read_swc(path, scale=scale)
+
+
+def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
+    """Read an SWC file; see :meth:`limber.geometry.skeleton.skeleton.Skeleton.read_swc`."""
+    rows, header_scale = [], 1.0
+    for number, line in enumerate(_lines(path), start=1):
+        if line.startswith("#"):
+            header_scale = _header_unit(line, header_scale)
+            continue
+        if not line.strip():
+            continue
+        parts = line.replace(",", " ").split()
+        try:
+            rows.append([int(float(parts[0])), *map(float, parts[2:6]), int(float(parts[6]))])
+        except (ValueError, IndexError, OverflowError) as error:
+            raise InputError(
+                f"{path}, line {number}: {line.strip()[:60]!r} is not a node.",
+                "SWC lines hold: id type x y z radius parent.", "Correct that line.") from error
+    if not rows:
+        raise InputError(f"{path} has no nodes.", "It is empty or not an SWC file.",
+                         "Choose another file.")
+    table = np.array(rows, float)
+    parent = _parents(path, table[:, 0].astype(np.int64), table[:, 5].astype(np.int64))
+    factor = header_scale if scale is None else scale
+    return Skeleton.from_edges(table[:, 1:4] * factor, parent, table[:, 4] * factor)
+
+
+def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
+    """Read a cylinder model: columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order).
+
+    A cylinder's end becomes a node that hangs on the end of its parent; the root's start becomes
+    the root node.
+
+    Args:
+        path: The CSV file.
+        scale: Metres per unit.
+
+    Raises:
+        InputError: columns are missing, a value is no number, or it is not one tree.
+    """
+    rows = list(csv.DictReader(_lines(path)))
+    names = ("id", "parent", "sx", "sy", "sz", "ex", "ey", "ez", "radius")
+    missing = [name for name in names if not rows or name not in rows[0]]
+    if missing:
+        raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
+                         f"A cylinder model has: {', '.join(names)}.",
+                         "Rename the columns of your export.")
+    try:
+        table = np.array([[float(row[name]) for name in names] for row in rows])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has a field that is not a number ({error}).",
+                         "All nine columns are numbers.", "Correct the file.") from error
+    parent = _parents(path, table[:, 0].astype(np.int64), table[:, 1].astype(np.int64))
+    roots = np.flatnonzero(parent < 0)
+    if len(roots) != 1:
+        raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
+                         "A branch has exactly one root.", "Keep one tree in the file.")
+    root = roots[0]
+    nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
+    radius = np.concatenate([table[root, 8:9], table[:, 8]]) * scale
+    hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
+    nodes, hang, radius = _without_repeats(nodes, hang, radius)
+    sigma = np.zeros(len(nodes))
+    return Skeleton.from_edges(nodes, hang, radius, radius_sigma=sigma)
+
+
+def write_cylinders(skeleton: Skeleton, path: Path) -> None:
+    """Write one cylinder for each node but the root, as CSV in metres.
+
+    Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
+    standard deviation, and its state (0 measured, 1 clamped, 2 interpolated).
+    """
+    start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
+    length = np.linalg.norm(end - start, axis=1)
+    axis = (end - start) / np.maximum(length, 1e-300)[:, None]
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        writer.writerow("id parent sx sy sz ex ey ez radius length ax ay az branch order "
+                        "radius_sigma radius_state".split())
+        for i in range(len(end)):
+            node = i + 1
+            numbers = [*start[i], *end[i], skeleton.radius[node], length[i], *axis[i]]
+            up = skeleton.parent[node] - 1
+            writer.writerow([i, up, *(f"{v:.9g}" for v in numbers), skeleton.branch[node],
+                             skeleton.order[node], f"{skeleton.radius_sigma[node]:.3g}",
+                             skeleton.radius_state[node]])
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return Path(path).read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).", "", "Check the path.",
+                         ) from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not a text file.", "A skeleton is SWC or CSV text.",
+                         "Choose another file.") from error
+
+
+def _header_unit(line: str, scale: float) -> float:
+    words = line.lstrip("# ").replace("=", ":").split(":")
+    if len(words) == 2 and words[0].strip().lower() in ("unit", "units"):
+        return UNIT_METRES.get(words[1].strip(), scale)
+    return scale
+
+
+def _parents(path: Path, ids: np.ndarray, parent_ids: np.ndarray) -> np.ndarray:
+    unique, counts = np.unique(ids, return_counts=True)
+    if (counts > 1).any():
+        raise InputError(f"{path} has id {unique[counts > 1][0]} more than once.",
+                         "Each node has an id of its own.", "Correct the file.")
+    where = {int(node): i for i, node in enumerate(ids)}
+    lost = [int(p) for p in parent_ids if p >= 0 and int(p) not in where]
+    if lost:
+        raise InputError(f"{path}: parent {lost[0]} is not in the file.",
+                         "Each node but the root hangs on another node.", "Correct the file.")
+    return np.array([where[int(p)] if p >= 0 else -1 for p in parent_ids], np.int64)
+
+
+def _without_repeats(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray,
+                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Merge a node with its parent where both are at the same place."""
+    step = np.linalg.norm(nodes - nodes[parent], axis=1)
+    repeated = (parent >= 0) & (step < 1e-9)
+    target = np.arange(len(nodes))
+    for _ in range(len(nodes)):
+        following = np.where(repeated[target], parent[target], target)
+        if (following == target).all():
+            break
+        target = following
+    keep = ~repeated
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent < 0, -1, new_index[target[parent]])
+    return nodes[keep], moved[keep], radius[keep]

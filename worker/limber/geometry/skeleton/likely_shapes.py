@@ -1,0 +1,70 @@
+"""Branches as likely as the fitted one: axes and radii drawn from what a scan leaves open.
+
+Where a scan's axis runs and how thick the branch is are known to the points' noise, averaged over
+a length of the branch. Errors of neighbouring places go together, and where only one side was
+seen, an axis too near goes with a radius too small: drawn together, all that is kept.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse.linalg import splu
+
+from limber.geometry.skeleton.axis_fit import fit_precision, on_cylinders
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.surface.sweep import tangents
+from limber.geometry.tets.tet_mesh import EDGES, TetMesh
+
+POINT_LIMIT = 60_000
+"""As many points as the fit itself looks at: more share their errors."""
+_LEAST, _MOST = 0.5, 2.0
+
+
+def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
+                     rng: np.random.Generator) -> list[Skeleton]:
+    """Draw ``count`` skeletons from the fit's covariance; nodes move across their axis only.
+
+    Args:
+        skeleton: Fitted to the points.
+        points: The scan [m], shape [m, 3], in the skeleton's frame.
+        count: How many.
+        rng: Source of what is random.
+    """
+    chosen = points[::max(1, -(-len(points) // POINT_LIMIT))]
+    # Fewer points of the same noise hold the axis less firmly than the fit's were.
+    matrix, noise = fit_precision(skeleton, chosen)
+    factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                  options={"SymmetricMode": True})
+    # Of A = L D L^T, L sqrt(D) times white noise has the covariance A; solved for, its inverse.
+    pivots = np.sqrt(np.abs(factor.U.diagonal()))
+    white = rng.standard_normal((len(pivots), count)) * pivots[:, None]
+    coloured = (factor.L @ white)[factor.perm_r]
+    moves = noise * factor.solve(coloured).T.reshape(count, -1, 4)
+    along = np.zeros_like(skeleton.nodes)
+    for members in skeleton.runs():
+        fresh = members if members[0] == 0 else members[1:]
+        along[fresh] = tangents(skeleton.nodes[members])[-len(fresh):]
+    across = moves[..., :3] - np.einsum("snj,nj->sn", moves[..., :3], along)[..., None] * along
+    radius = np.clip(skeleton.radius + moves[..., 3], _LEAST * skeleton.radius,
+                     _MOST * skeleton.radius)
+    return [replace(skeleton, nodes=skeleton.nodes + move, radius=thick)
+            for move, thick in zip(across, radius, strict=True)]
+
+
+def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
+    """Return a skeleton's mesh moved to another skeleton of the same tree.
+
+    Nodes go with the axis, and away from it as the radius grows; edges stay straight.
+    """
+    low, high, share, offset = on_cylinders(skeleton, mesh.nodes)
+    moves, growth = other.nodes - skeleton.nodes, other.radius / skeleton.radius - 1
+
+    def between(values: np.ndarray) -> np.ndarray:
+        weight = share.reshape(-1, *[1] * (values.ndim - 1))
+        return (1 - weight) * values[low] + weight * values[high]
+
+    nodes = mesh.nodes + between(moves) + between(growth)[:, None] * offset
+    if mesh.is_quadratic:
+        corners = mesh.tets[:, :4][:, EDGES]
+        nodes[mesh.tets[:, 4:]] = nodes[corners].mean(axis=2)
+    return replace(mesh, nodes=nodes)

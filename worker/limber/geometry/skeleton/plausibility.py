@@ -1,0 +1,133 @@
+"""Whether a cloud and its skeleton can be a plant: what is refused, and what is told."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.errors import InputError
+from limber.geometry.skeleton.curve_graph import CurveGraph
+from limber.geometry.skeleton.skeleton import Skeleton
+
+GIVEN = "skeleton given"
+"""Status of a contraction that was not needed."""
+
+_STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
+_NAMED = 3  # gaps and loops that are named one by one
+_FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--skeleton)."
+
+
+def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str) -> None:
+    """Refuse a ball, and two plants unless ``plants`` says which to take.
+
+    Args:
+        graph: Nodes and edges of the cloud.
+        count: Number of points that it was made of.
+        diagonal: Size of the cloud [m].
+        plants: ``refuse``, ``largest`` or ``joined``.
+
+    Raises:
+        InputError: one of these.
+    """
+    if len(graph.nodes) < 4:
+        raise InputError(f"The cloud contracts to {len(graph.nodes)} points.",
+                         "It is not branch-like: no axis was found (a ball or a blob?).", _FIX)
+    length = float(np.linalg.norm(
+        graph.nodes[graph.edges[:, 0]] - graph.nodes[graph.edges[:, 1]], axis=1).sum())
+    thick = float(np.median(graph.thickness))
+    if length < 4 * thick:
+        raise InputError(
+            f"The axes are {length:.3g} m long at {thick:.3g} m radius.",
+            "It is not branch-like: too stout for an axis (a ball or a fruit?).", _FIX)
+    if plants == "largest":
+        return
+    for plant in graph.plants:
+        raise InputError(
+            f"There are two plants, {plant['distance']:.3g} m apart at {_place(plant['at'])}: "
+            f"{100 * plant['points'] / count:.0f} % of the points stand on a base of their own.",
+            "A branch is one plant, and which of them is meant the scan does not say.",
+            f"{_FIX} Or take the larger one (--plants largest), or join them (--plants joined).")
+    for piece in graph.split_off:
+        share = piece["points"] / count
+        if share > 0.2 and piece["distance"] > 0.25 * diagonal:
+            raise InputError(
+                f"There are two far-apart clusters: {100 * share:.0f} % of the points lie "
+                f"{piece['distance']:.3g} m from the rest.", "A branch is in one piece.",
+                f"{_FIX} Or take the larger one (--plants largest).")
+
+
+def check_round(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray,
+                 residual: np.ndarray) -> None:
+    """Refuse what has an axis but no roundness at all: a ball. Leaves are told, not refused."""
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    round_share = float(np.mean(np.abs(residual) < 0.4 * skeleton.radius[segment]))
+    away = float(np.median(np.abs(residual + skeleton.radius[segment])))
+    if round_share < 0.15 and away > _STOUT * extent:
+        raise InputError(
+            f"Only {100 * round_share:.0f} % of the points lie on round axes; the others are "
+            f"{away:.3g} m away (median).", "It is not branch-like.", _FIX)
+
+
+def check_no_sheet(points: np.ndarray) -> None:
+    share = _sheet_share(points, 0.06 * float(np.linalg.norm(np.ptp(points, axis=0))))
+    if share > 0.9:
+        raise InputError(
+            f"{100 * share:.0f} % of the points lie in wide flat sheets.",
+            "It is not branch-like (a wall or the ground?).", _FIX)
+
+
+def _sheet_share(points: np.ndarray, reach: float) -> float:
+    """Share of points whose surroundings within ``reach`` [m] are wide and flat, on a sample."""
+    tree = cKDTree(points)
+    sample = points[:: max(len(points) // 300, 1)]
+    flat = []
+    for near in tree.query_ball_point(sample, reach):
+        if len(near) > 10:
+            values = np.linalg.eigvalsh(np.cov(points[near].T))
+            flat.append(values[0] < 0.01 * values[1] and values[1] > 0.3 * values[2])
+    return float(np.mean(flat)) if flat else 0.0
+
+
+def warnings(result: Any) -> list[str]:
+    texts = []
+    if result.contraction.status == GIVEN:
+        far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
+            result.node_of_point]))
+        if far > 0.5:
+            texts.append(f"{100 * far:.0f} % of the points are far from the given skeleton: is it "
+                         "in the cloud's coordinates and unit?")
+        return texts
+    longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
+    for bridge in longest[:_NAMED]:
+        texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
+                     f"{_place(bridge['to'])}.")
+    if len(longest) > _NAMED:
+        texts.append(f"{len(longest) - _NAMED} shorter gaps were bridged "
+                     f"(up to {1000 * longest[_NAMED]['length']:.0f} mm).")
+    lost = sum(piece["points"] for piece in result.split_off)
+    if lost:
+        share = 100 * lost / len(result.contraction.points)
+        largest = max(result.split_off, key=lambda piece: piece["points"])
+        texts.append(
+            f"{len(result.split_off)} pieces ({share:.1f} % of the points) were left away: too "
+            "far from the rest for their size. The largest is "
+            f"{1000 * largest['distance']:.0f} mm off, at {_place(largest['at'])}.")
+    for loop in sorted(result.loops)[::-1][:_NAMED]:
+        texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
+    if len(result.loops) > _NAMED:
+        texts.append(f"{len(result.loops) - _NAMED} shorter closed loops were opened too.")
+    if result.second_base is not None:
+        texts.append(f"The plant stands on a second base, at {_place(result.second_base)}: two "
+                     "plants that touch? Cut out one of them (--crop-low, --crop-high).")
+    # Leaves make noise look large: what lies a whole radius off is on no axis, whatever noise is.
+    radius = result.skeleton.radius[result.node_of_point]
+    misfit = float(np.mean(np.abs(result.residual) > np.clip(
+        3 * result.noise, 0.4 * radius, radius)))
+    if misfit > 0.15:
+        texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
+                     "pixels or a second plant? Radii there mean little.")
+    return texts
+
+
+def _place(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{v:.3f}" for v in point) + ")"

@@ -1,0 +1,138 @@
+"""What the image of a depth camera says of a skeleton: twigs and radii against silhouettes.
+
+Across the line of sight a depth camera is exact to a pixel; along it, readings scatter by
+millimetres or centimetres, together over whole patches. So a twig that only sticks out along the
+line of sight is taken for such scatter, and no branch is thicker than its silhouette is wide.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from limber.geometry.skeleton.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.skeleton import CLAMPED, Skeleton
+
+_ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouette tells the width
+_WINDOW = 3  # nodes to each side whose silhouette is taken together
+_SLACK = 1.2  # times as thick as its silhouette a branch may be
+_LEAST = 8  # pixels that make a silhouette
+
+
+@dataclass(frozen=True)
+class View:
+    """Where a cloud was seen from.
+
+    Attributes:
+        eye: The camera's place [m], shape [3].
+        pitch: Width of a pixel at distance 1.
+    """
+
+    eye: np.ndarray
+    pitch: float
+
+
+def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
+                         ) -> tuple[Skeleton, list[dict]]:
+    """Drop twigs that do not leave their carrier's silhouette.
+
+    Args:
+        skeleton: Fitted to the cloud.
+        view: Where it was seen from.
+        factor: A twig stays if, as the camera saw it, it or a twig on it reaches so many radii
+            of its carrier beyond the carrier's axis.
+
+    Returns:
+        The skeleton, and of each twig dropped its ``length`` [m] and its tip's place ``at``.
+    """
+    runs = skeleton.runs()
+    keep = np.ones(skeleton.node_count, bool)
+    dropped = []
+    carriers = {int(skeleton.branch[members[0]]) for members in runs[1:]}
+    for run in range(len(runs) - 1, 0, -1):
+        # A twig with twigs of its own is never dropped: too much hangs on it.
+        if run in carriers:
+            continue
+        members = runs[run]
+        carrier = runs[int(skeleton.branch[members[0]])]
+        reach, radius = _beyond(skeleton, members[1:], carrier, view)
+        if reach < factor * radius:
+            keep[members[1:]] = False
+            dropped.append({"length": _length(skeleton.nodes[members]),
+                            "at": skeleton.nodes[members[-1]]})
+    return (skeleton.subset(keep), dropped) if dropped else (skeleton, [])
+
+
+def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
+                      ) -> tuple[Skeleton, int]:
+    """Clamp radii to what the silhouettes are wide.
+
+    The pixels of a piece of branch cover its length, as the camera sees it, times its width.
+
+    Args:
+        skeleton: Fitted to the cloud.
+        points: The cloud [m], shape [n, 3], a point a pixel.
+        view: Where it was seen from.
+
+    Returns:
+        The skeleton, and how many radii were clamped.
+    """
+    segment, _ = nearest_cylinders(skeleton, points)
+    pixel = view.pitch * np.linalg.norm(points - view.eye, axis=1)
+    area = np.bincount(segment, pixel**2, skeleton.node_count)
+    count = np.bincount(segment, minlength=skeleton.node_count)
+    width = np.bincount(segment, pixel, skeleton.node_count) / np.maximum(count, 1)
+    radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
+    for run, members in enumerate(skeleton.runs()):
+        step = np.diff(skeleton.nodes[members], axis=0)
+        seen, aside = _seen_lengths(step, skeleton.nodes[members[1:]], view)
+        own = members[1:]
+        seen = np.where(count[own] > 0, seen, 0.0)
+        for place, node in enumerate(own):
+            near = slice(max(place - _WINDOW, 0), place + _WINDOW + 1)
+            total = float(seen[near].sum())
+            if count[own[near]].sum() < _LEAST or total <= 0 or aside[near].min() < _ASIDE:
+                continue
+            # Half a pixel to each side, that the edge may have lost, and as much for its place.
+            cap = _SLACK * float(area[own[near]].sum()) / (2 * total) + width[own[near]].max()
+            if radius[node] > cap:
+                radius[node], state[node] = cap, CLAMPED
+        if run == 0 and radius[0] > 1.1 * radius[members[1]]:
+            radius[0], state[0] = 1.1 * radius[members[1]], CLAMPED
+    clamped = int((radius < skeleton.radius).sum())
+    return replace(skeleton, radius=radius, radius_state=state), clamped
+
+
+def _beyond(skeleton: Skeleton, twig: np.ndarray, carrier: np.ndarray, view: View,
+            ) -> tuple[float, float]:
+    """How far a twig reaches beside its carrier's axis in the image [m], and that's radius [m]."""
+    nodes = skeleton.nodes
+    depth = float(np.linalg.norm(nodes[twig].mean(axis=0) - view.eye))
+    twig_ray, carrier_ray = _rays(nodes[twig], view), _rays(nodes[carrier], view)
+    start, end = carrier_ray[:-1], carrier_ray[1:]
+    axis = end - start
+    share = np.einsum("tkj,kj->tk", twig_ray[:, None] - start, axis) / np.maximum(
+        np.einsum("kj,kj->k", axis, axis), 1e-300)
+    foot = start + np.clip(share, 0, 1)[..., None] * axis
+    distance = np.linalg.norm(twig_ray[:, None] - foot, axis=2)
+    nearest = distance.argmin(axis=1)
+    aside = distance[np.arange(len(twig)), nearest] * depth
+    best = int(np.argmax(aside / skeleton.radius[carrier[1:]][nearest]))
+    return float(aside[best]), float(skeleton.radius[carrier[1:]][nearest[best]])
+
+
+def _rays(points: np.ndarray, view: View) -> np.ndarray:
+    offset = points - view.eye
+    return offset / np.linalg.norm(offset, axis=1)[:, None]
+
+
+def _seen_lengths(step: np.ndarray, place: np.ndarray, view: View,
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths of steps [m] as the camera sees them, and the sine of their angle to its sight."""
+    ray = _rays(place, view)
+    along = np.einsum("nj,nj->n", step, ray)
+    seen = np.linalg.norm(step - along[:, None] * ray, axis=1)
+    return seen, seen / np.maximum(np.linalg.norm(step, axis=1), 1e-300)
+
+
+def _length(nodes: np.ndarray) -> float:
+    return float(np.linalg.norm(np.diff(nodes, axis=0), axis=1).sum())

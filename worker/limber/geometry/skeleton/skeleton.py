@@ -1,0 +1,269 @@
+"""The skeleton: a rooted tree of nodes with radii along the axes of a branch and its twigs."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+
+MEASURED, CLAMPED, INTERPOLATED = 0, 1, 2
+"""Values of ``radius_state``: fitted to points, clamped to the cloud's scale, or filled in."""
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A rooted tree of nodes; a parent's index is smaller than its children's.
+
+    Attributes:
+        nodes: Positions [m], shape [n, 3]; node 0 is the root.
+        parent: Index of each node's parent, -1 for the root, shape [n].
+        radius: Radii [m], shape [n].
+        radius_sigma: Standard deviation of each radius [m], shape [n]; 0 where unknown.
+        branch: Index of the unforked run that each node belongs to, shape [n]; 0 is the main one.
+        order: Branching order, 0 for the main run, shape [n].
+        radius_state: ``MEASURED``, ``CLAMPED`` or ``INTERPOLATED``, shape [n].
+    """
+
+    nodes: np.ndarray
+    parent: np.ndarray
+    radius: np.ndarray
+    radius_sigma: np.ndarray = field(default=None)
+    branch: np.ndarray = field(default=None)
+    order: np.ndarray = field(default=None)
+    radius_state: np.ndarray = field(default=None)
+
+    def __post_init__(self) -> None:
+        count = len(self.nodes)
+        if self.radius_sigma is None:
+            object.__setattr__(self, "radius_sigma", np.zeros(count))
+        if self.radius_state is None:
+            object.__setattr__(self, "radius_state", np.zeros(count, np.int8))
+        if self.branch is None or self.order is None:
+            branch, order = _runs(self.parent, self._edge_lengths())
+            object.__setattr__(self, "branch", branch)
+            object.__setattr__(self, "order", order)
+
+    @classmethod
+    def from_edges(cls, nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray,
+                   **data: np.ndarray) -> "Skeleton":
+        """Make a skeleton of nodes in any order; they are renumbered run by run, main run first.
+
+        Args:
+            nodes: Positions [m], shape [n, 3].
+            parent: Parents, -1 for the one root, shape [n].
+            radius: Radii [m], shape [n].
+            data: Further arrays of the class, shape [n].
+
+        Raises:
+            InputError: no root, several roots, a cycle, a negative radius, or numbers that are
+                not finite.
+        """
+        nodes, parent = np.asarray(nodes, float).reshape(-1, 3), np.asarray(parent, np.int64)
+        radius = np.asarray(radius, float)
+        _check_tree(nodes, parent, radius)
+        order = _depth_first(nodes, parent)
+        new_index = np.empty(len(nodes), np.int64)
+        new_index[order] = np.arange(len(nodes))
+        moved = np.where(parent[order] < 0, -1, new_index[parent[order]])
+        return cls(nodes[order], moved, radius[order],
+                   **{name: np.asarray(values)[order] for name, values in data.items()})
+
+    @property
+    def node_count(self) -> int:
+        return len(self.nodes)
+
+    @property
+    def branch_count(self) -> int:
+        return int(self.branch.max()) + 1
+
+    @property
+    def length(self) -> float:
+        """Length of all axes together [m]."""
+        return float(self._edge_lengths().sum())
+
+    @property
+    def arc_length(self) -> np.ndarray:
+        """Distance from the root along the tree [m], shape [n]."""
+        step, total = self._edge_lengths(), np.zeros(self.node_count)
+        for node in range(1, self.node_count):
+            total[node] = total[self.parent[node]] + step[node]
+        return total
+
+    def child_counts(self) -> np.ndarray:
+        """Number of children of each node, shape [n]."""
+        return np.bincount(self.parent[self.parent >= 0], minlength=self.node_count)
+
+    def forks(self) -> np.ndarray:
+        """Indices of the nodes with two children or more."""
+        return np.flatnonzero(self.child_counts() > 1)
+
+    def tips(self) -> np.ndarray:
+        """Indices of the nodes without children."""
+        return np.flatnonzero(self.child_counts() == 0)
+
+    def main_path(self) -> np.ndarray:
+        """Indices from the root to the tip that is farthest from it along the tree."""
+        node, path = int(np.argmax(self.arc_length)), []
+        while node >= 0:
+            path.append(node)
+            node = int(self.parent[node])
+        return np.array(path[::-1])
+
+    def runs(self) -> list[np.ndarray]:
+        """Node indices of each unforked run, in branch order.
+
+        A side run starts with the node that it forks off from, which is its parent's.
+        """
+        runs = []
+        for branch in range(self.branch_count):
+            members = np.flatnonzero(self.branch == branch)
+            start = self.parent[members[0]]
+            runs.append(members if start < 0 else np.concatenate([[start], members]))
+        return runs
+
+    def point_at(self, fraction: float) -> np.ndarray:
+        """Position [m], shape [3], at a fraction of the main path's length."""
+        path = self.main_path()
+        along = self.arc_length[path]
+        wanted = float(fraction) * along[-1]
+        return np.array([np.interp(wanted, along, self.nodes[path, k]) for k in range(3)])
+
+    def radius_at(self, fraction: float) -> float:
+        """Radius [m] at a fraction of the main path's length."""
+        path = self.main_path()
+        along = self.arc_length[path]
+        return float(np.interp(float(fraction) * along[-1], along, self.radius[path]))
+
+    def moved(self, nodes: np.ndarray) -> "Skeleton":
+        """Return the skeleton with other node positions [m], shape [n, 3]."""
+        return replace(self, nodes=np.asarray(nodes, float))
+
+    def subset(self, keep: np.ndarray) -> "Skeleton":
+        """Return the skeleton of the nodes where ``keep`` [n] is true; a parent must be kept."""
+        new_index = np.cumsum(keep) - 1
+        parent = self.parent[keep]
+        parent = np.where(parent < 0, -1, new_index[parent])
+        return Skeleton.from_edges(
+            self.nodes[keep], parent, self.radius[keep],
+            radius_sigma=self.radius_sigma[keep], radius_state=self.radius_state[keep])
+
+    def write_swc(self, path: Path) -> None:
+        """Write an SWC file, in metres as its header says; type 5 is a fork, 6 a tip, 0 else."""
+        counts = self.child_counts()
+        kind = np.select([self.parent < 0, counts > 1, counts == 0], [1, 5, 6], 0)
+        lines = ["# Limber skeleton, SWC", "# unit: m", "# id type x y z radius parent"]
+        for i, (p, r) in enumerate(zip(self.nodes, self.radius, strict=True)):
+            up = self.parent[i] + 1 if self.parent[i] >= 0 else -1
+            lines.append(f"{i + 1} {kind[i]} {p[0]:.9g} {p[1]:.9g} {p[2]:.9g} {r:.6g} {up}")
+        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    @classmethod
+    def read_swc(cls, path: Path, *, scale: float | None = None) -> "Skeleton":
+        """Read an SWC file.
+
+        Args:
+            path: The file.
+            scale: Metres per unit; None takes the header's ``# unit:``, or metres.
+
+        Raises:
+            InputError: not an SWC tree; see :meth:`from_edges`.
+        """
+        from limber.geometry.skeleton.files import read_swc
+
+        return read_swc(path, scale=scale)
+
+    def _edge_lengths(self) -> np.ndarray:
+        step = np.linalg.norm(self.nodes - self.nodes[self.parent], axis=1)
+        step[self.parent < 0] = 0.0
+        return step
+
+
+def _check_tree(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray) -> None:
+    fix = "Correct the skeleton file, or reconstruct from the cloud instead."
+    if len(nodes) < 2:
+        raise InputError(f"The skeleton has {len(nodes)} nodes.", "A branch needs two.", fix)
+    if not (np.isfinite(nodes).all() and np.isfinite(radius).all()):
+        bad = np.flatnonzero(~(np.isfinite(nodes).all(axis=1) & np.isfinite(radius)))
+        raise InputError(f"Skeleton node {bad[0] + 1} has a number that is not finite.",
+                         "Positions and radii must be numbers.", fix)
+    if (radius < 0).any():
+        worst = int(np.argmin(radius))
+        raise InputError(f"Skeleton node {worst + 1} has radius {radius[worst]:g}.",
+                         "A radius cannot be negative.", fix)
+    roots = np.flatnonzero(parent < 0)
+    if len(roots) != 1:
+        names = ", ".join(str(r + 1) for r in roots[:5]) or "none"
+        raise InputError(f"The skeleton has {len(roots)} roots (nodes {names}).",
+                         "A branch has exactly one root.", fix)
+    if (parent >= len(nodes)).any():
+        bad = int(np.flatnonzero(parent >= len(nodes))[0])
+        raise InputError(f"Skeleton node {bad + 1} has a parent that is not in the file.",
+                         "Each node but the root hangs on another node.", fix)
+    depth = _depths(parent)
+    if (depth < 0).any():
+        bad = int(np.flatnonzero(depth < 0)[0])
+        raise InputError(f"Skeleton node {bad + 1} lies on or hangs on a cycle.",
+                         "A branch's skeleton is a tree.", fix)
+
+
+def _depths(parent: np.ndarray) -> np.ndarray:
+    """Number of edges to the root; -1 for nodes that never reach it."""
+    ancestor, depth = parent.copy(), np.zeros(len(parent), np.int64)
+    for _ in range(len(parent)):
+        alive = ancestor >= 0
+        if not alive.any():
+            return depth
+        depth[alive] += 1
+        ancestor[alive] = parent[ancestor[alive]]
+    depth[ancestor >= 0] = -1
+    return depth
+
+
+def _children(parent: np.ndarray) -> list[list[int]]:
+    children: list[list[int]] = [[] for _ in parent]
+    for node, up in enumerate(parent):
+        if up >= 0:
+            children[up].append(node)
+    return children
+
+
+def _reach(parent: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Distance from each node to the farthest tip below it."""
+    reach = np.zeros(len(parent))
+    for node in np.argsort(-_depths(parent), kind="stable"):
+        up = parent[node]
+        if up >= 0:
+            reach[up] = max(reach[up], reach[node] + step[node])
+    return reach
+
+
+def _depth_first(nodes: np.ndarray, parent: np.ndarray) -> np.ndarray:
+    step = np.linalg.norm(nodes - nodes[parent], axis=1)
+    reach = _reach(parent, step) + step
+    children = _children(parent)
+    stack, order = [int(np.flatnonzero(parent < 0)[0])], []
+    while stack:
+        node = stack.pop()
+        order.append(node)
+        # The child that reaches farthest comes next, so that a run's nodes are consecutive.
+        stack.extend(sorted(children[node], key=lambda child: reach[child]))
+    return np.array(order)
+
+
+def _runs(parent: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    reach = _reach(parent, step) + step
+    children = _children(parent)
+    branch, order = np.zeros(len(parent), np.int64), np.zeros(len(parent), np.int64)
+    count = 0
+    for node in range(len(parent)):
+        below = children[node]
+        if not below:
+            continue
+        main = max(below, key=lambda child: reach[child])
+        branch[main], order[main] = branch[node], order[node]
+        for child in below:
+            if child != main:
+                count += 1
+                branch[child], order[child] = count, order[node] + 1
+    return branch, order

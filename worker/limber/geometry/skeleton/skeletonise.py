@@ -1,0 +1,384 @@
+"""A scan's skeleton: thin, contract, connect, root, prune, fit."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial import cKDTree
+
+from limber.geometry.skeleton.axis_fit import (
+    AxisFit,
+    attached,
+    clamped,
+    fit_axes,
+    nearest_cylinders,
+    resampled,
+    tapered,
+)
+from limber.geometry.skeleton.contraction import Contraction, contract
+from limber.geometry.skeleton.curve_graph import (
+    CurveGraph,
+    curve_graph,
+    end_chain,
+    prune_spurs,
+    rooted,
+)
+from limber.geometry.skeleton.level_sets import POINT_LIMIT, is_sparse, level_graph
+from limber.geometry.skeleton.pieces import second_base
+from limber.geometry.skeleton.plausibility import (
+    GIVEN,
+    check_no_sheet,
+    check_one_plant,
+    check_round,
+    warnings,
+)
+from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
+from limber.progress import SILENT, Progress
+
+FIT_POINT_LIMIT = 60_000
+"""More points than that do not make the fit better, only slower."""
+
+LEAF_SHARE = 0.5
+"""Share of points over two radii off their axis from which a scan shows leaves, not branches."""
+
+
+class SkeletonSettings(BaseModel):
+    """How the skeleton is made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    contraction_points: int = Field(
+        12_000, ge=50, description="Contract at most so many points (thinned evenly).")
+    gap_factor: float = Field(
+        3.0, gt=1, description="The paper's gamma: longer than so many median steps is a gap.")
+    bridge_limit: float = Field(
+        0.15, ge=0, le=1, description="Bridge gaps up to this share of the cloud's diagonal.")
+    prune: float = Field(
+        2.5, ge=0, description="A twig stays if it reaches so many radii of its carrier beyond "
+        "the carrier's axis.")
+    plants: Literal["refuse", "largest", "joined"] = Field(
+        "refuse", description="Two plants in one cloud: refuse, take the largest, or join them.")
+    radius_low: float = Field(
+        5e-4, ge=0, description="Radii are clamped from below at this share of the diagonal.")
+    radius_high: float = Field(
+        0.1, gt=0, le=1, description="Radii are clamped from above at this share.")
+
+
+@dataclass(frozen=True)
+class SkeletonResult:
+    """A skeleton, and what was done to get it.
+
+    Attributes:
+        skeleton: Axes and radii [m] in the cloud's frame.
+        contraction: Contracted points and history.
+        node_of_point: Skeleton node of each point, shape [m].
+        residual: Distance of each point from its cylinder [m], shape [m].
+        noise: Robust standard deviation of the residuals [m].
+        bridges: Gaps closed: ``from``, ``to``, ``length`` [m].
+        split_off: Pieces left away: ``points``, ``distance`` [m], ``at``.
+        loops: Lengths [m] of closed loops that were opened.
+        pruned: Number of spurs pruned.
+        second_base: Where the plant seems to stand on the ground a second time [m], shape [3].
+    """
+
+    skeleton: Skeleton
+    contraction: Contraction
+    node_of_point: np.ndarray
+    residual: np.ndarray
+    noise: float
+    bridges: list[dict] = field(default_factory=list)
+    split_off: list[dict] = field(default_factory=list)
+    loops: list[float] = field(default_factory=list)
+    pruned: int = 0
+    second_base: np.ndarray | None = None
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the user should know, with places in the cloud's frame."""
+        return warnings(self)
+
+    def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
+        """Return the result in another frame; ``move`` takes points [n, 3] there."""
+        bridges = [bridge | {"from": move(bridge["from"][None])[0],
+                             "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
+        split_off = [piece | {"at": move(piece["at"][None])[0]} for piece in self.split_off]
+        base = None if self.second_base is None else move(self.second_base[None])[0]
+        return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
+                       bridges=bridges, split_off=split_off, second_base=base)
+
+    def report(self) -> dict[str, Any]:
+        """Numbers for the stage's result."""
+        return {"contraction_iterations": self.contraction.iterations,
+                "contraction_status": self.contraction.status, "noise_m": self.noise,
+                "bridges": self.bridges, "split_off": self.split_off,
+                "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
+
+
+def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
+                root: np.ndarray | None = None, up: np.ndarray | None = None,
+               progress: Progress = SILENT) -> SkeletonResult:
+    """Find the rooted skeleton of a cloud.
+
+    Args:
+        points: Scanned points [m], shape [n, 3].
+        settings: How.
+        root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
+        up: Which way is up, shape [3]; None: z.
+        progress: Called as it goes.
+
+    Raises:
+        InputError: the cloud is not branch-like.
+    """
+    settings = settings or SkeletonSettings()
+    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
+    thin = thinned(points, settings.contraction_points)
+    check_no_sheet(points[thin])
+    contraction = contract(points[thin], progress=progress.part(0.0, 0.6))
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    progress(0.6, "connecting")
+    # As drawn: measured on 20 branches, recentred points lose two forks of 46, since circles mix
+    # the branches there, and the fit below centres the axes anyhow.
+    graph = curve_graph(points[thin], contraction.drawn, gap_factor=settings.gap_factor,
+                        bridge_limit=settings.bridge_limit * diagonal, up=up,
+                        join_plants=settings.plants == "joined")
+    check_one_plant(graph, len(thin), diagonal, settings.plants)
+    start = _root_node(graph, points[thin], root, up, settings.prune)
+    if is_sparse(points[thin], contraction.drawn):
+        thin, loops, base = thinned(points, POINT_LIMIT), graph.loops, graph.nodes[start]
+        graph = level_graph(
+            points[thin], base, gap_factor=settings.gap_factor, up=up,
+            bridge_limit=settings.bridge_limit * diagonal, join_plants=settings.plants == "joined")
+        graph.loops = loops
+        start = _root_node(graph, points[thin], base, up, settings.prune)
+    first, pruned = _first_skeleton(graph, settings, start)
+    some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
+    if (graph.owner < 0).any():
+        # What was left away must not draw the rest towards it.
+        some = some[graph.owner[cKDTree(points[thin]).query(some)[1]] >= 0]
+    fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
+    segment, residual = nearest_cylinders(fitted.skeleton, points)
+    check_round(fitted.skeleton, points, segment, residual)
+    if float(np.mean(residual > fitted.skeleton.radius[segment])) > LEAF_SHARE:
+        base = graph.nodes[start]
+        graph = level_graph(
+            points[thin], base, gap_factor=settings.gap_factor, up=up,
+            width=float(np.median(graph.thickness)), join_plants=settings.plants == "joined",
+            bridge_limit=settings.bridge_limit * diagonal)
+        start = _root_node(graph, points[thin], base, up, settings.prune)
+        first, pruned = _first_skeleton(graph, settings, start)
+        fitted, more = _through_leaves(first, some, fitted, settings, diagonal), 0
+        segment, residual = nearest_cylinders(fitted.skeleton, points)
+    result = SkeletonResult(
+        fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
+        graph.split_off, graph.loops, pruned + more,
+        second_base(fitted.skeleton, up))
+    progress(1.0, "skeleton", nodes=fitted.skeleton.node_count)
+    return result
+
+
+def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
+    """Wrap a user's own skeleton, in the cloud's frame; nothing is changed in it."""
+    segment, residual = nearest_cylinders(skeleton, points)
+    noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+    nothing = Contraction(points[:0], np.empty(0), 0, GIVEN)
+    return SkeletonResult(skeleton, nothing, segment, residual, noise)
+
+
+def thinned(points: np.ndarray, limit: int) -> np.ndarray:
+    """Indices of at most ``limit`` points, one from each cell of a grid that fits that number."""
+    if len(points) <= limit:
+        return np.arange(len(points))
+    low = points.min(axis=0)
+    # Points lie on a surface: cells grow with the square root of how many there are too many.
+    size = float(np.median(cKDTree(points).query(
+        points[:: max(len(points) // 2000, 1)], k=2)[0][:, 1])) * np.sqrt(len(points) / limit)
+    size = max(size, 1e-6 * float(np.ptp(points, axis=0).max()), 1e-12)
+    for _ in range(40):
+        cell = np.floor((points - low) / size).astype(np.int64)
+        extent = cell.max(axis=0) + 1
+        key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+        _, first = np.unique(key, return_index=True)
+        if len(first) <= limit:
+            return np.sort(first)
+        size *= max(1.03, np.sqrt(len(first) / limit))
+    return np.sort(first)
+
+
+def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, start: int,
+                    ) -> tuple[Skeleton, int]:
+    parent = rooted(graph.nodes, graph.edges, start)
+    keep, pruned = prune_spurs(graph.nodes, parent, graph.thickness, settings.prune)
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
+    radius = np.maximum(graph.thickness[keep], 1e-3 * float(np.median(graph.thickness)) + 1e-12)
+    return Skeleton.from_edges(graph.nodes[keep], moved, radius), pruned
+
+
+def _root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
+               prune: float) -> int:
+    """The tip nearest to ``root``, or the tip of the thickest end; of several the lowest.
+
+    How thick an end is, its smallest extent tells together with how far its points were drawn: a
+    leaf is wide, but flat. An end that is shorter than it is thick is a spur, not an end.
+    """
+    degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
+    tips = np.flatnonzero(degree == 1)
+    if root is not None:
+        return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))])
+    # Spurs would end the walk from a tip early: pruned as from the lowest tip, for now.
+    parent = rooted(graph.nodes, graph.edges, int(tips[np.argmin(graph.nodes[tips] @ up)]))
+    keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
+    neighbours: list[list[int]] = [[] for _ in graph.nodes]
+    for node in np.flatnonzero(keep & (parent >= 0)):
+        neighbours[node].append(int(parent[node]))
+        neighbours[parent[node]].append(int(node))
+    tips = np.array([node for node, near in enumerate(neighbours) if len(near) == 1])
+    reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
+    thick = np.zeros(len(tips))
+    for place, tip in enumerate(tips):
+        chain = end_chain(neighbours, graph.nodes, int(tip), reach)
+        mine = points[np.isin(graph.owner, chain)]
+        length = np.linalg.norm(graph.nodes[chain[-1]] - graph.nodes[tip])
+        if len(mine) >= 4 and length > 2 * float(np.median(graph.thickness[chain])):
+            least = np.sqrt(max(np.linalg.eigvalsh(np.cov(mine.T))[0], 0.0))
+            thick[place] = np.sqrt(least * float(np.median(graph.thickness[chain])))
+    candidates = tips[thick >= 0.45 * thick.max()]
+    return int(candidates[np.argmin(graph.nodes[candidates] @ up)])
+
+
+def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
+         progress: Progress):
+    low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
+    skeleton = resampled(skeleton, 1.5)
+    fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.0, 0.5))
+    skeleton = _with_full_tips(_without_bare_ends(attached(fit.skeleton), points), points, fit)
+    # Noise makes a carrier look thicker, and its outliers look like twigs.
+    reach = skeleton.radius + 2 * fit.noise
+    keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
+    skeleton, strands = _without_strands(skeleton.subset(keep))
+    skeleton = resampled(clamped(skeleton, low, high), 1.0)
+    fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.5, 0.8))
+    skeleton, late = _without_strands(fit.skeleton)
+    fit = fit_axes(skeleton, points, rounds=6 if late else 0, progress=progress.part(0.8, 1.0))
+    pruned += strands + late
+    return replace(fit, skeleton=tapered(clamped(fit.skeleton, low, high))), pruned
+
+
+def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
+                    settings: SkeletonSettings, diagonal: float) -> AxisFit:
+    """Axes in the middle of stem and leaves, without a fit: leaves are no cylinders.
+
+    A leaf's radius is its stalk's, for want of a better one, and marked as not measured.
+    """
+    skeleton = attached(resampled(skeleton, 1.0))
+    for _ in range(3):
+        skeleton = skeleton.moved(_evened(skeleton))
+    low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
+    skeleton = _with_full_tips(tapered(clamped(skeleton, low, high)), points, fit)
+    return replace(fit, skeleton=replace(
+        skeleton, radius_sigma=0.25 * skeleton.radius,
+        radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8)))
+
+
+def _evened(skeleton: Skeleton) -> np.ndarray:
+    """Each node between others of its run moved half way to their middle [m], shape [n, 3]."""
+    nodes = skeleton.nodes.copy()
+    for members in skeleton.runs():
+        inner, old = members[1:-1], skeleton.nodes
+        nodes[inner] = 0.5 * old[inner] + 0.25 * (old[members[:-2]] + old[members[2:]])
+    return nodes
+
+
+def _without_strands(skeleton: Skeleton) -> tuple[Skeleton, int]:
+    """Drop side runs that lie mostly inside the others, thinnest twigs first.
+
+    Where a scan has holes, the contraction may leave two strands in one branch.
+    """
+    count, run = 0, skeleton.branch_count - 1
+    while run > 0:
+        if _is_strand(skeleton, run):
+            skeleton, count = skeleton.subset(skeleton.branch != run), count + 1
+            run = skeleton.branch_count
+        run -= 1
+    return skeleton, count
+
+
+def _is_strand(skeleton: Skeleton, run: int) -> bool:
+    """Whether a side run has no twigs of its own and lies mostly inside the others."""
+    own = np.flatnonzero(skeleton.branch == run)
+    carried = (skeleton.branch[skeleton.parent[1:]] == run) & (skeleton.branch[1:] != run)
+    if carried.any():
+        return False
+    # Others that could hold it: only those around.
+    middle = skeleton.nodes[own].mean(axis=0)
+    span = np.linalg.norm(skeleton.nodes[own] - middle, axis=1).max()
+    reach = 2 * span + 1.4 * float(skeleton.radius.max())
+    others = np.flatnonzero((skeleton.branch != run)
+                            & (np.linalg.norm(skeleton.nodes - middle, axis=1) < reach))
+    if len(others) == 0:
+        return False
+    gap = np.linalg.norm(skeleton.nodes[own][:, None] - skeleton.nodes[others], axis=2)
+    near = np.argmin(gap, axis=1)
+    share = gap[np.arange(len(own)), near] / skeleton.radius[others][near]
+    return float(np.median(share)) < 1.3
+
+
+def _without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Drop end nodes that no point belongs to: the contraction can overshoot an end."""
+    segment, _ = nearest_cylinders(skeleton, points)
+    count = np.bincount(segment, minlength=skeleton.node_count)
+    keep = np.ones(skeleton.node_count, bool)
+    for members in skeleton.runs():
+        if (skeleton.parent == members[-1]).any():
+            continue
+        own = list(members[1:])
+        while len(own) > 2 and count[own[-1]] == 0:
+            keep[own.pop()] = False
+    # The root end: a bare first segment belongs to its upper node.
+    children = skeleton.child_counts()
+    root, nodes, parent = 0, skeleton.nodes, skeleton.parent.copy()
+    while children[root] == 1:
+        following = int(np.flatnonzero(parent == root)[0])
+        if count[following] > 0 or children[following] != 1:
+            break
+        keep[root], parent[following], root = False, -1, following
+    new_index = np.cumsum(keep) - 1
+    moved = np.where(parent[keep] < 0, -1, new_index[parent[keep]])
+    return Skeleton.from_edges(nodes[keep], moved, skeleton.radius[keep],
+                               radius_sigma=skeleton.radius_sigma[keep],
+                               radius_state=skeleton.radius_state[keep])
+
+
+def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleton:
+    """Lengthen the ends that the contraction drew in, as far as there are points."""
+    nodes = skeleton.nodes.copy()
+    segment, _ = nearest_cylinders(skeleton, points)
+    tips = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
+    inner = int(np.flatnonzero(skeleton.parent == 0)[0])
+    for end, before, is_root in [(t, b, False) for t, b in tips] + [(0, inner, True)]:
+        start = before
+        for _ in range(2):
+            if not is_root and skeleton.parent[start] > 0:
+                start = int(skeleton.parent[start])
+        direction = nodes[end] - skeleton.nodes[start]
+        length = np.linalg.norm(direction)
+        if length == 0:
+            continue
+        direction /= length
+        radius = skeleton.radius[end]
+        mine = points[(segment == end) | (segment == (before if not is_root else inner))]
+        offset = mine - nodes[end]
+        along = offset @ direction
+        across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
+        along = np.sort(along[across < 2.0 * radius + 3 * fit.noise])
+        # An end does not reach over a gap.
+        breaks = np.flatnonzero((np.diff(along) > 2 * radius) & (along[1:] > 0))
+        along = along[:breaks[0] + 1] if len(breaks) else along
+        if len(along) < 3:
+            continue
+        reach = float(np.quantile(along, 0.98)) - (0.0 if is_root else radius)
+        nodes[end] = nodes[end] + direction * np.clip(reach, -0.8 * length, 20 * radius)
+    return skeleton.moved(nodes)
+

@@ -1,0 +1,1 @@
+"""Closed surfaces: tubes round a skeleton, joined and rounded, checked."""

@@ -1,0 +1,81 @@
+"""How far points lie from a triangle surface: exact, by a grid of cells."""
+
+import numpy as np
+from numba import njit
+from scipy.spatial import cKDTree
+
+from limber.geometry.surface.face_crossings import by_cell
+from limber.geometry.surface.surface import Surface
+
+
+def distance_to_surface(points: np.ndarray, surface: Surface) -> np.ndarray:
+    """Distances [m] of points [n, 3] from the nearest place on a surface, shape [n]."""
+    corner = surface.vertices[surface.faces]
+    low, high = corner.min(axis=1), corner.max(axis=1)
+    origin = low.min(axis=0)
+    extent = (high - low).max(axis=1)
+    cell = max(1.5 * float(np.median(extent)), float(extent.max()) / 24, 1e-12)
+    first = np.floor((low - origin) / cell).astype(np.int64)
+    last = np.floor((high - origin) / cell).astype(np.int64)
+    counts = last.max(axis=0) + 1
+    keys, owner = by_cell(first, last, counts)
+    order = np.argsort(keys, kind="stable")
+    # No farther than the nearest vertex, so that few cells need a look.
+    bound, _ = cKDTree(surface.vertices).query(points)
+    return _distances(np.ascontiguousarray(points, np.float64), bound,
+                      np.ascontiguousarray(corner), origin, cell, counts, keys[order],
+                      owner[order])
+
+
+@njit(cache=True)
+def _distances(points: np.ndarray, bound: np.ndarray, corner: np.ndarray, origin: np.ndarray,
+               cell: float, counts: np.ndarray, keys: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    found = np.empty(len(points))
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for p in range(len(points)):
+        best = bound[p] * bound[p]
+        for k in range(3):
+            low[k] = max(int(np.floor((points[p, k] - bound[p] - origin[k]) / cell)), 0)
+            high[k] = min(int(np.floor((points[p, k] + bound[p] - origin[k]) / cell)),
+                          counts[k] - 1)
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                row = (i * counts[1] + j) * counts[2]
+                at = np.searchsorted(keys, row + low[2])
+                while at < len(keys) and keys[at] <= row + high[2]:
+                    best = min(best, _square(points[p], corner[owner[at]]))
+                    at += 1
+        found[p] = np.sqrt(best)
+    return found
+
+
+@njit(cache=True)
+def _square(p: np.ndarray, corner: np.ndarray) -> float:
+    """Square of the distance of a point from a triangle (Ericson, Real-Time Collision Detection,
+    5.1.5)."""
+    a, b, c = corner[0], corner[1], corner[2]
+    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
+    d1, d2 = (ab * ap).sum(), (ac * ap).sum()
+    d3, d4 = (ab * bp).sum(), (ac * bp).sum()
+    d5, d6 = (ab * cp).sum(), (ac * cp).sum()
+    v, w = 0.0, 0.0
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    if d1 <= 0 and d2 <= 0:
+        v, w = 0.0, 0.0
+    elif d3 >= 0 and d4 <= d3:
+        v, w = 1.0, 0.0
+    elif d6 >= 0 and d5 <= d6:
+        v, w = 0.0, 1.0
+    elif vc <= 0 and d1 >= 0 and d3 <= 0:
+        v, w = (d1 / (d1 - d3) if d1 > d3 else 0.0), 0.0
+    elif vb <= 0 and d2 >= 0 and d6 <= 0:
+        v, w = 0.0, (d2 / (d2 - d6) if d2 > d6 else 0.0)
+    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:
+        total = (d4 - d3) + (d5 - d6)
+        w = (d4 - d3) / total if total > 0 else 0.0
+        v = 1.0 - w
+    else:
+        total = va + vb + vc
+        v, w = (vb / total, vc / total) if total > 0 else (0.0, 0.0)
+    rest = ap - v * ab - w * ac
+    return (rest * rest).sum()

@@ -1,0 +1,219 @@
+"""Fillets where twigs leave their parents, in place of the sharp creases of a plain union.
+
+Around each crease goes a solid whose surface is that of a rounded union of twig and parent: with
+a and b the distances from the two and rho the fillet's radius,
+
+    max(rho, min(a, b)) = sqrt(max(rho - a, 0)^2 + max(rho - b, 0)^2).
+
+It reaches about a twig's radius beyond the crease, lies a little over the cylinders near it and
+dips under them at its rim, and is joined to them as a solid: the result is closed whatever the
+angle of the fork and however many twigs meet there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.errors import MeshingError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.surface.checks import SurfaceCheck, check_surface
+from limber.geometry.surface.implicit_surface import level_surface
+from limber.geometry.surface.rounded_union import distances, fillet_level, near_box, segments
+from limber.geometry.surface.surface import Surface
+from limber.geometry.surface.sweep import polygon_factor, tangents
+from limber.geometry.surface.tubes import SPACING, largest_piece, run_axis, sides_of_runs, solid
+
+ROUNDING = 0.5
+"""Radius of a fillet, in radii of its twig or of its parent, whichever is thinner."""
+
+VOLUME_CHANGE = 0.02
+_STEP = 0.7  # of the lattice, in radii of the fillet
+_COARSENED = 0.06  # by how much a fillet's triangles may then be off, in radii of the fillet
+_REACH = 2.5  # how far from the crease a fillet's solid goes, in radii of the fillet
+_RIM = 2.2  # where it lies lowest under the cylinders
+_MARGIN = 0.02  # how far it lies over them near the crease and under them at the rim, in fillets
+_LONGEST = 8.0  # crease of a twig along its parent, in radii of both together
+_SCALES = (1.0, 0.83, 1.21)  # of the lattice's step, in turn
+
+
+def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = None,
+                 spacing: float = SPACING) -> tuple[Surface, SurfaceCheck, list[str]]:
+    """Round the creases between twigs and their parents.
+
+    Args:
+        surface: The union of the cylinders, :func:`branch_surface`: closed, oriented, not
+            crossing itself.
+        skeleton: The axes and radii it was made of.
+        sides: The sides it was made with.
+        spacing: The spacing it was made with.
+
+    Returns:
+        The surface, within 2 % of the volume; its check; and warnings about forks that had to
+        stay sharp.
+    """
+    forks = {fork.run: fork for fork in _forks(skeleton, sides, spacing)}
+    fillets = {run: fork.fillet(_SCALES[0]) for run, fork in forks.items()}
+    tolerance = 0.02 * float(skeleton.radius.min())
+    # Where a fillet crosses something, another lattice may do; then it is left out.
+    for scale in (*_SCALES[1:], None, None):
+        made = [fillet for fillet in fillets.values() if fillet is not None]
+        joined = _joined(surface, made, tolerance)
+        if joined is None or abs(joined.volume / surface.volume - 1) > VOLUME_CHANGE:
+            break
+        check = check_surface(joined)
+        if check.valid:
+            return joined, check, _warnings(len(forks) - len(made), len(forks))
+        wrong = [run for run, fillet in fillets.items()
+                 if fillet is not None and _holds(fillet, check.crossings)]
+        if not wrong:
+            break
+        for run in wrong:
+            fillets[run] = None if scale is None else forks[run].fillet(scale)
+    return surface, check_surface(surface), _warnings(len(forks), len(forks))
+
+
+def crease_angles(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+    """Angles [rad] by which faces turn towards each other at hollow edges, and their lengths.
+
+    Returns:
+        Angles, shape [k]; lengths [m], shape [k].
+    """
+    faces = surface.faces
+    edges = np.sort(np.vstack([faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    owner = np.tile(np.arange(len(faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    pair, one, other = edges[order[::2]], owner[order[::2]], owner[order[1::2]]
+    a, b, c = (surface.vertices[faces[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    ends = surface.vertices[pair]
+    corner = surface.vertices[faces[other]].sum(axis=1) - ends.sum(axis=1)
+    hollow = np.einsum("ij,ij->i", normal[one], corner - ends[:, 0]) > 0
+    cosine = np.einsum("ij,ij->i", normal[one], normal[other])
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    return np.arccos(np.clip(cosine[hollow], -1, 1)), length[hollow]
+
+
+def _warnings(plain: int, count: int) -> list[str]:
+    return [f"{plain} of {count} forks stay sharp-edged in the surface: a fillet there would cross "
+            "it or change its volume."] if plain else []
+
+
+def _holds(fillet: Surface, places: np.ndarray) -> bool:
+    """Whether any of the places [m], shape [n, 3], lies in the box around a fillet."""
+    low, high = fillet.vertices.min(axis=0), fillet.vertices.max(axis=0)
+    margin = 0.1 * (high - low)
+    return bool(((places > low - margin) & (places < high + margin)).all(axis=1).any())
+
+
+@dataclass(frozen=True)
+class _Fork:
+    """A twig, what it grows out of, and the stretch of it where the two meet."""
+
+    run: int
+    twig: np.ndarray
+    others: tuple[np.ndarray, ...]
+    excess: np.ndarray
+    base: np.ndarray
+    wide: float  # how far from the root's middle the cut may matter [m]
+    rounding: float
+    axis: np.ndarray  # the stretch's points [m] and radii [m], shape [k, 4]
+    end: float  # where along the twig the fillet fades out, if the two do not part
+
+    def fillet(self, scale: float) -> Surface | None:
+        """The solid of the rounded union around the crease; None if there is no crease."""
+        step = scale * _STEP * self.rounding
+        reach = (self.axis[:, 3] + _REACH * self.rounding + 2 * step)[:, None]
+        # An odd shift: a lattice that lies in line with the axes meets the cylinders in edges.
+        low = (self.axis[:, :3] - reach).min(axis=0) - np.array([0.31, 0.17, 0.43]) * step
+        high = (self.axis[:, :3] + reach).max(axis=0)
+        near = 2 * _REACH * self.rounding
+        twig = near_box(self.twig, low, high, near)
+        others = [near_box(other, low, high, near) for other in self.others]
+        first = np.concatenate([[0], np.cumsum([len(other) for other in others])])
+        shape = np.array([self.rounding, _REACH, _RIM, _MARGIN, self.end])
+        stacked = np.vstack(others)
+        # The cut is as wide as the root; a twig may well hang down beside it.
+        root = self.base[0]
+        beside = np.linalg.norm(np.maximum(np.maximum(low - root, root - high), 0)) > self.wide
+        base = self.base - np.outer([1e6 * self.wide, 0], self.base[1]) if beside else self.base
+
+        def level(points: np.ndarray) -> np.ndarray:
+            return fillet_level(np.ascontiguousarray(points), twig, stacked, first, self.excess,
+                                base, shape)
+
+        made = level_surface(level, low, high, step)
+        if len(made.faces) == 0:
+            return None
+        return largest_piece(solid(made.vertices, made.faces).simplify(
+            _COARSENED * self.rounding))
+
+
+def _forks(skeleton: Skeleton, sides: int | None, spacing: float) -> list[_Fork]:
+    """Twigs that come out of their parents."""
+    excess = np.array([polygon_factor(n) - 1 for n in sides_of_runs(skeleton, sides)])
+    runs = skeleton.runs()
+    axes = [run_axis(skeleton, run, spacing) for run in range(skeleton.branch_count)]
+    cones = [segments(*axis) for axis in axes]
+    points, radius = axes[0]
+    upwards = tangents(points)[0]
+    # A little over the root's flat cut, so that a fillet's end lies within the solid.
+    base = np.stack([points[0] + 0.05 * radius[0] * upwards, upwards])
+    carrier = [-1] + [int(skeleton.branch[members[0]]) for members in runs[1:]]
+    starts = np.array([axis[0][0] for axis in axes])
+    forks = []
+    for run in range(1, skeleton.branch_count):
+        parent = carrier[run]
+        reach = 4 * skeleton.radius[runs[run][0]]
+        near = [other for other in range(1, skeleton.branch_count)
+                if other != run and carrier[other] == parent
+                and np.linalg.norm(starts[other] - starts[run]) < reach]
+        others = [parent, *near, *([carrier[parent]] if carrier[parent] >= 0 else [])]
+        fork = _fork(run, axes[run], cones[run], tuple(cones[other] for other in others),
+                     excess[[run, *others]], base, 1.5 * float(radius[0]))
+        if fork is not None:
+            forks.append(fork)
+    return forks
+
+
+def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
+          others: tuple[np.ndarray, ...], excess: np.ndarray, base: np.ndarray, wide: float,
+          ) -> _Fork | None:
+    """Where a twig comes out of what it grows from; None if it stays within."""
+    along = np.append(twig[:, 8], twig[-1, 8] + twig[-1, 9])
+    count = max(int(4 * along[-1] / axis[1].mean()), 8)
+    place = np.linspace(0, along[-1], count + 1)
+    points = np.stack([np.interp(place, along, axis[0][:, k]) for k in range(3)], axis=1)
+    radius = np.interp(place, along, axis[1])
+    found = [distances(other, points) for other in others]
+    which = np.argmin([distance for distance, _ in found], axis=0)
+    outside = np.min([distance for distance, _ in found], axis=0)
+    if (outside + radius < 0).all():
+        return None
+    leaving = np.flatnonzero(outside > 0)
+    at = leaving[0] if len(leaving) else count
+    thick = float(found[which[at]][1][at])
+    rounding = ROUNDING * min(float(radius[at]), thick)
+    reach = radius + _REACH * rounding
+    begin = np.flatnonzero(outside > -reach)[0]
+    clear = np.flatnonzero(outside[begin:] > reach[begin:])
+    end = begin + clear[0] if len(clear) else count
+    longest = place[begin] + _LONGEST * (radius[at] + thick)
+    fades = place[end] > longest
+    stretch = np.column_stack([points, radius])[begin:end + 1]
+    if fades:
+        stretch = stretch[place[begin:end + 1] <= longest + 2 * radius[at]]
+    return _Fork(run, twig, others, excess, base, wide, rounding, stretch,
+                 float(longest) if fades else np.inf)
+
+
+def _joined(surface: Surface, fillets: list[Surface], tolerance: float) -> Surface | None:
+    """The union of the cylinders and the fillets; None if that is empty."""
+    import manifold3d
+
+    solids = [solid(part.vertices, part.faces) for part in (surface, *fillets)]
+    joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).simplify(tolerance)
+    try:
+        return largest_piece(joined)
+    except MeshingError:
+        return None

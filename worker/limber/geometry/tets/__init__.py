@@ -1,0 +1,1 @@
+"""Tetrahedral meshes of a branch: swept along its axes or by fTetWild."""

@@ -1,0 +1,221 @@
+"""Tetrahedra for a branch: our own sweep along its axes, or fTetWild on its surface."""
+
+import hashlib
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.errors import MeshingError, MissingDependencyError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.surface.surface import Surface
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tetwild_process import run_tetwild
+from limber.progress import SILENT, Progress
+
+_CACHE_VERSION = 1
+_LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTetWild's time
+
+
+class MeshSettings(BaseModel):
+    """How the tetrahedra are made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mesher: Literal["auto", "ftetwild", "sweep"] = Field(
+        "auto", description="auto: sweep along the axes, and fTetWild where that cannot join a "
+        "twig; ftetwild falls back to the sweep.")
+    mesh_sides: int = Field(
+        8, ge=4, le=24, description="Sides of the sections that fTetWild fills; the sweep has 6.")
+    mesh_spacing: float = Field(
+        2.5, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
+    mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's time limit [s].")
+    mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
+
+
+@dataclass(frozen=True)
+class MeshResult:
+    """Tetrahedra and how they came about.
+
+    Attributes:
+        mesh: Quadratic, positively oriented, without data on it.
+        mesher: ``ftetwild``, ``ftetwild (cached)`` or ``sweep``.
+        warnings: Why another mesher than the first took over.
+        left_out: Runs of the skeleton that are not in the mesh.
+    """
+
+    mesh: TetMesh
+    mesher: str
+    warnings: list[str] = field(default_factory=list)
+    left_out: list[int] = field(default_factory=list)
+
+
+def mesh_branch(skeleton: Skeleton, settings: MeshSettings | None = None, *,
+                progress: Progress = SILENT) -> MeshResult:
+    """Mesh the generalised cylinders of a skeleton with quadratic tetrahedra.
+
+    The sweep is tried first: on the scans we have it takes half a second where fTetWild takes 6 to
+    60, comes out the same each time, keeps the volume within a percent and has no flatter angles.
+    fTetWild takes over where the sweep cannot join a twig, and the sweep again where that fails.
+
+    Args:
+        skeleton: Axes and radii.
+        settings: Which mesher, how fine.
+        progress: Called as it goes.
+
+    Raises:
+        MeshingError: no mesher could do it.
+    """
+    settings = settings or MeshSettings()
+    swept, warnings = None, []
+    if settings.mesher != "ftetwild":
+        try:
+            swept = _swept(skeleton, settings)
+        except MeshingError as error:
+            if settings.mesher == "sweep":
+                raise
+            warnings.append(f"{error.seen} fTetWild took over.")
+        if swept is not None and (settings.mesher == "sweep"
+                                  or _share(skeleton, swept.left_out) < _LEFT_OUT_LIMIT):
+            return swept
+    try:
+        mesh, mesher, told = _wild(skeleton, settings, progress)
+        return MeshResult(mesh, mesher, warnings + told)
+    except (MeshingError, MissingDependencyError) as error:
+        if swept is None and settings.mesher == "auto":
+            raise
+        warnings.append(f"{error.seen} The sweep mesher took over.")
+    swept = swept or _swept(skeleton, settings)
+    return MeshResult(swept.mesh, "sweep", warnings + swept.warnings, swept.left_out)
+
+
+def _share(skeleton: Skeleton, runs: list[int]) -> float:
+    """Share of the skeleton's volume that the runs have."""
+    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[skeleton.parent], axis=1)
+    step[0] = 0.0
+    volume = skeleton.radius**2 * step
+    return float(volume[np.isin(skeleton.branch, runs)].sum() / volume.sum())
+
+
+def _swept(skeleton: Skeleton, settings: MeshSettings) -> MeshResult:
+    from limber.geometry.tets.tree_sweep import sweep_tree
+
+    swept = sweep_tree(skeleton, spacing=settings.mesh_spacing)
+    warnings = []
+    if swept.left_out:
+        warnings.append(f"{len(swept.left_out)} short twigs could not be joined to the mesh; "
+                        "their mass is kept.")
+    return MeshResult(swept.mesh.quadratic(), "sweep", warnings, swept.left_out)
+
+
+def _wild(skeleton: Skeleton, settings: MeshSettings, progress: Progress,
+          ) -> tuple[TetMesh, str, list[str]]:
+    from limber.geometry.surface.forks import smooth_forks
+    from limber.geometry.surface.tubes import branch_surface
+
+    shape = {"sides": settings.mesh_sides, "spacing": settings.mesh_spacing}
+    surface, _, warnings = smooth_forks(branch_surface(skeleton, **shape), skeleton, **shape)
+    radii = np.sort(skeleton.radius)
+    mesh, cached = tetrahedralise(
+        surface, edge_length=4 * float(np.median(radii)),
+        epsilon=0.25 * float(radii[len(radii) // 10]), settings=settings, progress=progress)
+    return mesh, "ftetwild (cached)" if cached else "ftetwild", warnings
+
+
+def tetrahedralise(surface: Surface, *, edge_length: float, epsilon: float,
+                   settings: MeshSettings | None = None, stop_energy: float = 30.0,
+                   coarsen: bool = False, progress: Progress = SILENT) -> tuple[TetMesh, bool]:
+    """Fill a closed surface with quadratic tetrahedra by fTetWild; the same input comes cached.
+
+    fTetWild's own tolerance is a thousandth of the bounding box, which takes 7 % of a thin
+    branch's volume; here it is absolute.
+
+    Args:
+        surface: Closed, oriented.
+        edge_length: Wanted edge length [m]; a finer surface makes finer tetrahedra.
+        epsilon: How far the result may be from the surface [m].
+        settings: Limits of time and memory.
+        stop_energy: See :func:`limber.geometry.tets.tetwild_process.run_tetwild`.
+        coarsen: Likewise.
+        progress: Called while waiting.
+
+    Returns:
+        The mesh, and whether it came from the cache.
+
+    Raises:
+        MeshingError: no mesh, or one that lost over 5 % of the volume or came in pieces.
+        MissingDependencyError: pytetwild is not installed.
+    """
+    settings = settings or MeshSettings()
+    place = _cache_place(surface, edge_length, epsilon, stop_energy, coarsen)
+    cached = _from_cache(place)
+    if cached is None:
+        nodes, tets = run_tetwild(
+            surface.vertices, surface.faces, edge_length=edge_length, epsilon=epsilon,
+            stop_energy=stop_energy, coarsen=coarsen, time_limit=settings.mesh_time_limit,
+            memory_limit_mb=settings.mesh_memory_limit_mb, progress=progress)
+        _to_cache(place, nodes, tets)
+    else:
+        nodes, tets = cached
+    return _checked(nodes, tets, surface), cached is not None
+
+
+def _checked(nodes: np.ndarray, tets: np.ndarray, surface: Surface) -> TetMesh:
+    if len(tets) == 0:
+        raise MeshingError("fTetWild returned no tetrahedra.", "The surface may be open.",
+                           "Check the surface.")
+    mesh = _largest_piece(TetMesh(nodes, tets.astype(np.int64)).oriented())
+    ratio = float(mesh.volumes.sum()) / surface.volume
+    if not 0.95 < ratio < 1.05:
+        raise MeshingError(f"fTetWild's mesh has {100 * ratio:.1f} % of the surface's volume.",
+                           "Bending stiffness goes with the square of that.",
+                           "Use a smaller tolerance, or choose --mesher sweep.")
+    if mesh.volumes.min() <= 1e-7 * np.median(mesh.volumes):
+        raise MeshingError("fTetWild's mesh has flat tetrahedra.",
+                           "A solver cannot work on them.", "Choose --mesher sweep.")
+    return mesh.quadratic()
+
+
+def _largest_piece(mesh: TetMesh) -> TetMesh:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    tets = mesh.tets[:, :4]
+    rows, columns = tets[:, [0, 1, 2]].ravel(), tets[:, [1, 2, 3]].ravel()
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), (mesh.node_count,) * 2)
+    _, label = connected_components(graph, directed=False)
+    size = np.bincount(label[tets[:, 0]])
+    keep = label[tets[:, 0]] == int(np.argmax(size))
+    used, inverse = np.unique(tets[keep], return_inverse=True)
+    return TetMesh(mesh.nodes[used], inverse.reshape(-1, 4))
+
+
+def _cache_place(surface: Surface, *numbers: float) -> Path:
+    import platformdirs
+
+    digest = hashlib.sha256()
+    for array in (surface.vertices, surface.faces.astype(np.int64),
+                  np.array([_CACHE_VERSION, *map(float, numbers)])):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return Path(platformdirs.user_cache_dir("limber"), "tetrahedra", f"{digest.hexdigest()}.npz")
+
+
+def _from_cache(place: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    try:
+        with np.load(place) as stored:
+            return stored["nodes"], stored["tets"]
+    except (OSError, ValueError, KeyError):
+        return None  # not there, or cut short: it is made anew
+
+
+def _to_cache(place: Path, nodes: np.ndarray, tets: np.ndarray) -> None:
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        part = place.with_name(f".{os.getpid()}-{place.name}")
+        np.savez(part, nodes=nodes, tets=tets)
+        os.replace(part, place)
+    except OSError:
+        return  # a cache that cannot be written costs time, not results

@@ -1,0 +1,129 @@
+"""fTetWild in a process of its own: it is slow, and a crash or a leak must not be ours.
+
+``python -m limber.geometry.tets.tetwild_process IN.npz OUT.npz`` is what :func:`run_tetwild`
+starts.
+"""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+import time
+import types
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import MeshingError, MissingDependencyError
+from limber.progress import SILENT, Progress
+
+
+def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, epsilon: float,
+                stop_energy: float, coarsen: bool, time_limit: float, memory_limit_mb: float,
+                progress: Progress = SILENT) -> tuple[np.ndarray, np.ndarray]:
+    """Fill a closed surface with tetrahedra by fTetWild (Hu et al. 2020).
+
+    Args:
+        vertices: Positions [m], shape [n, 3].
+        faces: Triangles, shape [m, 3].
+        edge_length: Wanted edge length [m]; where the surface is finer, so are the tetrahedra.
+        epsilon: How far the result may be from the surface [m].
+        stop_energy: Quality at which it stops improving (fTetWild's AMIPS energy; 3 is best).
+        coarsen: Merge elements as far as quality allows, which takes longer.
+        time_limit: Seconds after which it is stopped.
+        memory_limit_mb: Memory after which it is stopped.
+        progress: Called while waiting; cancelling stops the process.
+
+    Returns:
+        Nodes [m], shape [k, 3], and tetrahedra, shape [t, 4], oriented as they come.
+
+    Raises:
+        MissingDependencyError: pytetwild is not installed.
+        MeshingError: it failed, or took too long or too much memory.
+    """
+    if importlib.util.find_spec("pytetwild") is None:
+        raise MissingDependencyError("pytetwild (fTetWild) is not installed.", "",
+                                     "Install it, or choose --mesher sweep.")
+    with tempfile.TemporaryDirectory(prefix="limber-tetwild-") as folder:
+        source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
+        np.savez(source, vertices=vertices, faces=faces, edge_length=edge_length,
+                 epsilon=epsilon, stop_energy=stop_energy, coarsen=coarsen)
+        command = [sys.executable, "-m", "limber.geometry.tets.tetwild_process", str(source),
+                   str(target)]
+        # fTetWild uses TBB and OpenMP: one thread each, since a second one gains nothing.
+        environment = os.environ | {"OMP_NUM_THREADS": "1",
+                                    "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        # It also writes a file of its own (__tracked_surface.stl) where it runs.
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                                   stderr=subprocess.PIPE, env=environment, cwd=folder)
+        try:
+            _watch(process, time_limit, memory_limit_mb, progress)
+            message = process.stderr.read().decode(errors="replace").strip()
+        finally:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+            process.stderr.close()
+        if process.returncode != 0 or not target.exists():
+            last = message.splitlines()[-1] if message else "no message"
+            raise MeshingError(f"fTetWild ended with code {process.returncode} ({last}).",
+                               "The surface may be too fine or broken.",
+                               "Choose --mesher sweep, or a coarser mesh.")
+        with np.load(target) as result:
+            return result["nodes"], result["tets"]
+
+
+def _watch(process: subprocess.Popen, time_limit: float, memory_limit_mb: float,
+           progress: Progress) -> None:
+    import psutil
+
+    started = time.perf_counter()
+    while True:
+        try:
+            process.wait(timeout=0.1)
+            return
+        except subprocess.TimeoutExpired:
+            pass
+        seconds = time.perf_counter() - started
+        progress(min(seconds / time_limit, 0.99), "fTetWild", seconds=round(seconds, 1))
+        if seconds > time_limit:
+            raise MeshingError(f"fTetWild was stopped after {seconds:.0f} s.",
+                               "It had not finished within its time limit.",
+                               "Raise --mesh-time-limit, or choose a coarser mesh.")
+        try:
+            used = psutil.Process(process.pid).memory_info().rss / 1e6
+        except psutil.NoSuchProcess:
+            continue
+        if used > memory_limit_mb:
+            raise MeshingError(f"fTetWild was stopped at {used:.0f} MB.",
+                               "It went over its memory limit.",
+                               "Raise --mesh-memory-limit-mb, or choose a coarser mesh.")
+
+
+def _load_tetrahedralize():
+    """Import pytetwild's numpy interface without pyvista, which only its package file needs."""
+    places = importlib.util.find_spec("pytetwild").submodule_search_locations
+    package = types.ModuleType("pytetwild")
+    package.__path__ = list(places)
+    sys.modules["pytetwild"] = package
+    from pytetwild.pytetwild import tetrahedralize
+
+    return tetrahedralize
+
+
+def _main(source: str, target: str) -> None:
+    with np.load(source) as given:
+        # The wrapper refuses integers for floats and arrays that are not its own.
+        nodes, tets = _load_tetrahedralize()(
+            np.array(given["vertices"], np.float64, order="C"),
+            np.array(given["faces"], np.int32, order="C"),
+            edge_length_abs=float(given["edge_length"]), epsilon=float(given["epsilon"]) / float(
+                np.linalg.norm(np.ptp(given["vertices"], axis=0))),
+            stop_energy=float(given["stop_energy"]), coarsen=bool(given["coarsen"]),
+            num_threads=1, quiet=True)
+    np.savez(target, nodes=nodes, tets=tets)
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], sys.argv[2])

@@ -1,0 +1,1 @@
+"""Motion in time: implicit Newmark, what drives it, derivatives along it."""

@@ -1,0 +1,149 @@
+"""What moves a branch: grasps along poses or with forces, loads, gravity; at any time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.mechanics.dynamics.motion import MotionState
+from limber.mechanics.dynamics.pose_path import PosePath
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.linear.equations import Equations
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics.problem import checked_forces
+from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.statics.solve import solve_static
+
+
+class Drive:
+    """Loads and constraints of a motion; arguments as for simulate_dynamics.
+
+    Attributes:
+        times: Of the frames [s].
+        grasps: All of them; single: whether one was given by itself.
+        path: The grasps' motion; None where they do not follow poses.
+        equations: With the grasps held that follow poses.
+
+    Raises:
+        InputError: arguments that do not fit each other.
+    """
+
+    def __init__(self, model: BranchModel, grasp: Grasp | Sequence[Grasp] | None,
+                 poses: np.ndarray | None, grasp_forces: np.ndarray | None,
+                 nodal_forces: np.ndarray | None, times: np.ndarray):
+        self.model, self.times = model, _checked_times(times)
+        self.single = isinstance(grasp, Grasp)
+        self.grasps = [] if grasp is None else [grasp] if self.single else list(grasp)
+        self.path = None
+        if poses is not None:
+            if not self.grasps or grasp_forces is not None:
+                raise InputError("Poses without a grasp, or together with grasp forces.",
+                                 "A grasp follows poses or exerts a force, not both.",
+                                 "Leave one out.")
+            self.path = PosePath(self.grasps, model.mesh.nodes, self.times, poses)
+        self._weight = model.weight_force
+        self._nodal_forces = self._checked_nodal_forces(nodal_forces)
+        self._grasp_forces = self._checked_grasp_forces(grasp_forces)
+        self.equations: Equations = model.equations(self.grasps if self.path else ())
+        self._known: tuple[float, tuple] | None = None
+
+    def load_at(self, instant: float) -> np.ndarray:
+        """Return nodal loads [N] at a time."""
+        load = self._weight.copy()
+        if self._nodal_forces is not None:
+            load += self._between(self._nodal_forces, instant)
+        if self._grasp_forces is None:
+            return load
+        for number, grasp in enumerate(self.grasps):
+            force = self._between(self._grasp_forces[:, number], instant)
+            load[grasp.nodes] += grasp.weights[:, None] * force
+        return load
+
+    def equilibrium(self) -> StaticResult:
+        """Return the equilibrium under pose and loads of the first time.
+
+        Raises:
+            ConvergenceError: there is none.
+        """
+        pose = self.path.poses[0] if self.path else None
+        force = None if self._grasp_forces is None else self._grasp_forces[0]
+        loads = None if self._nodal_forces is None else self._nodal_forces[0]
+        return solve_static(self.model, grasp=self.grasps or None, pose=pose, grasp_force=force,
+                            nodal_forces=loads).require()
+
+    def moves(self, state: MotionState) -> tuple[np.ndarray | None, np.ndarray]:
+        """Return how held nodes and pinned means have to move to where the path is.
+
+        Returns:
+            [m], shape [node_count, 3], or None if they do not, and shape [pinned, 3].
+        """
+        if not self.path:
+            return None, np.zeros((0, 3))
+        held, means = self._at(state.time)
+        moved = np.zeros_like(state.displacement)
+        for grasp, patch in zip(self.path.clamped, held[0], strict=True):
+            moved[grasp.nodes] = patch - state.displacement[grasp.nodes]
+        now = np.array([g.weights @ state.displacement[g.nodes] for g in self.path.pinned])
+        return (moved if moved.any() else None), means[0] - now.reshape(-1, 3)
+
+    def hold(self, state: MotionState) -> None:
+        """Give held nodes the path's velocity and acceleration."""
+        if self.path:
+            held, _ = self._at(state.time)
+            for values, motion in zip((state.velocity, state.acceleration), held[1:],
+                                      strict=True):
+                for grasp, patch in zip(self.path.clamped, motion, strict=True):
+                    values[grasp.nodes] = patch
+
+    def impose(self, state: MotionState) -> None:
+        """Give held nodes, and the means of pinned patches, all of the path's motion."""
+        held, pins = self._at(state.time)
+        fields = (state.displacement, state.velocity, state.acceleration)
+        for field_, values, means in zip(fields, held, pins, strict=True):
+            for grasp, patch in zip(self.path.clamped, values, strict=True):
+                field_[grasp.nodes] = patch
+            for grasp, mean in zip(self.path.pinned, means, strict=True):
+                field_[grasp.nodes] += mean - grasp.weights @ field_[grasp.nodes]
+
+    def _at(self, instant: float) -> tuple:
+        if self._known is None or self._known[0] != instant:
+            self._known = (instant, self.path.at(instant))
+        return self._known[1]
+
+    def _between(self, values: np.ndarray, instant: float) -> np.ndarray:
+        """Return values of the frames, shape [frames or 1, ...], linearly at a time."""
+        if len(values) == 1:
+            return values[0]
+        after = int(np.clip(np.searchsorted(self.times, instant), 1, len(self.times) - 1))
+        first, last = self.times[after - 1:after + 1]
+        part = np.clip((instant - first) / (last - first), 0.0, 1.0)
+        return (1.0 - part) * values[after - 1] + part * values[after]
+
+    def _checked_nodal_forces(self, forces: np.ndarray | None) -> np.ndarray | None:
+        if forces is None:
+            return None
+        shape = (self.model.mesh.node_count, 3)
+        forces = np.asarray(forces, float)
+        if forces.ndim < 3:
+            return checked_forces(forces, shape)[None]
+        return checked_forces(forces, (len(self.times), *shape))
+
+    def _checked_grasp_forces(self, forces: np.ndarray | None) -> np.ndarray | None:
+        if forces is None:
+            return None
+        wanted = (len(self.times), len(self.grasps), 3)
+        values = np.asarray(forces, float)
+        if not self.grasps or values.size != np.prod(wanted) or not np.isfinite(values).all():
+            raise InputError(f"Grasp forces of shape {values.shape}.",
+                             f"{len(self.times)} times and {len(self.grasps)} grasps need"
+                             f" {wanted}.", "Give three numbers [N] for each.")
+        return values.reshape(wanted)
+
+
+def _checked_times(times: np.ndarray) -> np.ndarray:
+    times = np.asarray(times, float)
+    if times.ndim != 1 or len(times) < 1 or not np.isfinite(times).all() or (
+            np.diff(times) <= 0).any():
+        raise InputError("Times are not ascending.", "Each frame must be later than the last.",
+                         "Sort them and remove what is double.")
+    return times

@@ -1,0 +1,119 @@
+"""Derivatives along a motion: each step's, from the factor that it was solved with."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from limber.mechanics.dynamics.drive import Drive
+from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
+from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.sensitivities import (
+    ParameterSet,
+    explicit_forces,
+    reactions,
+    refined_solve,
+    static_sensitivities,
+    viscous_force,
+)
+from limber.mechanics.statics.result import StaticResult
+
+
+class MotionTangents:
+    """Derivatives of the present state to the parameters.
+
+    Args:
+        wanted: The parameters.
+        followed: Nodes whose derivatives are kept for the frames; None: all.
+    """
+
+    def __init__(self, drive: Drive, settings: NewmarkSettings, wanted: ParameterSet,
+                 followed: np.ndarray | None):
+        self.drive, self.settings, self.wanted = drive, settings, wanted
+        self.model, self.equations = drive.model, drive.equations
+        self._followed = (np.arange(self.model.mesh.node_count) if followed is None
+                          else np.asarray(followed))
+        self._states: list[MotionState] = []
+        self._out: list[np.ndarray] = []
+
+    def begin(self, start: MotionState, equilibrium: StaticResult | None) -> None:
+        """Start from a state that does not depend on the parameters, or from an equilibrium."""
+        zero = np.zeros_like(start.displacement)
+        empty = np.zeros_like(start.strain)
+        self._states = [MotionState(0.0, zero.copy(), zero.copy(), zero.copy(), empty, empty)
+                        for _ in self.wanted.labels()]
+        if equilibrium is None:
+            return
+        drive, wanted = self.drive, self.wanted
+        found = static_sensitivities(
+            self.model, equilibrium, drive.grasps or None, wanted.weights, wanted.names,
+            is_held=drive.path is not None, control_young=wanted.control_young)
+        for column, tangent in enumerate(self._states):
+            tangent.displacement = found.displacement[:, :, column].copy()
+            if self.model.damping.stiffness:
+                tangent.strain = tangent.strain_before = self.model.strain_changes(
+                    equilibrium.displacement, tangent.displacement)
+
+    def explicit(self, state: MotionState, viscous: Viscous | None) -> list[np.ndarray]:
+        """Return the explicit derivatives of forces where pinned patches make them jump."""
+        if not self.equations.pinned:
+            return []
+        return explicit_forces(self.model, self.wanted, state, viscous)
+
+    def jump(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
+        """Take the reaction of the motion that was imposed on pinned patches."""
+        if before:
+            self._out = [out + now - was
+                         for out, now, was in zip(self._out, after, before, strict=True)]
+
+    def advance(self, old: MotionState, new: MotionState, dt: float,
+                viscous: Viscous | None) -> None:
+        """Go a step along with the motion."""
+        model, settings = self.model, self.settings
+        beta, gamma = settings.beta, settings.gamma
+        rate, inertia = gamma / (beta * dt), 1 / (beta * dt**2)
+        formula, alpha = old.rate_formula(dt), model.damping.mass
+        partials = explicit_forces(model, self.wanted, new, viscous)
+
+        def force(change: np.ndarray) -> np.ndarray:
+            return (model.tangent_times(new.displacement, change, viscous)
+                    + model.mass_times((inertia + alpha * rate) * change))
+
+        self._out = []
+        for number, partial in enumerate(partials):
+            past = self._states[number]
+            # Velocity and acceleration if the displacement's derivative were 0.
+            a_zero = (-(past.displacement + dt * past.velocity) / dt**2
+                      - (0.5 - beta) * past.acceleration) / beta
+            v_zero = past.velocity + dt * ((1 - gamma) * past.acceleration + gamma * a_zero)
+            history = partial + model.mass_times(a_zero + alpha * v_zero)
+            if viscous is not None:
+                memory = model.damping.stiffness * (formula[1] * past.strain
+                                                    + formula[2] * past.strain_before)
+                history = history + viscous_force(model, new.displacement, memory)
+            change = refined_solve(self.equations, force, -history)
+            strain = past.strain if viscous is None else model.strain_changes(
+                new.displacement, change)
+            motion = (v_zero + rate * change, a_zero + inertia * change)
+            free = alpha * motion[0] + motion[1]
+            for grasp in self.equations.pinned:
+                # The path gives the means' velocity and acceleration, whatever the parameters.
+                for values in motion:
+                    values[grasp.nodes] -= grasp.weights @ values[grasp.nodes]
+            imposed = model.mass_times(alpha * motion[0] + motion[1] - free)
+            self._states[number] = MotionState(new.time, change, *motion, strain, past.strain,
+                                                dt)
+            self._out.append(history + force(change) + imposed)
+
+    def frame(self, state: MotionState) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of followed nodes [nodes, 3, p] and reactions [grasps, 3, p]."""
+        moved = np.stack([t.displacement[self._followed] for t in self._states], axis=-1)
+        grasps = self.drive.grasps
+        force = np.stack(
+            [reactions(grasps, out) if self.drive.path else np.zeros((len(grasps), 3))
+             for out in self._out or self._first_out(state)], axis=-1)
+        return moved, force
+
+    def _first_out(self, state: MotionState) -> list[np.ndarray]:
+        partials = explicit_forces(self.model, self.wanted, state, None)
+        return [partial + self.model.tangent_times(state.displacement, tangent.displacement)
+                for partial, tangent in zip(partials, self._states, strict=True)]

@@ -1,0 +1,143 @@
+"""One implicit Newmark step: mixed-point Newton with factors kept as long as they serve."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.mechanics.dynamics.drive import Drive
+from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
+from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.linear.factor import NotPositiveDefiniteError
+
+_GOOD_FACTOR = 1e-3
+
+
+class NewmarkStepper:
+    """Takes steps, and remembers the factor of the last.
+
+    Attributes:
+        iteration_count: So far.
+        status, trouble: Why the last step failed.
+    """
+
+    def __init__(self, drive: Drive, settings: NewmarkSettings):
+        self.drive, self.settings = drive, settings
+        self.model, self.equations = drive.model, drive.equations
+        self.iteration_count = 0
+        self.status, self.trouble = "converged", ""
+        self._factor_step, self._factor_error = 0.0, np.inf
+
+    def forget_factor(self) -> None:
+        """Use the last factor no more."""
+        self._factor_step = 0.0
+
+    def viscous(self, old: MotionState, dt: float) -> Viscous | None:
+        """Return the viscous part of a step of ``dt`` from ``old``."""
+        factor = self.model.damping.stiffness
+        if not factor:
+            return None
+        ahead, now, before = old.rate_formula(dt)
+        return Viscous(1 + factor * ahead, factor * (now * old.strain + before * old.strain_before))
+
+    def step(self, old: MotionState, dt: float, load: np.ndarray,
+             viscous: Viscous | None) -> MotionState | None:
+        """Return the state ``dt`` after ``old``, or None where it is not found.
+
+        The first solve starts from the balanced state before, not from one extrapolated in time:
+        straight extrapolation stretches whatever turns. Mixed-point Newton then does the same
+        service as in statics.
+        """
+        model, equations, settings = self.model, self.equations, self.settings
+        new = replace(old, time=old.time + dt, step_before=dt,
+                      displacement=old.displacement.copy())
+        moved, pins = self.drive.moves(new)
+        self._follow(old, new, dt)
+        increment, norms, fresh = None, [], False
+        for _ in range(settings.max_iterations):
+            out, inertial, min_det_f = self._imbalance(new, load, viscous)
+            residual = equations.free_part(out)
+            norm = float(np.linalg.norm(residual))
+            reference = float(np.linalg.norm(load) + np.linalg.norm(inertial)
+                              + np.linalg.norm(out - residual))
+            if not np.isfinite(norm) or (len(norms) > 4 and norm > 0.9 * min(norms)
+                                         and norms[-1] > 0.9 * min(norms[:-1])):
+                self.trouble, self.status = "the iteration does not converge", "stalled"
+                return None
+            if increment is not None and norm <= max(settings.tolerance * reference,
+                                                     self._floor()):
+                if fresh:
+                    self._factor_error = norm / norms[-1]
+                return self._accepted(new, min_det_f)
+            first = increment is None
+            if fresh:
+                self._factor_error, fresh = norm / norms[-1], False
+            keep = self._may_keep(dt) if first else (
+                norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
+            if not keep:
+                if not self._factorise(new, increment, viscous, dt):
+                    return None
+                fresh = True
+            norms.append(norm)
+            self.iteration_count += 1
+            if first and moved is not None:
+                residual = equations.free_part(
+                    out - model.tangent_times(old.displacement, moved, viscous))
+            increment = equations.solve(residual, pins)
+            if moved is not None and equations.held.any():
+                increment = increment + moved
+            moved, pins = None, np.zeros_like(pins)
+            new.displacement = new.displacement + increment
+            self._follow(old, new, dt)
+        self.trouble = f"no convergence in {settings.max_iterations} iterations"
+        self.status = "stalled"
+        return None
+
+    def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
+        """Give velocity and acceleration by Newmark's formulas, and the path's to held nodes."""
+        beta, gamma = self.settings.beta, self.settings.gamma
+        new.acceleration = ((new.displacement - old.displacement - dt * old.velocity) / dt**2
+                            - (0.5 - beta) * old.acceleration) / beta
+        new.velocity = old.velocity + dt * (
+            (1 - gamma) * old.acceleration + gamma * new.acceleration)
+        self.drive.hold(new)
+
+    def _may_keep(self, dt: float) -> bool:
+        """Whether the last factor fits the state before this step.
+
+        It does if its own solve brought the residual down a thousandfold.
+        """
+        return (self.settings.keep_factor > 0 and self._factor_step == dt
+                and self._factor_error <= _GOOD_FACTOR)
+
+    def _factorise(self, new: MotionState, increment: np.ndarray | None,
+                   viscous: Viscous | None, dt: float) -> bool:
+        settings, damping = self.settings, self.model.damping
+        rate, inertia = settings.gamma / (settings.beta * dt), 1 / (settings.beta * dt**2)
+        try:
+            self.equations.assemble(self.model, new.displacement, increment=increment,
+                                    viscous=viscous, mass_factor=inertia + damping.mass * rate)
+            self.equations.factorise()
+        except NotPositiveDefiniteError:
+            self.trouble, self.status = "the stiffness has no positive pivots", "stalled"
+            return False
+        self._factor_step = dt
+        return True
+
+    def _imbalance(self, new: MotionState, load: np.ndarray, viscous: Viscous | None,
+                   ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return what forces are left over, the inertial ones, and min det F."""
+        internal = self.model.internal(new.displacement, viscous=viscous)
+        inertial = self.model.mass_times(
+            new.acceleration + self.model.damping.mass * new.velocity)
+        return load - internal.force - inertial, inertial, internal.min_det_f
+
+    def _floor(self) -> float:
+        # Differences of displacements in an element carry round-off of about one unit each.
+        return 8 * np.finfo(float).eps * self.equations.diagonal_norm() * self.model.mean_edge
+
+    def _accepted(self, new: MotionState, min_det_f: float) -> MotionState | None:
+        if min_det_f <= 0:
+            self.trouble, self.status = "an element would turn inside out", "inverted"
+            return None
+        self.status = "converged"
+        return new

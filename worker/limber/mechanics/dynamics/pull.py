@@ -1,0 +1,148 @@
+"""A pull of a branch: what holds it, what pulls it, and the motion that follows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.mechanics.dynamics.simulate import NewmarkSettings, simulate_dynamics
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.statics.solve import solve_static
+from limber.progress import Progress
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Loads and constraints over the frames of a pull.
+
+    Attributes:
+        model: The branch, with all that hangs on it.
+        start: Its equilibrium before the pull, with the grippers on and no force in them.
+        grasp: The gripper that pulls.
+        follows_pose: Whether it follows poses; else it exerts ``grasp_force``.
+        holds: Other grippers and ties; they stay where they are at the start.
+        way: Poses of the gripper [m, rad], shape [frames, 6]; unused where it exerts a force.
+        grasp_force: At the end of the pull [N], shape [3].
+        loads: Other forces on the nodes at the end of the pull [N], shape [node_count, 3].
+        times: Of the frames [s], shape [frames].
+        part: Part of the pull's forces at each frame, shape [frames].
+    """
+
+    model: BranchModel
+    start: StaticResult
+    grasp: Grasp
+    follows_pose: bool
+    holds: tuple[Grasp, ...]
+    way: np.ndarray
+    grasp_force: np.ndarray
+    loads: np.ndarray
+    times: np.ndarray
+    part: np.ndarray
+
+    @property
+    def held(self) -> list[Grasp]:
+        """All that follow a pose; the gripper first, if it does."""
+        return [self.grasp, *self.holds] if self.follows_pose else list(self.holds)
+
+    def poses(self) -> np.ndarray:
+        """Poses of :attr:`held` [m, rad], shape [frames, held, 6]."""
+        still = np.tile(self.start.pose[1:], (len(self.times), 1, 1))
+        return np.concatenate([self.way[:, None], still], axis=1) if self.follows_pose else still
+
+    def nodal_forces(self) -> np.ndarray:
+        """All forces at the end of the pull [N], shape [node_count, 3]."""
+        forces = self.loads.copy()
+        if not self.follows_pose:
+            forces[self.grasp.nodes] += self.grasp.weights[:, None] * self.grasp_force
+        return forces
+
+    def at_grippers(self, reactions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Part what the held patches get into the gripper's and that of the holds.
+
+        Args:
+            reactions: Of :attr:`held`, shape [frames, held, 3].
+
+        Returns:
+            Shapes [frames, 3] and [frames, holds, 3].
+        """
+        if self.follows_pose:
+            return reactions[:, 0], reactions[:, 1:]
+        return np.zeros((len(reactions), 3)), reactions
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Frames of a motion; shorter than the pull where the branch could not follow.
+
+    Attributes:
+        times: [s], shape [frames].
+        displacement: Of all nodes from the rest shape [m], shape [frames, node_count, 3].
+        strain_energy, kinetic_energy: [J], shape [frames].
+        grasp_force, grasp_torque: Of the gripper on the branch [N, Nm], shape [frames, 3].
+        hold_forces: Of the other holds [N], shape [frames, holds, 3].
+        min_det_f: Smallest det F, shape [frames].
+        converged: Whether all frames were reached; ``message`` tells why not.
+        warnings: What the user should know.
+    """
+
+    times: np.ndarray
+    displacement: np.ndarray
+    strain_energy: np.ndarray
+    kinetic_energy: np.ndarray
+    grasp_force: np.ndarray
+    grasp_torque: np.ndarray
+    hold_forces: np.ndarray
+    min_det_f: np.ndarray
+    converged: bool
+    message: str
+    warnings: list[str]
+
+
+def static_motion(pull: Pull, progress: Progress) -> Motion:
+    """Follow a pull through equilibria; ends with the first frame that has none."""
+    held, poses, forces = pull.held, pull.poses(), pull.nodal_forces()
+    results: list[StaticResult] = []
+    for number, part in enumerate(pull.part):
+        progress(number / len(pull.part), "following the pull", frame=number)
+        results.append(solve_static(
+            pull.model, grasp=held or None, pose=poses[number] if held else None,
+            nodal_forces=part * forces, start=results[-1] if results else pull.start))
+        if not results[-1].converged:
+            break
+    last, count = results[-1], len(results)
+    reactions = np.array([r.reaction_force for r in results]).reshape(count, -1, 3)
+    torques = np.array([r.reaction_torque for r in results]).reshape(count, -1, 3)
+    force, hold_forces = _forces(pull, reactions)
+    return Motion(
+        times=pull.times[:count], displacement=np.array([r.displacement for r in results]),
+        strain_energy=np.array([r.strain_energy for r in results]),
+        kinetic_energy=np.zeros(count), grasp_force=force,
+        grasp_torque=pull.at_grippers(torques)[0], hold_forces=hold_forces,
+        min_det_f=np.array([r.min_det_f for r in results]), converged=last.converged,
+        message=last.message, warnings=last.warnings)
+
+
+def dynamic_motion(pull: Pull, settings: NewmarkSettings, progress: Progress) -> Motion:
+    """Follow a pull in time, with inertia and damping."""
+    held, forces = pull.held, pull.nodal_forces()
+    found = simulate_dynamics(
+        pull.model, grasp=held or None, poses=pull.poses() if held else None,
+        nodal_forces=pull.part[:, None, None] * forces if forces.any() else None,
+        times=pull.times, start=pull.start, settings=settings, progress=progress)
+    count = len(found.times)
+    force, hold_forces = _forces(pull, found.reaction_force.reshape(count, -1, 3))
+    return Motion(
+        times=found.times, displacement=found.displacement, strain_energy=found.strain_energy,
+        kinetic_energy=found.kinetic_energy, grasp_force=force,
+        grasp_torque=pull.at_grippers(found.reaction_torque.reshape(count, -1, 3))[0],
+        hold_forces=hold_forces, min_det_f=found.min_det_f, converged=found.converged,
+        message=found.message, warnings=found.warnings)
+
+
+def _forces(pull: Pull, reactions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gripper's forces [frames, 3] and those of the holds [frames, holds, 3]."""
+    force, hold_forces = pull.at_grippers(reactions[:, :len(pull.held)])
+    if not pull.follows_pose:
+        force = pull.part[:len(reactions), None] * pull.grasp_force
+    return force, hold_forces

@@ -1,0 +1,1 @@
+"""Finite elements: shape functions, kernels of force, strain and stiffness."""

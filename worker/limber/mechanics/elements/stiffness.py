@@ -1,0 +1,299 @@
+"""The kernel that makes the tangent stiffness and scatters it into the factor's own pattern.
+
+Elements are taken LANES at a time (limber.mechanics.elements.stiffness_pairs); the layout, made by
+limber.mechanics.linear.pattern, has the element as the last axis.
+
+``slots`` has, for each pair of an element's nodes, where the pair's block starts in the values of
+the lower triangle in compressed columns; the block's other two columns follow at distances that
+the column's length gives. An element's nodes are sorted so that the earlier eliminated comes first,
+so every pair's block is in the lower triangle as it stands. Pairs with a constrained node point
+behind the end of the values.
+"""
+
+import numpy as np
+
+from limber.compiled import compiled
+from limber.mechanics.elements.stiffness_pairs import (
+    LANES,
+    STRAIN_ROWS,
+    STRAIN_TERMS,
+    VOLUME_ROWS,
+    VOLUME_TERMS,
+    linear_gradient,
+    quadratic_gradient,
+    scatter_block,
+    strain_pairs_1,
+    strain_pairs_2,
+    strain_pairs_4,
+    volume_pairs_1,
+    volume_pairs_2,
+    volume_pairs_4,
+)
+
+_NEO_HOOKE = 1
+_LINEAR = 2
+
+
+@compiled
+def tangent_stiffness(displacement, increment, gradients, weights, lame_lambda, lame_mu, nodes,
+                      material, growth, memory, slots, lengths, values):
+    """Add the tangent stiffness [N/m] of all elements to ``values``.
+
+    Args:
+        displacement: See limber.mechanics.elements.forces.
+        increment: The last increment of the displacement; the stress of the geometric part is
+            then taken at the strain less dH^T dH / 2, dH the increment's gradient: the stress
+            that the last linearisation predicted (mixed integration points, Magisano, Leonetti
+            and Garcea 2017). Without rows: Newton's. Only for St. Venant-Kirchhoff.
+        gradients, weights: Shapes [batch, q, n, 3, LANES] and [batch, q, LANES].
+        lame_lambda, lame_mu: Shape [batch, LANES].
+        nodes: Shape [batch, n, LANES].
+        growth, memory: See limber.mechanics.elements.forces; memory of shape [batch, q, 6, LANES].
+        slots, lengths: Shape [batch, pairs, LANES]; pair (a, b <= a) has number a (a+1)/2 + b.
+        values: Lower triangle by columns, with a few numbers of scratch behind its end.
+    """
+    batch_count, point_count = weights.shape[0], weights.shape[1]
+    node_count = nodes.shape[1]
+    flat = gradients.reshape(batch_count, point_count, 3 * node_count * LANES)
+    local = np.empty(3 * node_count * LANES)
+    rate = np.empty(3 * node_count * LANES)
+    strain_rows = np.empty((node_count, point_count * STRAIN_ROWS * LANES))
+    volume_rows = np.empty((node_count, point_count * VOLUME_ROWS * LANES))
+    strain_terms = np.empty(point_count * STRAIN_TERMS * LANES)
+    volume_terms = np.empty(point_count * VOLUME_TERMS * LANES)
+    F, D = np.empty(9 * LANES), np.empty(9 * LANES)
+    E, C = np.empty(6 * LANES), np.empty(9 * LANES)
+    root, lam, mu, both = np.empty(LANES), np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    block = np.empty(9 * LANES)
+    mixed = material != _LINEAR and increment.shape[0] > 0
+    has_memory = memory.shape[0] > 0 and material != _LINEAR
+    factor = growth - 1.0 if material == _NEO_HOOKE else growth
+    has_strain = material != _NEO_HOOKE or memory.shape[0] > 0
+    for batch in range(batch_count):
+        gather(displacement, nodes[batch], local)
+        if mixed:
+            gather(increment, nodes[batch], rate)
+        for l in range(LANES):
+            lam[l], mu[l] = factor * lame_lambda[batch, l], factor * lame_mu[batch, l]
+            both[l] = lame_lambda[batch, l] + lame_mu[batch, l]
+        for q in range(point_count):
+            if material == _LINEAR:
+                F[:] = 0.0
+                for l in range(LANES):
+                    F[l] = F[4 * LANES + l] = F[8 * LANES + l] = 1.0
+            else:
+                deformation(local, flat[batch, q], node_count, F)
+            for l in range(LANES):
+                root[l] = np.sqrt(weights[batch, q, l])
+            if has_strain:
+                green_strain(F, E)
+                if mixed:
+                    gradient(rate, flat[batch, q], node_count, D)
+                    _subtract_half_square(D, E)
+                for k in range(6 * LANES):
+                    E[k] *= factor
+                if has_memory:
+                    for k in range(6):
+                        for l in range(LANES):
+                            E[k * LANES + l] += memory[batch, q, k, l]
+                _stress(lame_lambda[batch], lame_mu[batch], weights[batch, q], E)
+                _strain_terms(F, mu, weights[batch, q], strain_terms[q * STRAIN_TERMS * LANES:])
+                for a in range(node_count):
+                    _strain_rows(F, E, root, flat[batch, q, 3 * a * LANES:],
+                                 strain_rows[a, q * STRAIN_ROWS * LANES:])
+            if material == _NEO_HOOKE:
+                _volume_terms(F, lame_mu[batch], both, weights[batch, q], C,
+                              volume_terms[q * VOLUME_TERMS * LANES:])
+                for a in range(node_count):
+                    _volume_rows(C, root, flat[batch, q, 3 * a * LANES:],
+                                 volume_rows[a, q * VOLUME_ROWS * LANES:])
+        pair = 0
+        for a in range(node_count):
+            for b in range(a + 1):
+                block[:] = 0.0
+                if has_strain:
+                    _add_strain_pairs(strain_rows[a], strain_rows[b], strain_terms, lam, mu,
+                                      point_count, block)
+                if material == _NEO_HOOKE:
+                    _add_volume_pairs(volume_rows[a], volume_rows[b], volume_terms, both,
+                                      point_count, block)
+                scatter_block(block, slots[batch, pair], lengths[batch, pair], a == b, values)
+                pair += 1
+
+
+@compiled
+def gather(field, nodes, out):
+    """Write a nodal field, less its value at each element's first node."""
+    for a in range(nodes.shape[0]):
+        for l in range(LANES):
+            node, first = nodes[a, l], nodes[0, l]
+            for i in range(3):
+                out[(3 * a + i) * LANES + l] = field[node, i] - field[first, i]
+
+
+@compiled
+def gradient(values, gradients, node_count, out):
+    """Write the gradient of a nodal field, by rows."""
+    if node_count == 10:
+        quadratic_gradient(values, gradients, out)
+    else:
+        linear_gradient(values, gradients, out)
+
+
+@compiled
+def deformation(values, gradients, node_count, F):
+    """Write the deformation gradient of a nodal displacement, by rows."""
+    gradient(values, gradients, node_count, F)
+    for l in range(LANES):
+        F[l] += 1.0
+        F[4 * LANES + l] += 1.0
+        F[8 * LANES + l] += 1.0
+
+
+@compiled
+def green_strain(F, E):
+    """Write the Green-Lagrange strain: 00 11 22 01 02 12."""
+    for l in range(LANES):
+        f00, f01, f02 = F[l], F[LANES + l], F[2 * LANES + l]
+        f10, f11, f12 = F[3 * LANES + l], F[4 * LANES + l], F[5 * LANES + l]
+        f20, f21, f22 = F[6 * LANES + l], F[7 * LANES + l], F[8 * LANES + l]
+        E[l] = 0.5 * (f00 * f00 + f10 * f10 + f20 * f20 - 1.0)
+        E[LANES + l] = 0.5 * (f01 * f01 + f11 * f11 + f21 * f21 - 1.0)
+        E[2 * LANES + l] = 0.5 * (f02 * f02 + f12 * f12 + f22 * f22 - 1.0)
+        E[3 * LANES + l] = 0.5 * (f00 * f01 + f10 * f11 + f20 * f21)
+        E[4 * LANES + l] = 0.5 * (f00 * f02 + f10 * f12 + f20 * f22)
+        E[5 * LANES + l] = 0.5 * (f01 * f02 + f11 * f12 + f21 * f22)
+
+
+@compiled
+def _subtract_half_square(D, E):
+    for l in range(LANES):
+        d00, d01, d02 = D[l], D[LANES + l], D[2 * LANES + l]
+        d10, d11, d12 = D[3 * LANES + l], D[4 * LANES + l], D[5 * LANES + l]
+        d20, d21, d22 = D[6 * LANES + l], D[7 * LANES + l], D[8 * LANES + l]
+        E[l] -= 0.5 * (d00 * d00 + d10 * d10 + d20 * d20)
+        E[LANES + l] -= 0.5 * (d01 * d01 + d11 * d11 + d21 * d21)
+        E[2 * LANES + l] -= 0.5 * (d02 * d02 + d12 * d12 + d22 * d22)
+        E[3 * LANES + l] -= 0.5 * (d00 * d01 + d10 * d11 + d20 * d21)
+        E[4 * LANES + l] -= 0.5 * (d00 * d02 + d10 * d12 + d20 * d22)
+        E[5 * LANES + l] -= 0.5 * (d01 * d02 + d11 * d12 + d21 * d22)
+
+
+@compiled
+def _stress(lam, mu, weight, E):
+    """Turn strain into weight times stress, in place."""
+    for l in range(LANES):
+        twice = 2.0 * weight[l] * mu[l]
+        trace = weight[l] * lam[l] * (E[l] + E[LANES + l] + E[2 * LANES + l])
+        E[l] = trace + twice * E[l]
+        E[LANES + l] = trace + twice * E[LANES + l]
+        E[2 * LANES + l] = trace + twice * E[2 * LANES + l]
+        E[3 * LANES + l] *= twice
+        E[4 * LANES + l] *= twice
+        E[5 * LANES + l] *= twice
+
+
+@compiled
+def _strain_terms(F, mu, weight, out):
+    for l in range(LANES):
+        f00, f01, f02 = F[l], F[LANES + l], F[2 * LANES + l]
+        f10, f11, f12 = F[3 * LANES + l], F[4 * LANES + l], F[5 * LANES + l]
+        f20, f21, f22 = F[6 * LANES + l], F[7 * LANES + l], F[8 * LANES + l]
+        m = weight[l] * mu[l]
+        out[l] = m * (f00 * f00 + f01 * f01 + f02 * f02)
+        out[LANES + l] = m * (f10 * f10 + f11 * f11 + f12 * f12)
+        out[2 * LANES + l] = m * (f20 * f20 + f21 * f21 + f22 * f22)
+        out[3 * LANES + l] = m * (f00 * f10 + f01 * f11 + f02 * f12)
+        out[4 * LANES + l] = m * (f00 * f20 + f01 * f21 + f02 * f22)
+        out[5 * LANES + l] = m * (f10 * f20 + f11 * f21 + f12 * f22)
+
+
+@compiled
+def _strain_rows(F, S, root, gradients, out):
+    for l in range(LANES):
+        x, y, z = gradients[l], gradients[LANES + l], gradients[2 * LANES + l]
+        r = root[l]
+        out[l] = r * (F[l] * x + F[LANES + l] * y + F[2 * LANES + l] * z)
+        out[LANES + l] = r * (F[3 * LANES + l] * x + F[4 * LANES + l] * y + F[5 * LANES + l] * z)
+        out[2 * LANES + l] = r * (
+            F[6 * LANES + l] * x + F[7 * LANES + l] * y + F[8 * LANES + l] * z)
+        out[3 * LANES + l] = x
+        out[4 * LANES + l] = y
+        out[5 * LANES + l] = z
+        s01, s02, s12 = S[3 * LANES + l], S[4 * LANES + l], S[5 * LANES + l]
+        out[6 * LANES + l] = S[l] * x + s01 * y + s02 * z
+        out[7 * LANES + l] = s01 * x + S[LANES + l] * y + s12 * z
+        out[8 * LANES + l] = s02 * x + s12 * y + S[2 * LANES + l] * z
+
+
+@compiled
+def _volume_terms(F, mu, both, weight, cofactor, out):
+    for l in range(LANES):
+        f00, f01, f02 = F[l], F[LANES + l], F[2 * LANES + l]
+        f10, f11, f12 = F[3 * LANES + l], F[4 * LANES + l], F[5 * LANES + l]
+        f20, f21, f22 = F[6 * LANES + l], F[7 * LANES + l], F[8 * LANES + l]
+        c00, c01, c02 = f11 * f22 - f12 * f21, f12 * f20 - f10 * f22, f10 * f21 - f11 * f20
+        cofactor[l] = c00
+        cofactor[LANES + l] = c01
+        cofactor[2 * LANES + l] = c02
+        cofactor[3 * LANES + l] = f02 * f21 - f01 * f22
+        cofactor[4 * LANES + l] = f00 * f22 - f02 * f20
+        cofactor[5 * LANES + l] = f01 * f20 - f00 * f21
+        cofactor[6 * LANES + l] = f01 * f12 - f02 * f11
+        cofactor[7 * LANES + l] = f02 * f10 - f00 * f12
+        cofactor[8 * LANES + l] = f00 * f11 - f01 * f10
+        det = f00 * c00 + f01 * c01 + f02 * c02
+        pressure = weight[l] * (both[l] * (det - 1.0) - mu[l])
+        out[l] = pressure * f00
+        out[LANES + l] = pressure * f01
+        out[2 * LANES + l] = pressure * f02
+        out[3 * LANES + l] = pressure * f10
+        out[4 * LANES + l] = pressure * f11
+        out[5 * LANES + l] = pressure * f12
+        out[6 * LANES + l] = pressure * f20
+        out[7 * LANES + l] = pressure * f21
+        out[8 * LANES + l] = pressure * f22
+        out[9 * LANES + l] = weight[l] * mu[l]
+
+
+@compiled
+def _volume_rows(cofactor, root, gradients, out):
+    for l in range(LANES):
+        x, y, z = gradients[l], gradients[LANES + l], gradients[2 * LANES + l]
+        r = root[l]
+        out[l] = r * (cofactor[l] * x + cofactor[LANES + l] * y + cofactor[2 * LANES + l] * z)
+        out[LANES + l] = r * (cofactor[3 * LANES + l] * x + cofactor[4 * LANES + l] * y
+                              + cofactor[5 * LANES + l] * z)
+        out[2 * LANES + l] = r * (cofactor[6 * LANES + l] * x + cofactor[7 * LANES + l] * y
+                                  + cofactor[8 * LANES + l] * z)
+        out[3 * LANES + l] = x
+        out[4 * LANES + l] = y
+        out[5 * LANES + l] = z
+
+
+@compiled
+def _add_strain_pairs(one, two, terms, lam, mu, point_count, block):
+    if point_count == 4:
+        strain_pairs_4(one, two, terms, lam, mu, block)
+    elif point_count % 2:
+        for q in range(point_count):
+            row = q * STRAIN_ROWS * LANES
+            strain_pairs_1(one[row:], two[row:], terms[q * STRAIN_TERMS * LANES:], lam, mu, block)
+    else:
+        for q in range(0, point_count, 2):
+            row = q * STRAIN_ROWS * LANES
+            strain_pairs_2(one[row:], two[row:], terms[q * STRAIN_TERMS * LANES:], lam, mu, block)
+
+
+@compiled
+def _add_volume_pairs(one, two, terms, both, point_count, block):
+    if point_count == 4:
+        volume_pairs_4(one, two, terms, both, block)
+    elif point_count % 2:
+        for q in range(point_count):
+            row = q * VOLUME_ROWS * LANES
+            volume_pairs_1(one[row:], two[row:], terms[q * VOLUME_TERMS * LANES:], both, block)
+    else:
+        for q in range(0, point_count, 2):
+            row = q * VOLUME_ROWS * LANES
+            volume_pairs_2(one[row:], two[row:], terms[q * VOLUME_TERMS * LANES:], both, block)

@@ -1,0 +1,1 @@
+"""The reduced model: basis, training, statics, motion, refresh."""

@@ -1,0 +1,495 @@
+"""Reduced model of a branch: static grasps and their sensitivities in about a millisecond.
+
+Full solutions span a subspace (limber.mechanics.reduced.basis) in which the StVK force is a cubic
+polynomial (limber.mechanics.reduced.strain). ::
+
+    reduced = build_reduced(model, grasp, weights, control_young)
+    state = reduced.with_young(young).solve_static(pose)
+    state.strain_energy, state.reaction_force, reduced.displacement(state)
+
+How far to trust it: :mod:`limber.mechanics.reduced.refresh`.
+"""
+
+import copy
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.mechanics.grasp import Grasp, check_pose, pose_between, rotation_matrix
+from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.reduced.basis import Basis, GraspCoordinates, make_basis
+from limber.mechanics.reduced.state import (
+    ReducedSensitivities,
+    ReducedSettings,
+    ReducedState,
+    ReducedStaticSettings,
+)
+from limber.mechanics.reduced.strain import (
+    StrainPolynomial,
+    evaluate_strain,
+    make_polynomial,
+    reduced_mass,
+    strain_only,
+)
+from limber.mechanics.reduced.training import (
+    Snapshots,
+    Trainer,
+    sample_poses,
+    sample_young,
+)
+from limber.progress import SILENT, Progress
+
+FORMAT = 2
+_STATIC = ReducedStaticSettings()
+_DEFAULT = ReducedSettings()
+_NO_INCREMENT = np.empty(0)
+_LEADING = 20
+"""Modes that tell whether a state is like those of the training."""
+
+
+@dataclass
+class Workspace:
+    """Arrays that the kernel writes to."""
+
+    strain: np.ndarray
+    jacobian: np.ndarray
+    gradient: np.ndarray
+    tangent: np.ndarray
+
+    @classmethod
+    def of(cls, linear: np.ndarray) -> "Workspace":
+        count, size = linear.shape
+        return cls(np.empty(count), np.empty((count, size)), np.empty(size),
+                   np.empty((size, size)))
+
+
+@dataclass
+class ReducedModel:
+    """A branch held at one patch, in few coordinates.
+
+    Attributes:
+        grasp: The patch.
+        rest: Rest positions of all nodes [m], shape [node_count, 3].
+        basis: The subspace.
+        polynomial: Strain as a polynomial of the coordinates.
+        load: Gravity on the coordinates [N], shape [size].
+        mass: Mass matrix of the coordinates, shape [size, size].
+        damping: Rayleigh damping.
+        control_young: Young's modulus at the control points [Pa], shape [K].
+        poses, training_young, energies: Of the training states.
+        young_spread: Factor in Young's modulus within which the training sampled.
+        extent: Diagonal of the branch's bounding box [m].
+        error: Held-out errors measured when it was built (limber.mechanics.reduced.refresh).
+    """
+
+    grasp: Grasp
+    rest: np.ndarray
+    basis: Basis
+    polynomial: StrainPolynomial
+    load: np.ndarray
+    mass: np.ndarray
+    damping: RayleighDamping
+    control_young: np.ndarray
+    poses: np.ndarray
+    training_young: np.ndarray
+    energies: np.ndarray
+    young_spread: float
+    extent: float
+    error: dict[str, float] = field(default_factory=dict)
+    poisson: float | None = None
+
+    def __post_init__(self) -> None:
+        self.held = GraspCoordinates(self.grasp)
+        self.young = self.control_young
+        self._largest = self.basis.reach
+        # The leading modes: those of vibrations are not in the states, the last are small.
+        modes = np.arange(self.size) >= self.basis.lift_count
+        self._known = np.flatnonzero(modes & (self._largest > 0))[:_LEADING]
+        self._table = _PoseTable(self.poses, self.extent)
+        self._spacing = self._table.spacing()
+        self._set()
+
+    @property
+    def size(self) -> int:
+        return self.basis.size
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """Derivative of the whitened strain where the tangent was evaluated last, [m, size]."""
+        return self._work.jacobian
+
+    def with_young(self, young: np.ndarray, poisson: float | None = None) -> "ReducedModel":
+        """Return the model with other moduli [Pa] at the control points, shape [K].
+
+        Raises:
+            InputError: wrong number, or not positive.
+        """
+        young = np.asarray(young, float)
+        if young.shape != self.control_young.shape or not (young > 0).all():
+            raise InputError(f"Young's moduli {young}.",
+                             f"{len(self.control_young)} positive values are needed.", "")
+        other = copy.copy(self)
+        other.young = young
+        other.poisson = self.poisson if poisson is None else poisson
+        other._set()
+        return other
+
+    def _set(self) -> None:
+        moduli = self.polynomial.moduli(self.young, self.poisson)
+        self.linear, self.quadratic, self.root = self.polynomial.whitened(moduli)
+        self._work = Workspace.of(self.linear)
+
+    def energy_force(self, q: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return strain energy [J] and its derivative [size] at coordinates."""
+        energy, gradient, _ = self.tangent(q)
+        return energy, gradient.copy()
+
+    def tangent(self, q: np.ndarray, increment: np.ndarray | None = None,
+                velocity: np.ndarray | None = None, by_rate: float = 0.0,
+                ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return energy, force and tangent (lower triangle); arrays are overwritten next time.
+
+        With ``increment`` the geometric stiffness is that of the mixed-integration-point Newton;
+        with ``velocity``, which changes by ``by_rate`` [1/s] with q, the stiffness damping acts.
+        """
+        work = self._work
+        dq = _NO_INCREMENT if increment is None else increment
+        moving = _NO_INCREMENT if velocity is None else velocity
+        energy = evaluate_strain(self.linear, self.quadratic, q, dq, moving,
+                                 self.damping.stiffness, by_rate, work.strain, work.jacobian,
+                                 work.gradient, work.tangent)
+        return energy, work.gradient, work.tangent
+
+    def strain_energy(self, q: np.ndarray) -> float:
+        """Return the strain energy [J] at coordinates."""
+        return strain_only(self.linear, self.quadratic, q, self._work.strain)
+
+    def displacement_of(self, q: np.ndarray) -> np.ndarray:
+        """Return the displacement of all nodes [m], shape [node_count, 3]."""
+        return np.tensordot(q, self.basis.columns, 1)
+
+    def displacement(self, state: ReducedState) -> np.ndarray:
+        """Return the displacement of all nodes [m] in a state, shape [node_count, 3]."""
+        return self.displacement_of(state.coordinates)
+
+    def load_of(self, nodal_forces: np.ndarray) -> np.ndarray:
+        """Return nodal forces [N], shape [node_count, 3], on the coordinates."""
+        return np.tensordot(self.basis.columns, nodal_forces, 2)
+
+    def solve_static(self, pose: np.ndarray, *, start: ReducedState | None = None,
+                     nodal_forces: np.ndarray | None = None,
+                     settings: ReducedStaticSettings = _STATIC,
+                     ) -> ReducedState:
+        """Return the equilibrium at a pose [m, rad]; look at ``converged`` and ``trusted``.
+
+        Starts from ``start`` or from the nearest training state. A state that fails, is not
+        stable or lies outside the training is sought again from others, on longer ways; the one
+        of the lowest energy counts.
+        """
+        began = time.perf_counter()
+        pose = check_pose(pose)
+        load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
+        best, iterations = None, 0
+        for at_pose, q in self._starts(pose, start)[:settings.start_count]:
+            found = self._follow(at_pose, q, pose, load, settings)
+            iterations += found.iterations
+            if best is not None and found.agrees(best):
+                break  # the same from two starts: unusual, but no accident of the way there
+            if best is None or (found.ranking(settings) < best.ranking(settings)):
+                best = found
+            if best.converged and best.novelty < settings.novelty_limit:
+                break
+        return self._state(best, pose, load, iterations, began, settings)
+
+    def sensitivities(self, state: ReducedState) -> ReducedSensitivities:
+        """Differentiate a converged state to log Young's modulus at each control point."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        q, free = state.coordinates, slice(self.basis.lift_count, None)
+        _, force, lower = self.tangent(q)
+        force, tangent = force.copy(), lower + np.tril(lower, -1).T
+        strain = np.linalg.solve(self.root.T, self._work.strain)
+        slope = np.linalg.solve(self.root.T, self._work.jacobian)
+        factor = cho_factor(tangent[free, free])
+        columns, forces, energies = [], [], []
+        for modulus, part in zip(self.young, self.polynomial.parts(self.poisson), strict=True):
+            explicit = modulus * slope.T @ (part @ strain)
+            change = np.zeros(self.size)
+            change[free] = -cho_solve(factor, explicit[free])
+            columns.append(change)
+            forces.append(np.concatenate(self.wrench(state.pose, explicit + tangent @ change)))
+            energies.append(0.5 * modulus * strain @ part @ strain + force @ change)
+        wrench = np.array(forces).T
+        return ReducedSensitivities(np.array(columns).T, wrench[:3], wrench[3:],
+                                    np.array(energies))
+
+    def nearest(self, pose: np.ndarray, count: int = 4) -> np.ndarray:
+        """Return the training states nearest to a pose at this Young's modulus."""
+        distance = self._table.distance(pose) + 0.1 * self.extent * np.abs(
+            np.log(self.training_young / self.young)).max(axis=1)
+        return np.argsort(distance)[:count]
+
+    def doubt(self, pose: np.ndarray, novelty: float, limit: float) -> str:
+        """Return why a state lies outside of what the basis knows, or an empty string."""
+        distance = self._table.distance(pose).min()
+        if distance > 3 * self._spacing:
+            return f"the pose is {distance:.3g} m from the nearest training grasp"
+        factor = np.exp(np.abs(np.log(self.young / self.control_young)).max())
+        if factor > 1.05 * self.young_spread:
+            return f"Young's modulus is {factor:.3g} times off what was sampled"
+        if novelty > limit:
+            return f"a coordinate is {novelty:.3g} times its largest in training"
+        return ""
+
+    def _starts(self, pose: np.ndarray, start: ReducedState | None,
+                ) -> list[tuple[np.ndarray, np.ndarray]]:
+        near = [(self.poses[k], self.basis.states[k]) for k in self.nearest(pose)]
+        if start is None:
+            return near
+        own = (start.pose, start.coordinates)
+        far = _PoseTable(np.array([start.pose, near[0][0]]), self.extent).distance(pose)
+        return [own, *near] if far[0] <= 2 * far[1] else [near[0], own, *near[1:]]
+
+    def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
+                settings: ReducedStaticSettings) -> "_Found":
+        """Newton to the pose; halves the way where that fails."""
+        iterations, reached, step = 0, 0.0, 1.0
+        while True:
+            part = min(1.0, reached + step)
+            goal = pose if part == 1.0 else pose_between(at_pose, pose, part)
+            found = self._newton(q, self.held.at(goal), load, settings)
+            iterations += found.iterations
+            sound = found.converged and found.novelty < 4 * settings.novelty_limit
+            if sound and part == 1.0:
+                return replace(found, iterations=iterations)
+            if sound:
+                q, reached = found.q, part
+                continue
+            step /= 2
+            if step < 0.5**settings.max_halvings:
+                return replace(found, converged=False, iterations=iterations)
+
+    def _newton(self, q: np.ndarray, held: np.ndarray, load: np.ndarray,
+                settings: ReducedStaticSettings) -> "_Found":
+        count, q = self.basis.lift_count, q.copy()
+        move, increment = held - q[:count], None
+        for iteration in range(settings.max_iterations):
+            energy, force, tangent = self.tangent(q, increment)
+            right = load[count:] - force[count:]
+            if move is not None:
+                right = right - tangent[count:, :count] @ move
+            step, stable = solved_raised(tangent[count:, count:], right)
+            increment = np.concatenate([np.zeros(count) if move is None else move, step])
+            q = q + increment
+            gain = 0.5 * abs(right @ step)
+            if not np.isfinite(gain) or np.abs(q).max() > 1e3 * self._largest.max():
+                return _Found(q, False, np.inf, iteration + 1, np.inf)
+            if move is None and gain <= settings.tolerance * max(energy, 1e-12):
+                novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
+                return _Found(q, stable, novelty, iteration + 1,
+                              self.strain_energy(q) - float(load @ q))
+            move = None
+        return _Found(q, False, np.inf, settings.max_iterations, np.inf)
+
+    def _state(self, found: "_Found", pose: np.ndarray, load: np.ndarray, iterations: int,
+               began: float, settings: ReducedStaticSettings) -> ReducedState:
+        energy, force = self.energy_force(found.q)
+        reaction, torque = self.wrench(pose, force - load)
+        doubt = "" if found.converged else "no stable equilibrium was found"
+        doubt = doubt or self.doubt(pose, found.novelty, settings.novelty_limit)
+        return ReducedState(
+            found.converged, not doubt, doubt, found.q, pose, self.young, float(energy), reaction,
+            torque, found.novelty, iterations, time.perf_counter() - began)
+
+    def wrench(self, pose: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return force and torque of the gripper from the forces on the grasp coordinates."""
+        wrench = self.held.by_pose(pose).T @ out[:self.basis.lift_count]
+        return wrench[:3], wrench[3:] if len(wrench) == 6 else np.zeros(3)
+
+    def write(self, path: Path) -> None:
+        """Write the model as plain arrays (npz, nothing pickled)."""
+        arrays = {
+            "format": FORMAT, "grasp_nodes": self.grasp.nodes, "grasp_weights": self.grasp.weights,
+            "grasp_centre": self.grasp.centre, "grasp_mode": self.grasp.mode, "rest": self.rest,
+            "columns": self.basis.columns, "lift_count": self.basis.lift_count,
+            "states": self.basis.states, "captured": self.basis.captured, "reach": self.basis.reach,
+            **{f"polynomial_{k}": v for k, v in vars(self.polynomial).items()},
+            "load": self.load, "mass": self.mass,
+            "damping": [self.damping.mass, self.damping.stiffness],
+            "control_young": self.control_young, "poses": self.poses,
+            "training_young": self.training_young, "energies": self.energies,
+            "young_spread": self.young_spread, "extent": self.extent,
+            "error_names": list(self.error), "error_values": list(self.error.values())}
+        with open(path, "wb") as stream:
+            np.savez(stream, **arrays)
+
+    @classmethod
+    def read(cls, path: Path) -> "ReducedModel":
+        """Read a model that :meth:`write` wrote.
+
+        Raises:
+            InputError: it is not one, or of another format.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path} cannot be read ({error}).",
+                             "A reduced model was expected.", "Build it again.") from error
+        if int(arrays.get("format", -1)) != FORMAT:
+            raise InputError(f"{path} has another format.", "", "Build it again.")
+        grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
+                      str(arrays["grasp_mode"]))
+        basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
+                      float(arrays["captured"]), arrays["reach"])
+        polynomial = StrainPolynomial(*(arrays[f"polynomial_{name}"] for name in
+                                        ("linear", "quadratic", "by_lambda", "by_mu")),
+                                      float(arrays["polynomial_poisson"]))
+        error = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
+                         strict=True))
+        return cls(grasp, arrays["rest"], basis, polynomial, arrays["load"], arrays["mass"],
+                   RayleighDamping(*arrays["damping"]), arrays["control_young"], arrays["poses"],
+                   arrays["training_young"], arrays["energies"], float(arrays["young_spread"]),
+                   float(arrays["extent"]), error)
+
+
+@dataclass(frozen=True)
+class _Found:
+    q: np.ndarray
+    converged: bool
+    novelty: float
+    iterations: int
+    potential: float
+
+    def agrees(self, other: "_Found") -> bool:
+        """Whether both are the same equilibrium."""
+        return (self.converged and other.converged
+                and abs(self.potential - other.potential) <= 1e-6 * abs(other.potential))
+
+    def ranking(self, settings: ReducedStaticSettings) -> tuple[bool, bool, float]:
+        """Sort key: converged, then within the training, then the lower potential energy."""
+        return not self.converged, self.novelty >= settings.novelty_limit, self.potential
+
+
+def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                  control_young: np.ndarray,
+                  settings: ReducedSettings = _DEFAULT,
+                  progress: Progress = SILENT) -> tuple[ReducedModel, Snapshots]:
+    """Solve the full model at training grasps and make the reduced model of them.
+
+    Args:
+        model: The branch (St. Venant-Kirchhoff).
+        grasp: The patch that is held, clamped or pinned.
+        weights: From control points to tetrahedra, shape [tet_count, K]
+            (limber.mechanics.young_weights).
+        control_young: Young's modulus at the control points [Pa], shape [K].
+
+    Raises:
+        ConvergenceError: no training grasp has an equilibrium. InputError: other materials.
+    """
+    training = settings.training
+    rng = np.random.default_rng(training.seed)
+    trainer = Trainer(model, grasp, weights, control_young,
+                      young_tangents=training.young_spread > 1)
+    poses = sample_poses(model, grasp, training.grasp_count, rng, training)
+    young = sample_young(control_young, len(poses), rng, training.young_spread)
+    snapshots = trainer.take(poses, young, vibration_every=training.vibration_every,
+                             vibration_count=training.vibration_count,
+                             progress=progress.part(0.0, 0.9))
+    progress(0.9, "reducing", snapshots=len(snapshots))
+    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings)
+    progress(1.0, "reduced model ready", size=reduced.size)
+    return reduced, snapshots
+
+
+def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
+                     control_young: np.ndarray, snapshots: Snapshots,
+                     settings: ReducedSettings) -> ReducedModel:
+    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`."""
+    control_young = np.asarray(control_young, float)
+    if not settings.vibration_count:
+        snapshots = snapshots.without_vibrations()
+    basis = make_basis(model, grasp, snapshots, settings.size,
+                       settings.vibration_count if len(snapshots.vibrations) else 0)
+    polynomial = make_polynomial(model, basis, weights, control_young, snapshots,
+                                 settings.field_count)
+    flat = basis.columns.reshape(basis.size, -1)
+    spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
+    return ReducedModel(
+        grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(),
+        reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
+        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent)
+
+
+def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Solve with the lower triangle; raise the diagonal until it is positive definite.
+
+    Returns the solution (NaN where there is none) and whether nothing had to be raised.
+    """
+    from scipy.linalg.lapack import dposv
+
+    shift, scale = 0.0, np.abs(np.diag(matrix)).mean()
+    while True:
+        shifted = matrix if shift == 0.0 else matrix + shift * scale * np.eye(len(matrix))
+        _, solution, info = dposv(shifted, right, lower=1)
+        if info == 0:
+            return solution, shift == 0.0
+        shift = max(4 * shift, 1e-6)
+        if shift > 1e3 or not np.isfinite(scale):
+            return np.full(len(right), np.nan), False
+
+
+class _PoseTable:
+    """Poses that distances are taken to; a radian counts as 0.3 of the extent."""
+
+    def __init__(self, poses: np.ndarray, extent: float):
+        from scipy.spatial.transform import Rotation
+
+        self.positions = np.atleast_2d(poses)[:, :3]
+        self.rotations = Rotation.from_rotvec(np.atleast_2d(poses)[:, 3:]).as_matrix()
+        self.extent = extent
+
+    def distance(self, pose: np.ndarray) -> np.ndarray:
+        """Return the distance of each pose to one [m], shape [s]."""
+        away = self.rotations - rotation_matrix(pose[3:])
+        # |R1 - R2| is sqrt(2) times the angle between them, where that is small.
+        turns = np.sqrt(0.5 * np.einsum("sij,sij->s", away, away))
+        return np.linalg.norm(self.positions - pose[:3], axis=1) + 0.3 * self.extent * turns
+
+    def spacing(self) -> float:
+        """Return the 90th percentile of the distance to the nearest other pose [m]."""
+        if len(self.positions) < 3:
+            return self.extent
+        from scipy.spatial.transform import Rotation
+
+        vectors = Rotation.from_matrix(self.rotations).as_rotvec()
+        nearest = [np.partition(self.distance(np.concatenate([position, vector])), 1)[1]
+                   for position, vector in zip(self.positions, vectors, strict=True)]
+        return float(np.percentile(nearest, 90))
+
+
+def as_control_points(model: BranchModel, points: Sequence[np.ndarray] | None = None,
+                      ) -> tuple[np.ndarray, np.ndarray]:
+    """Return weights [tet_count, K] and moduli [K] that give the model's Young's modulus.
+
+    Control points are the mesh's; where the field is not what they can give (or there are none)
+    it becomes one region with its own pattern, and only its level can change.
+    """
+    from limber.mechanics.young_field import young_weights
+
+    marks = model.mesh.point_data.get("control_point")
+    if points is None and marks is not None and (marks >= 0).any():
+        order = np.argsort(marks[marks >= 0])
+        points = model.mesh.nodes[np.flatnonzero(marks >= 0)[order]]
+    if points is not None:
+        weights = young_weights(model.mesh, np.asarray(points))
+        young = np.linalg.lstsq(weights, model.young, rcond=None)[0]
+        if (young > 0).all() and np.abs(weights @ young / model.young - 1).max() < 1e-6:
+            return weights, young
+    level = float(model.young.mean())
+    return (model.young / level)[:, None], np.array([level])

@@ -1,0 +1,1 @@
+"""Static equilibrium: path following, snaps, the unloaded rest shape."""

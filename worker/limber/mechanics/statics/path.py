@@ -1,0 +1,229 @@
+"""The way from a state in balance to the wanted one, in steps of adapted length."""
+
+import time
+
+import numpy as np
+
+from limber.mechanics.grasp import pose_between
+from limber.mechanics.linear.factor import NotPositiveDefiniteError
+from limber.mechanics.materials import Material
+from limber.mechanics.model import InternalState
+from limber.mechanics.statics.problem import Problem, Target, make_result, strain_warnings
+from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.statics.snap import settle
+from limber.mechanics.strain import principal_stretch
+from limber.progress import Progress
+
+_SOFT_DET_F = 0.75
+_SNAP = 1 / 64
+"""Part of the way taken when the branch has to snap."""
+
+
+class Path:
+    """The way from a start to a target, in steps of adapted length."""
+
+    def __init__(self, problem: Problem, begin: np.ndarray, goal: Target,
+                 pose: np.ndarray | None):
+        self.problem, self.goal, self.pose = problem, goal, pose
+        self.model, self.equations = problem.model, problem.equations
+        self.settings = problem.settings
+        self.started = time.perf_counter()
+        self.displacement = begin.copy()
+        self.state: InternalState = self.model.internal(begin)
+        # Imbalance of the start under the wanted loads: let go along the way.
+        self.imbalance = self.equations.free_part(goal.load - self.state.force)
+        self._begin_constraint(begin)
+        self.history: list[float] = []
+        self.iterations = 0
+        self.reached = 0.0
+        self.trouble = ""
+        # Where the branch had to snap, as part of the way, and whether it buckled there.
+        self.snaps: list[tuple[float, bool]] = []
+        self.status = "stalled"
+
+    def _begin_constraint(self, begin: np.ndarray) -> None:
+        problem, nodes = self.problem, self.model.mesh.nodes
+        self.begin_poses = None
+        self.begin_pins = np.array([g.weights @ begin[g.nodes] for g in self.equations.pinned]
+                                   ).reshape(-1, 3)
+        self.begin_rest = np.where(self.equations.held[:, None], begin, 0.0)
+        if self.pose is not None:
+            self.end_poses = problem.poses(self.pose)
+            self.begin_poses = [g.pose_of(nodes, begin) for g in problem.grasps]
+            rigid, _ = problem.constraint(self.begin_poses)
+            # What of the start is not rigid goes away along the way as well.
+            self.begin_rest = self.begin_rest - rigid
+
+    def constraint_at(self, part: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return displacements of held nodes and pinned means at ``part`` of the way."""
+        pins = self.begin_pins + part * (self.goal.pins - self.begin_pins)
+        if part >= 1.0:
+            return self.goal.held, self.goal.pins
+        if self.begin_poses is None:
+            return self.begin_rest + part * (self.goal.held - self.begin_rest), pins
+        poses = [pose_between(a, b, part)
+                 for a, b in zip(self.begin_poses, self.end_poses, strict=True)]
+        return self.problem.constraint(poses)[0] + (1 - part) * self.begin_rest, pins
+
+    def run(self, progress: Progress) -> StaticResult:
+        step = 1.0
+        while self.reached < 1.0:
+            progress(self.reached, "seeking equilibrium", iteration=self.iterations)
+            part = min(1.0, self.reached + step)
+            before = self.iterations
+            taken = self._step(part)
+            if taken is None:
+                step = (part - self.reached) / 2
+                if step < self.settings.min_step:
+                    taken = settle(self, min(1.0, self.reached + _SNAP))
+                    if taken is None:
+                        return self._result(False)
+                    self.reached, step = self.reached + taken, _SNAP
+                continue
+            quick = self.iterations - before <= 6
+            step = max(taken, step) * (2.0 if quick else 1.0) if taken == part - self.reached \
+                else taken * (1.5 if quick else 1.0)
+            self.reached += taken
+            if self.reached > 1 - 1e-12:
+                self.reached = 1.0
+        self.status = "converged"
+        return self._result(True)
+
+    def _step(self, part: float) -> float | None:
+        """Try a step to ``part`` of the way; return the length taken, None if it failed."""
+        settings, equations, held = self.settings, self.equations, self.equations.held
+        try:
+            equations.assemble(self.model, self.displacement)
+            equations.factorise()
+        except NotPositiveDefiniteError:
+            self.trouble = "the stiffness has no positive pivots"
+            return None
+        target, pins = self.constraint_at(part)
+        increment = self._predict(target, pins, part)
+        longest = np.linalg.norm(increment, axis=1).max()
+        limit = settings.max_step * self.model.extent
+        if longest > limit:
+            part = self.reached + (part - self.reached) * limit / longest
+            target, pins = self.constraint_at(part)
+            increment = self._predict(target, pins, part)
+        trial = self.displacement + increment
+        trial[held] = target[held]
+        return self.correct(trial, increment, part)
+
+    def load_at(self, part: float) -> np.ndarray:
+        return self.goal.load - (1.0 - part) * self.imbalance
+
+    def _predict(self, target: np.ndarray, pins: np.ndarray, part: float) -> np.ndarray:
+        equations, held = self.equations, self.equations.held
+        moved = np.where(held[:, None], target - self.displacement, 0.0)
+        right = self.load_at(part) - self.state.force
+        if moved.any():
+            right = right - self.model.tangent_times(self.displacement, moved)
+        now = np.array([g.weights @ self.displacement[g.nodes] for g in equations.pinned])
+        return equations.solve(right, pins - now.reshape(-1, 3)) + moved
+
+    def correct(self, trial: np.ndarray, increment: np.ndarray, part: float) -> float | None:
+        settings, equations = self.settings, self.equations
+        load = self.load_at(part)
+        best, worse = np.inf, 0
+        stable = True
+        for _ in range(settings.max_iterations):
+            state = self.model.internal(trial)
+            out = load - state.force
+            residual = equations.free_part(out)
+            norm = float(np.linalg.norm(residual))
+            if not np.isfinite(norm):
+                self.trouble = "the displacements grew without bound"
+                return None
+            reference = float(np.linalg.norm(out - residual) + np.linalg.norm(load))
+            self.history.append(norm / reference if reference else 0.0)
+            if norm <= max(settings.tolerance * reference, self._floor()):
+                return self._accept(trial, state, part, stable)
+            worse = worse + 1 if norm > 0.9 * best else 0
+            best = min(best, norm)
+            if worse > 5:
+                self.trouble = "Newton's iteration does not converge"
+                return None
+            self.iterations += 1
+            try:
+                equations.assemble(self.model, trial,
+                                   increment=increment if self.problem.mixed else None)
+                stable = equations.factorise()
+            except NotPositiveDefiniteError:
+                self.trouble = "the stiffness has no positive pivots"
+                return None
+            increment = equations.solve(residual)
+            if not self.problem.mixed:
+                increment = self._searched(trial, increment, load, residual)
+            trial = trial + increment
+        self.trouble = f"no convergence in {settings.max_iterations} iterations"
+        return None
+
+    def _searched(self, trial: np.ndarray, increment: np.ndarray, load: np.ndarray,
+                  residual: np.ndarray) -> np.ndarray:
+        """Return the increment, shortened until the work of the residual along it has fallen."""
+        slope = float((residual * increment).sum())
+        length = 1.0
+        for _ in range(8):
+            state = self.model.internal(trial + length * increment)
+            left = float((self.equations.free_part(load - state.force) * increment).sum())
+            if abs(left) < 0.9 * abs(slope) and np.isfinite(left):
+                break
+            length *= 0.5
+        return length * increment
+
+    def _floor(self) -> float:
+        # Differences of displacements in an element carry round-off of about one unit each.
+        return 8 * np.finfo(float).eps * self.equations.diagonal_norm() * self.model.mean_edge
+
+    def _accept(self, trial: np.ndarray, state: InternalState, part: float,
+                stable: bool) -> float | None:
+        if state.min_det_f <= 0:
+            self.status, self.trouble = "inverted", "an element would turn inside out"
+            return None
+        if not stable and not self._is_stable(trial):
+            self.status, self.trouble = "unstable", "the equilibrium found is not stable"
+            return None
+        if (stretch := principal_stretch(self.model, trial)).value > self.settings.stretch_limit:
+            self.status = "torn"
+            self.trouble = f"stretched to {100 * stretch.value:.0f} % of its length {stretch.at}"
+            return None
+        self.displacement, self.state = trial, state
+        taken = part - self.reached
+        self.status = "stalled"
+        return taken
+
+    def _is_stable(self, trial: np.ndarray) -> bool:
+        self.equations.assemble(self.model, trial)
+        return self.equations.factorise()
+
+    def _result(self, converged: bool) -> StaticResult:
+        stretch = principal_stretch(self.model, self.displacement)
+        message = "" if converged else (
+            f"{self.trouble}; stopped at {100 * self.reached:.1f} % of the way, where the branch"
+            f" is stretched most {stretch.at} ({100 * (stretch.value - 1):.1f} %)"
+            + self._softening())
+        warnings = strain_warnings(stretch) + buckling_warnings(self.snaps)
+        load = self.load_at(self.reached)
+        return make_result(self.problem, self.displacement, self.state, load, converged=converged,
+                           status=self.status, message=message, warnings=warnings,
+                           iterations=self.iterations, residual_history=self.history,
+                           seconds=time.perf_counter() - self.started, reached=self.reached,
+                           snapped_at=[part for part, _ in self.snaps])
+
+    def _softening(self) -> str:
+        """Say so where the material, not the branch, is what gives way."""
+        if (self.model.material != Material.st_venant_kirchhoff
+                or self.state.min_det_f > _SOFT_DET_F):
+            return ""
+        return (f"; it is compressed to {100 * self.state.min_det_f:.0f} % of its volume, where St."
+                " Venant-Kirchhoff goes soft: stable_neo_hookean bears more")
+
+
+def buckling_warnings(snaps: list[tuple[float, bool]]) -> list[str]:
+    """Return a warning if the branch left a saddle on the way, else nothing."""
+    where = [f"{100 * part:.0f} %" for part, buckled in snaps if buckled]
+    if not where:
+        return []
+    return [f"A straight part buckled at {where[0]} of the way: to which side is chance, another"
+            " equilibrium of about the same energy exists."]

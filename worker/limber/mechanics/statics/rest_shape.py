@@ -1,0 +1,182 @@
+"""The stress-free shape of a branch that was scanned while it sagged (inverse statics).
+
+In the scanned shape x the load must balance the stress, and what is sought is the rest shape X
+that it is strained from (Govindjee and Mihalic 1996). At fixed x a change e of X changes the
+strain alone, not the geometry, so the derivative of the imbalance has no geometric stiffness:
+the inverse problem is a benign one however far the branch sags, where turning the miss of loaded
+candidates back (a fixed point) diverges. Newton's step solves K_material d = imbalance on x, and
+d is pulled back to X through its gradient: grad e = -F^-1 grad d in least squares.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.errors import ConvergenceError, InputError
+from limber.geometry.tets.tet_mesh import EDGES, TetMesh
+from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.linear.factor import NotPositiveDefiniteError
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
+from limber.mechanics.strain import deformation_gradients
+from limber.progress import SILENT, Progress
+
+_MAX_ITERATIONS = 40
+_MAX_UNLOADING = 100
+_LARGEST_TURN = 0.15
+"""Largest gradient of a Newton step: more load is taken off in several."""
+_AWAY = 0.02
+"""Way of a loaded candidate off the scan, as part of the extent, that stability is doubted at."""
+_BALANCED = 1e-4
+"""Largest gradient of a step after which the part that is off counts as balanced."""
+
+
+def unloaded_rest_shape(model: BranchModel, *, tolerance: float = 1e-6,
+                        start: np.ndarray | None = None,
+                        progress: Progress = SILENT) -> TetMesh:
+    """Return the mesh without load, such that the model's loads bend it to the model's mesh.
+
+    Sides stay straight, so middle nodes meet the scan but for the curvature within an element
+    (micrometres); corner nodes meet it within the tolerance.
+
+    Args:
+        model: Its mesh is the scanned, loaded shape; gravity and added masses are the loads.
+        tolerance: Largest miss of a corner node [m].
+        start: Rest positions to begin with [m], shape [node_count, 3]: those found with another
+            Young's modulus, for example.
+
+    Raises:
+        ConvergenceError: no rest shape; the branch may be too soft to carry itself.
+    """
+    search = _Search(model, progress)
+    rest = search.unloaded(model.mesh.nodes.copy() if start is None else np.array(start, float))
+    return replace(model.mesh, nodes=search.refined(rest, tolerance))
+
+
+class _Search:
+    """Seeks the rest positions of one scan."""
+
+    def __init__(self, model: BranchModel, progress: Progress):
+        self.model, self.progress = model, progress
+        self.scan = model.mesh.nodes
+        self.corners = np.unique(model.mesh.tets[:, :4])
+
+    def unloaded(self, rest: np.ndarray) -> np.ndarray:
+        """Return rest positions in balance with the scan, taking the load on bit by bit."""
+        for number in range(_MAX_UNLOADING):
+            self.progress(min(0.7, number / 40), "seeking the rest shape", step=number)
+            step = self._step(rest, self.scan)
+            turn = float(np.abs(_gradients(self.model, step)).max())
+            rest = rest + min(1.0, _LARGEST_TURN / max(turn, 1e-30)) * step
+            if turn <= _BALANCED:
+                return rest
+        raise ConvergenceError(
+            f"No rest shape: after {_MAX_UNLOADING} steps the scan is not in balance.",
+            "The branch is too soft to carry itself in the scanned shape.",
+            "Check Young's modulus, density and gravity.")
+
+    def refined(self, rest: np.ndarray, tolerance: float) -> np.ndarray:
+        """Return rest positions that the load bends to the scan, by solving the loaded shape."""
+        target, misses = self.scan.copy(), []
+        settings = StaticSettings()
+        for number in range(_MAX_ITERATIONS):
+            found = self._loaded(rest, target, settings)
+            reached = rest + found.displacement
+            miss = reached - self.scan
+            misses.append(float(np.linalg.norm(miss[self.corners], axis=1).max()))
+            self.progress(min(0.99, 0.7 + 0.03 * number), "seeking the rest shape",
+                          miss=misses[-1])
+            if misses[-1] <= tolerance:
+                self.progress(1.0, "seeking the rest shape", miss=misses[-1])
+                return rest
+            if len(misses) > 5 and misses[-1] > 0.95 * misses[-4]:
+                break
+            # Corners belong on the scan; middle nodes keep the bow of the loaded shape.
+            target = reached - _straight(self.model.mesh, miss)
+            rest = rest + self._step(rest, target)
+        raise ConvergenceError(
+            "No rest shape: the loaded candidate still misses the scan by"
+            f" {1000 * misses[-1]:.2f} mm.",
+            "The branch may be too soft to carry itself in this shape.",
+            "Check Young's modulus, density and gravity.")
+
+    def _step(self, rest: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Return Newton's change of the rest positions [m], sides kept straight."""
+        candidate = self._at(rest)
+        u = target - rest
+        equations = candidate.equations()
+        # Minus the strain itself as a constant part: stress 0, so no geometric stiffness.
+        no_stress = Viscous(1.0, -candidate.strains(u))
+        equations.assemble(candidate, u, viscous=no_stress)
+        try:
+            equations.factorise()
+        except NotPositiveDefiniteError as error:
+            raise _too_soft("The material stiffness is not positive.") from error
+        out = equations.free_part(candidate.weight_force - candidate.internal(u).force)
+        moved = equations.solve(out)
+        inverse = np.linalg.inv(deformation_gradients(candidate, u))
+        wanted = -inverse @ _gradients(candidate, moved)
+        return _straight(self.model.mesh, _integrated(candidate, wanted))
+
+    def _loaded(self, rest: np.ndarray, target: np.ndarray,
+                settings: StaticSettings) -> StaticResult:
+        candidate = self._at(rest)
+        found = solve_static(candidate, start=target - rest, settings=settings)
+        away = np.linalg.norm(rest + found.displacement - target, axis=1).max()
+        if not found.converged or away > _AWAY * self.model.extent:
+            self._check_stable(candidate, target - rest)
+            found = solve_static(candidate, settings=settings)
+        return found.require()
+
+    def _check_stable(self, candidate: BranchModel, displacement: np.ndarray) -> None:
+        equations = candidate.equations()
+        equations.assemble(candidate, displacement)
+        if not equations.factorise():
+            raise ConvergenceError(
+                "No rest shape: a shape is in balance with the scan under its load, but not stably"
+                " so: it would fall or roll over.",
+                "The branch is too soft to stay in the scanned shape.",
+                "Check Young's modulus, density and gravity.")
+
+    def _at(self, rest: np.ndarray) -> BranchModel:
+        try:
+            return self.model.with_rest_nodes(rest)
+        except InputError as error:
+            raise _too_soft(f"On the way to it elements turn inside out. {error.seen}") from error
+
+
+def _too_soft(why: str) -> ConvergenceError:
+    return ConvergenceError(f"No rest shape. {why}",
+                            "The branch is too soft to carry itself in the scanned shape.",
+                            "Check Young's modulus, density and gravity.")
+
+
+def _gradients(model: BranchModel, field: np.ndarray) -> np.ndarray:
+    """Return the gradient of a nodal field at all quadrature points, shape [tets, q, 3, 3]."""
+    return np.swapaxes(np.matmul(model.gradients, field[model.mesh.tets][:, None]), 2, 3)
+
+
+def _integrated(model: BranchModel, gradient: np.ndarray) -> np.ndarray:
+    """Return the field, 0 at fixed nodes, whose gradient is nearest in least squares."""
+    from scipy.sparse.linalg import splu
+
+    from limber.mechanics.reduced.basis import gradient_metric
+
+    mesh = model.mesh
+    right = np.zeros_like(mesh.nodes)
+    np.add.at(right, mesh.tets, np.einsum("eq,eqij,eqjn->eni", model.weights, gradient,
+                                          model.gradients, optimize=True))
+    free = np.flatnonzero(~model.fixed)
+    metric = gradient_metric(model).tocsc()[free][:, free]
+    field = np.zeros_like(right)
+    field[free] = splu(metric, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+                       ).solve(right[free])
+    return field
+
+
+def _straight(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:
+    """Return a nodal field that is linear between the corners of each tetrahedron."""
+    if mesh.is_quadratic:
+        nodes = nodes.copy()
+        nodes[mesh.tets[:, 4:]] = nodes[mesh.tets[:, EDGES]].mean(axis=2)
+    return nodes

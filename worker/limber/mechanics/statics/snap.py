@@ -1,0 +1,127 @@
+"""Where a path of stable equilibria ends: a column buckles, a bow turns over.
+
+No small step leads on there. The branch creeps, as through honey, to where it comes to rest; if
+that is a saddle (a straight column under too much load) it is pushed off along the mode in which
+the tangent stiffness is negative, and creeps on down to the bent state.
+"""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from limber.mechanics.linear.equations import Equations
+from limber.mechanics.linear.factor import NotPositiveDefiniteError
+from limber.mechanics.materials import Material
+from limber.mechanics.model import BranchModel
+
+if TYPE_CHECKING:
+    from limber.mechanics.statics.path import Path
+
+_FIRST_DRAG = 1e-5
+_CREEPS = 60
+_CREEP_ITERATIONS = 9
+_RESTING = 1e-2
+_PUSHES = 3
+_PUSH = 2e-3
+"""How far a column is pushed off its saddle, as part of the branch's extent."""
+_MODE_ITERATIONS = 30
+
+
+def settle(path: "Path", part: float) -> float | None:
+    """Let the branch snap to where it comes to rest at ``part`` of the way.
+
+    Each creep is a step of implicit Euler on the gradient flow of the potential, so it only ever
+    goes down. Return the length taken; None where the branch does not come to rest.
+    """
+    if path.model.material == Material.linear:
+        return None
+    target, pins = path.constraint_at(part)
+    load, before = path.load_at(part), (path.status, path.trouble)
+    trial, drag, pushes = path.displacement, _FIRST_DRAG, 0
+    for _ in range(_CREEPS):
+        crept = _creep(path, trial, target, pins, load, drag)
+        if crept is None:
+            drag *= 8
+            if drag > 1:
+                break
+            continue
+        trial, quick, error, stable = crept
+        if error < _RESTING and not stable and pushes < _PUSHES:
+            trial, pushed = pushed_off(path.model, path.equations, trial, load)
+            pushes += pushed
+        elif error < _RESTING and stable:
+            taken = path.correct(trial, np.zeros_like(trial), part)
+            if taken is not None:
+                path.snaps.append((path.reached + taken, pushes > 0))
+                return taken
+        drag *= 0.25 if quick else 0.7
+    path.status, path.trouble = before
+    return None
+
+
+def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray,
+           load: np.ndarray, drag: float) -> tuple[np.ndarray, bool, float, bool] | None:
+    """Return the state after one creep, whether it was quick, its imbalance, stability."""
+    model, equations, held = path.model, path.equations, path.equations.held
+    moved = np.where(held[:, None], target - start, 0.0)
+    now = np.array([g.weights @ start[g.nodes] for g in equations.pinned]).reshape(-1, 3)
+    trial, increment, honey = start, None, 0.0
+    for count in range(_CREEP_ITERATIONS):
+        state = model.internal(trial)
+        out = load - state.force
+        pull = equations.free_part(out - honey * (trial - start))
+        norm = float(np.linalg.norm(pull))
+        reference = float(np.linalg.norm(out - equations.free_part(out)) + np.linalg.norm(load))
+        if not np.isfinite(norm):
+            return None
+        if increment is not None and norm <= 1e-4 * reference:
+            left = float(np.linalg.norm(equations.free_part(out)))
+            equations.assemble(model, trial)
+            return trial, count <= 4, left / reference, equations.factorise()
+        path.iterations += 1
+        try:
+            equations.assemble(model, trial, increment=increment)
+            honey = equations.raise_diagonal(drag)
+            if not equations.factorise():
+                return None
+        except NotPositiveDefiniteError:
+            return None
+        if increment is None:
+            right = out - model.tangent_times(start, moved) if moved.any() else out
+            increment = equations.solve(right, pins - now) + moved
+        else:
+            increment = equations.solve(pull)
+        trial = trial + increment
+    return None
+
+
+def pushed_off(model: BranchModel, equations: Equations, state: np.ndarray,
+               load: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Return a state pushed off a saddle, to the side where the potential falls more.
+
+    And whether there was a mode to push it along.
+    """
+    mode, curvature = lowest_mode(model, equations, state)
+    if curvature >= 0:
+        return state, False
+    push = _PUSH * model.extent * mode / np.linalg.norm(mode, axis=1).max()
+    sides = [state + push, state - push]
+    potentials = [model.internal(side).strain_energy - float((load * side).sum())
+                  for side in sides]
+    return sides[int(np.argmin(potentials))], True
+
+
+def lowest_mode(model: BranchModel, equations: Equations, state: np.ndarray,
+                ) -> tuple[np.ndarray, float]:
+    """Return the mode of least tangent stiffness [node_count, 3] and its stiffness [N/m].
+
+    Inverse iteration on the tangent whose diagonal was raised until it could be factorised:
+    raising moves no eigenvector. Its Rayleigh quotient is of the tangent itself.
+    """
+    equations.assemble(model, state)
+    equations.factorise()
+    mode = np.random.default_rng(0).normal(size=state.shape)
+    for _ in range(_MODE_ITERATIONS):
+        mode = equations.solve(mode)
+        mode /= np.linalg.norm(mode)
+    return mode, float((mode * model.tangent_times(state, mode)).sum())

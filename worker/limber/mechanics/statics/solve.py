@@ -1,0 +1,105 @@
+"""Static equilibrium: mixed-integration-point Newton along a path of small steps.
+
+The path leads from a state in balance to the wanted one: prescribed poses move, and the imbalance
+that the start has under the wanted loads is let go in proportion. Each step starts with a linear
+solve of the whole increment (tangent predictor); then Newton, whose geometric stiffness uses the
+stress that the last linearisation predicted (Magisano, Leonetti and Garcea 2017), which lets a
+slender branch take steps several times as long. A step that fails is halved.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from limber.mechanics.grasp import Grasp
+from limber.mechanics.model import BranchModel
+from limber.mechanics.statics.path import Path
+from limber.mechanics.statics.problem import Problem, Target
+from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
+from limber.progress import SILENT, Progress
+
+
+def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = None,
+                 pose: np.ndarray | None = None, grasp_force: np.ndarray | None = None,
+                 nodal_forces: np.ndarray | None = None,
+                 start: "StaticResult | np.ndarray | None" = None,
+                 settings: StaticSettings = DEFAULT_SETTINGS,
+                 progress: Progress = SILENT) -> StaticResult:
+    """Find the equilibrium of a branch; never raises for want of convergence.
+
+    Args:
+        grasp: The grasp, or several.
+        pose: Pose of the grasp [m, rad], shape [6] ([g, 6] for several). None: it is not held.
+        grasp_force: Force [N] of the gripper on the branch instead, spread over the patch,
+            shape [3] ([g, 3]).
+        nodal_forces: Dead loads [N], shape [node_count, 3], besides gravity.
+        start: State to start from; default the rest shape.
+
+    Raises:
+        InputError: arguments that do not fit each other.
+    """
+    problem = Problem(model, grasp, pose is not None, settings)
+    goal = problem.target(pose, grasp_force, nodal_forces)
+    begin = problem.displacement_of(start)
+    result = Path(problem, begin, goal, pose).run(progress)
+    if settings.verify and result.converged and start is not None:
+        return _verified(problem, result, goal, pose, progress)
+    return result
+
+
+def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.ndarray, *,
+                 nodal_forces: np.ndarray | None = None,
+                 start: "StaticResult | np.ndarray | None" = None,
+                 settings: StaticSettings = DEFAULT_SETTINGS,
+                 progress: Progress = SILENT) -> list[StaticResult]:
+    """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
+
+    After a pose that fails the next starts from the last converged state.
+    """
+    problem = Problem(model, grasp, True, settings)
+    displacement = problem.displacement_of(start)
+    results = []
+    for number, pose in enumerate(poses):
+        progress(number / len(poses), "following poses", pose=number)
+        goal = problem.target(pose, None, nodal_forces)
+        result = Path(problem, displacement, goal, pose).run(SILENT)
+        if settings.verify and result.converged:
+            result = _verified(problem, result, goal, pose, SILENT)
+        if result.converged:
+            displacement = result.displacement
+        results.append(result)
+    progress(1.0, "following poses")
+    return results
+
+
+def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
+                     nodal_forces: np.ndarray | None = None,
+                     settings: StaticSettings = DEFAULT_SETTINGS,
+                     ) -> StaticResult:
+    """Find the equilibrium with the model's fixed nodes moved by ``displacement``.
+
+    Args:
+        displacement: [m], shape [node_count, 3]; rows of nodes that are not fixed are unused.
+    """
+    problem = Problem(model, None, False, settings)
+    goal = problem.target(None, None, nodal_forces)
+    held = np.where(model.fixed[:, None], displacement, 0.0)
+    begin = np.zeros_like(held)
+    return Path(problem, begin, replace(goal, held=held), None).run(SILENT)
+
+
+def _verified(problem: Problem, result: StaticResult, goal: Target, pose: np.ndarray | None,
+              progress: Progress) -> StaticResult:
+    """Return the result, or, if a path from rest in small steps ends lower, a refusal."""
+    careful = replace(problem.settings, max_step=problem.settings.max_step / 4, verify=False)
+    other = Problem(problem.model, problem.grasps or None, problem.is_held, careful)
+    other.single = problem.single
+    again = Path(other, problem.displacement_of(None), goal, pose).run(progress)
+    lower = result.strain_energy - again.strain_energy
+    if again.converged and lower > 1e-3 * abs(again.strain_energy):
+        return replace(
+            result, converged=False, status="false_equilibrium",
+            message=f"energy {result.strain_energy:.6g} J, but {again.strain_energy:.6g} J on the"
+                    " way from rest: a false equilibrium")
+    return result

@@ -1,0 +1,1 @@
+"""Recordings of pulls: formats, tables, alignment, registration, checks."""

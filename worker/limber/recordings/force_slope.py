@@ -1,0 +1,294 @@
+"""Force against displacement, as a load cell on an actuator gives it: how stiff, with interval."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from limber.errors import InputError
+from limber.recordings.streams import saturated
+from limber.recordings.tables import (
+    FORCE_UNITS_N,
+    LENGTH_UNITS_M,
+    Table,
+    read_table,
+    scale_of,
+    split_title,
+)
+
+NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
+"""Force over the unloaded reading that counts as contact [N]; a drop of twice as much is a slip."""
+STIFFENING = 0.3
+"""A slope that changes by more along the push is told."""
+
+WHY_NO_MODULUS = (
+    "A force slope is the stiffness of the whole structure below the contact: proportional to "
+    "Young's modulus times radius to the fourth power over length cubed. Radius along the branch "
+    "and where it is held are not in this file; a radius wrong by 10 % alone changes the modulus "
+    "by 40 %. Reconstruct the branch from a scan and import the pull with its grasp point to get "
+    "a modulus.")
+
+
+@dataclass(frozen=True)
+class ForceSlope:
+    """Stiffness seen by the actuator.
+
+    Attributes:
+        slope: [N/m] over the loaded part of the way out.
+        interval: Its 95 % interval [N/m]; wide enough for residuals that follow each other.
+        contact: Displacement at which force sets in [m], on the actuator's scale.
+        contact_seen: Whether the recording starts before contact.
+        baseline: Reading without load [N].
+        sample_count: Samples in the loaded part.
+        stiffening: Slope of the second half of the loaded part over that of the first, minus 1.
+        slips: Displacements at which the force drops at once [m].
+        slope_before_slip: [N/m] up to the first slip, or None where it does not slip.
+        return_slope: [N/m] of the way back, or None where there is none.
+        energy_lost: Share of the work of the way out that does not come back, or None.
+        warnings: What in the file is not as it should be.
+    """
+
+    slope: float
+    interval: tuple[float, float]
+    contact: float
+    contact_seen: bool
+    baseline: float
+    sample_count: int
+    stiffening: float | None
+    slips: tuple[float, ...] = ()
+    slope_before_slip: float | None = None
+    return_slope: float | None = None
+    energy_lost: float | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: str | None = None,
+                            ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Read displacement [m] and force [N] in the file's order; units are those of the header.
+
+    Columns are found by name: ``Load Cell Reading (gf)`` or ``force [N]``, ``Displacement (mm)``,
+    with any separator and preamble. Rows that are not complete are dropped with a warning.
+
+    Args:
+        path: The file.
+        unit: Of the displacement, instead of the header's.
+        force_unit: Of the force, instead of the header's.
+
+    Raises:
+        InputError: a column or its unit is missing, or under 5 rows are left.
+    """
+    table = read_table(path)
+    force_at, force_scale = _column(table, r"force|load", FORCE_UNITS_N, force_unit)
+    moved_at, moved_scale = _column(table, r"displacement|travel|position|stroke|deflection",
+                                    LENGTH_UNITS_M, unit)
+    pairs = table.values[:, [moved_at, force_at]]
+    kept = pairs[np.isfinite(pairs).all(axis=1)]
+    warnings = list(table.warnings)
+    if len(kept) < len(pairs):
+        warnings.append(f"{path.name}: {len(pairs) - len(kept)} incomplete row(s) were dropped.")
+    if len(kept) < 5:
+        raise InputError(f"{path} has {len(kept)} complete rows.", "Five are needed for a slope.",
+                         "Record more of the push.")
+    return kept[:, 0] * moved_scale, kept[:, 1] * force_scale, tuple(warnings)
+
+
+def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[str, ...] = (),
+                ) -> ForceSlope:
+    """Fit contact and slope of the way out, and the slope of the way back where there is one.
+
+    Contact is the bend of a constant followed by a line. The slope is that of a straight line
+    through what lies over contact and the sensor's noise; its standard error allows for residuals
+    that are not independent, as a curved response or a slip leaves them.
+
+    Args:
+        displacement: [m], shape [n], in the order of time.
+        force: [N], shape [n].
+        warnings: What is known to be wrong already; handed on.
+
+    Raises:
+        InputError: the force never rises out of the noise.
+    """
+    messages = list(warnings)
+    moved, force = _in_range(np.asarray(displacement, float), np.asarray(force, float), messages)
+    moved, force = _oriented(moved, force, messages)
+    out, back = _ways(moved)
+    x, y = _sorted(moved[out], force[out])
+    contact, baseline = _contact(x, y)
+    loaded = (x > contact) & (y > baseline + NOISE_FLOOR_N)
+    if loaded.sum() < 4:
+        raise InputError(
+            f"The force rises by {np.ptp(y):.3g} N over {np.ptp(x) * 1e3:.3g} mm.",
+            f"Fewer than 4 samples lie over the noise of {NOISE_FLOOR_N:.2g} N.",
+            "Push farther, or use a more sensitive sensor.")
+    contact_seen = bool(contact > x[0])
+    if not contact_seen:
+        messages.append("The first sample is loaded already: where contact was made, and the "
+                        "reading without load, are not in the file. The slope is.")
+    elif abs(baseline) > NOISE_FLOOR_N:
+        messages.append(f"The load cell reads {baseline:.3g} N without load: not tared. The slope "
+                        "does not depend on it.")
+    x, y = x[loaded], y[loaded]
+    slope, error = _line(x, y)
+    width = stats.t.ppf(0.975, len(x) - 2) * error
+    stiffening = _stiffening(x, y)
+    slips = _slips(x, y)
+    before = float(_line(x[:slips[0] + 1], y[:slips[0] + 1])[0]) if (
+        len(slips) and slips[0] >= 3) else None
+    if len(slips):
+        messages.append(
+            f"The force drops at once at {', '.join(f'{x[k] * 1e3:.1f}' for k in slips[:4])} mm: "
+            "the contact slipped, or wood gave way. "
+            + (f"Up to the first drop the slope is {before:.4g} N/m." if before else ""))
+    elif stiffening is not None and abs(stiffening) > STIFFENING:
+        messages.append(f"The slope changes by {100 * stiffening:+.0f} % along the push: a "
+                        "straight line is a coarse description of it.")
+    if slope <= 0:
+        messages.append("The force falls as the actuator advances: sign or slip?")
+    return ForceSlope(
+        float(slope), (float(slope - width), float(slope + width)), float(contact), contact_seen,
+        float(baseline), len(x), stiffening, tuple(float(x[k]) for k in slips), before,
+        *_return(moved[back], force[back], moved[out], force[out], contact, baseline),
+        warnings=tuple(messages))
+
+
+def _column(table: Table, name: str, units: dict[str, float], given: str | None,
+            ) -> tuple[int, float]:
+    for index, text in enumerate(table.titles):
+        title = split_title(text)
+        if not re.search(name, title.name, re.IGNORECASE):
+            continue
+        if given is not None:
+            return index, units[given]
+        if title.unit is None:
+            raise InputError(
+                f"{table.path}: the column {text!r} names no unit out of {', '.join(units)}.",
+                "A number without unit cannot be used.",
+                "Add it: 'Force (N)'; or give --unit and --force-unit.")
+        return index, scale_of(title, units, "", table.path)
+    raise InputError(f"{table.path} has the columns {', '.join(table.titles)}.",
+                     f"None is named like {name.replace('|', ' or ')}.", "Rename the column.")
+
+
+def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """Leave out readings at the sensor's limit and single ones far off."""
+    limited = saturated(force[:, None])
+    if limited.any() and limited.sum() < 0.8 * len(force):
+        messages.append(f"{int(limited.sum())} readings at {np.abs(force[limited]).max():.3g} N "
+                        "are alike: the load cell is saturated there; left out.")
+        moved, force = moved[~limited], force[~limited]
+    # One sample far from both neighbours, on the same side; a slip stays where it falls to.
+    before, after = force[1:-1] - force[:-2], force[1:-1] - force[2:]
+    jump = np.where(before * after > 0, np.minimum(np.abs(before), np.abs(after)), 0.0)
+    usual = np.median(np.abs(np.diff(force))) if len(force) > 1 else 0.0
+    stray = np.r_[False, jump > max(10 * usual, 2 * NOISE_FLOOR_N), False] if len(force) > 2 else (
+        np.zeros(len(force), bool))
+    if stray.any():
+        messages.append(f"{int(stray.sum())} spike(s) in the force, the first at "
+                        f"{moved[stray][0] * 1e3:.1f} mm; left out.")
+    return moved[~stray], force[~stray]
+
+
+def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """Turn signs so that the actuator advances and the body pushes back."""
+    far = int(np.argmax(np.abs(moved - moved[0])))
+    if moved[far] < moved[0]:
+        messages.append("The displacement counts downwards; it was turned.")
+        moved = -moved
+    far = int(np.argmax(moved))
+    change = force[:far + 1] - force[0]
+    # Work of the reading over its first one: negative where the sensor counts pressure negative.
+    work = float(np.sum((change[1:] + change[:-1]) / 2 * np.diff(moved[:far + 1])))
+    if work < 0 and change.min() < -NOISE_FLOOR_N and -change.min() > 3 * change.max():
+        messages.append("The reading falls as the actuator advances: by the work done, its sign "
+                        "is that of the force on the sensor. It was turned.")
+        force = -force
+    return moved, force
+
+
+def _ways(moved: np.ndarray) -> tuple[slice, slice]:
+    """The way out, up to the farthest sample, and the way back."""
+    far = int(np.argmax(moved))
+    # A hold at the end is no way back.
+    returns = moved[far] - moved[-1] > 0.05 * np.ptp(moved) and len(moved) - far > 5
+    return slice(0, far + 1 if returns else len(moved)), slice(
+        far if returns else len(moved), len(moved))
+
+
+def _sorted(moved: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(moved, kind="stable")
+    return moved[order], force[order]
+
+
+def _stiffening(x: np.ndarray, y: np.ndarray) -> float | None:
+    half = np.median(x)
+    if min(np.sum(x <= half), np.sum(x > half)) < 3:
+        return None
+    lower, upper = (np.polyfit(x[part], y[part], 1)[0] for part in (x <= half, x > half))
+    return float(upper / lower - 1) if lower > 0 else None
+
+
+def _slips(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Indices before which the force drops by more than sensor noise can make it."""
+    step = np.diff(y)
+    usual = 1.4826 * np.median(np.abs(step - np.median(step)))
+    return np.flatnonzero(step < -max(2 * NOISE_FLOOR_N, 6 * usual)) if len(x) > 4 else (
+        np.empty(0, int))
+
+
+def _return(moved: np.ndarray, force: np.ndarray, moved_out: np.ndarray, force_out: np.ndarray,
+            contact: float, baseline: float) -> tuple[float | None, float | None]:
+    """Slope [N/m] of the way back, and the share of the work that was lost."""
+    loaded = (moved > contact) & (force > baseline + NOISE_FLOOR_N)
+    if loaded.sum() < 4:
+        return None, None
+    slope = float(_line(*_sorted(moved[loaded], force[loaded]))[0])
+
+    def work(x: np.ndarray, y: np.ndarray) -> float:
+        x, y = _sorted(x, y)
+        over = np.maximum(y - baseline, 0.0)
+        shared = x >= max(contact, moved.min())
+        return float(np.sum((over[shared][1:] + over[shared][:-1]) / 2 * np.diff(x[shared])))
+    given = work(moved_out, force_out)
+    return slope, float(1 - work(moved, force) / given) if given > 0 else None
+
+
+def _contact(moved: np.ndarray, force: np.ndarray) -> tuple[float, float]:
+    """Displacement and reading at the bend of constant-then-quadratic, by search over samples."""
+    best = (np.inf, moved[0], force[0])
+    for place in moved[: max(len(moved) - 4, 1)]:
+        beyond = np.maximum(moved - place, 0.0)
+        features = np.column_stack([np.ones(len(moved)), beyond, beyond**2])
+        solved, *_ = np.linalg.lstsq(features, force, rcond=None)
+        cost = np.sum((force - features @ solved)**2)
+        if cost < best[0]:
+            best = (cost, place, solved[0])
+    return best[1], best[2]
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope and its standard error: Newey and West's, or that of a first-order autoregression.
+
+    The larger counts: the former is too small for few samples, the latter for long waves.
+    """
+    features = np.column_stack([np.ones(len(x)), x - x.mean()])
+    inverse = np.linalg.inv(features.T @ features)
+    solved = inverse @ features.T @ y
+    residual = y - features @ solved
+    scores = features * residual[:, None]
+    meat = scores.T @ scores
+    lags = min(int(np.ceil(4 * (len(x) / 100) ** (2 / 9))) + 1, len(x) - 2)
+    for lag in range(1, lags + 1):
+        cross = scores[lag:].T @ scores[:-lag]
+        meat += (1 - lag / (lags + 1)) * (cross + cross.T)
+    freedom = len(x) - 2
+    robust = (inverse @ meat @ inverse)[1, 1] * len(x) / freedom
+    square = float(residual @ residual)
+    follow = float(residual[1:] @ residual[:-1]) / square if square > 0 else 0.0
+    # Estimated from residuals, the correlation comes out too small by about this.
+    follow = np.clip(follow + (1 + 4 * follow) / len(x), 0.0, 0.95)
+    plain = inverse[1, 1] * square / freedom * (1 + follow) / (1 - follow)
+    return float(solved[1]), float(np.sqrt(max(robust, plain)))

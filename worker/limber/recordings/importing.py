@@ -1,0 +1,407 @@
+"""Recordings of other programs into ``pulls/NAME``: marker tables, C3D, clouds, RGB-D folders."""
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from limber.errors import InputError
+from limber.estimation.forward.hung_load import settled
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.progress import SILENT, Progress
+from limber.recordings.alignment import estimate_offset
+from limber.recordings.checks import clean
+from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
+from limber.recordings.frames import copy_clouds, copy_rgbd
+from limber.recordings.recording import (
+    POSE_COLUMNS,
+    WRENCH_COLUMNS,
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+    read_pull,
+    write_entry,
+    write_pull,
+)
+from limber.recordings.registration import Registration, read_nominal, register
+from limber.recordings.streams import Stream
+from limber.recordings.tables import (
+    LENGTH_UNITS_M,
+    marker_stream,
+    read_table,
+    robot_stream,
+    split_title,
+    with_columns,
+)
+from limber.store import Branch, file_digest
+
+Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement"]
+
+
+class ImportSettings(BaseModel):
+    """How to read a recording."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Kind = Field("auto", description="What SOURCE is; auto goes by its name and content.")
+    robot: str | None = Field(None, description="CSV of the gripper: time, pose and wrench.")
+    unit: Literal["m", "cm", "mm"] | None = Field(
+        None, description="Unit of positions in SOURCE; without it that of the columns' names, "
+        "else metres.")
+    force_unit: Literal["N", "gf", "mN", "lbf", "kgf", "kN"] | None = Field(
+        None, description="Unit of forces; without it that of the columns' names, else newtons.")
+    rate_hz: float | None = Field(
+        None, gt=0, description="Frames a second, where SOURCE has no time stamps.")
+    nominal: str | None = Field(
+        None, description="CSV label,x_m,y_m,z_m: the markers' places on the branch at rest; the "
+        "recording's first frames are fitted to it rigidly.")
+    coordinates: Literal["branch", "scan"] = Field(
+        "branch", description="Frame of --nominal, --grasp-point and --load: the branch folder's, "
+        "or that of the file it was made from.")
+    grasp_point: tuple[float, float, float] | None = Field(
+        None, description="Where the gripper holds or the load hangs, at rest [m]; else the "
+        "robot's first pose.")
+    grasp_radius: float = Field(0.01, gt=0, description="Radius of the grasp patch [m].")
+    grasp_mode: Literal["clamped", "pinned"] = Field(
+        "clamped", description="clamped: the gripper also turns the branch.")
+    weight: float | None = Field(
+        None, ge=0, description="No robot, but a weight of so many newtons that hangs at "
+        "--grasp-point: SOURCE shows the branch without it first, at rest under it last.")
+    load: tuple[float, float, float] | None = Field(
+        None, description="The same for a steady force in any direction [N].")
+    own_weight: bool = Field(
+        False, description="The branch's own weight is not in its shape at rest (it was held up, "
+        "or scanned lying): it acts as well.")
+    drive: Literal["pose", "force"] = Field(
+        "pose", description="What drives the simulation; the other is compared with it.")
+    motion: Literal["quasi_static", "dynamic"] = Field(
+        "quasi_static", description="dynamic where inertia matters.")
+    time_offset: float | None = Field(
+        None, description="Added to SOURCE's time stamps [s]; without it, it is estimated.")
+    position_sigma: float | None = Field(
+        None, gt=0, description="Noise of positions [m]; without it 1 mm, under a steady load "
+        "what the recording shows.")
+    force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
+    torque_sigma: float | None = Field(
+        None, gt=0, description="Noise of torques about the pose's position [N m]; a clamped "
+        "gripper's torque is used only where this is known.")
+    yolo_weights: str | None = Field(
+        None, description="Weights file of a YOLO segmentation model of your own, for masks of "
+        "an RGB-D folder's colour images (needs ultralytics).")
+    yolo_prompt: str | None = Field(
+        None, description="What it shall look for, for open-vocabulary models.")
+    yolo_class: str | None = Field(None, description="Which of its classes is the branch.")
+
+
+def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
+                force: bool = False, progress: Progress = SILENT, warn: Any = lambda text: None,
+                ) -> dict[str, Any]:
+    """Bring a recording into ``pulls/NAME`` of a branch folder.
+
+    Returns:
+        ``pull``, ``kind``, ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
+        load ``displacement_m``, ``settled_s`` and ``registration_rms_m``; of a force table
+        ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
+
+    Raises:
+        InputError: SOURCE cannot be read as what it is said to be.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
+    kind = _guess(source) if settings.kind == "auto" else settings.kind
+    branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
+    key, digests = f"pull:{name}", {"source": _digest(source)}
+    for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
+                          ("yolo", settings.yolo_weights)):
+        if named and Path(named).is_file():
+            digests[key_of] = _digest(Path(named))
+    if not force and branch.is_current(key, settings, digests=digests):
+        return branch.manifest.stages[key].result
+    with branch.stage(key, settings, digests=digests) as stage:
+        prefix = f"pulls/{name}/"
+        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+            stage.remove(old)
+        folder = stage.path(prefix + "pull.toml").parent
+        progress(0.1, f"reading {kind}")
+        if kind == "force-displacement":
+            stage.result.update(_import_force_table(source, folder, settings, warn))
+        elif settings.weight is not None or settings.load is not None:
+            stage.result.update(_import_load(kind, source, folder, name, settings, branch, warn))
+        else:
+            stage.result.update(_import_motion(kind, source, folder, name, settings, branch,
+                                               warn, progress.part(0.1, 1.0)))
+        stage.result |= {"pull": name, "kind": kind}
+    return stage.result
+
+
+def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
+    """Read the points of a C3D file [m], and their labels.
+
+    Raises:
+        InputError: not a C3D file, or one without points.
+    """
+    import ezc3d
+
+    try:
+        data = ezc3d.c3d(str(path))
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as C3D ({error}).",
+                         "Marker tracks were expected.", "Check the file.") from error
+    points = data["data"]["points"][:3]
+    if not points.size:
+        raise InputError(f"{path} has no points.", "Marker tracks were expected.",
+                         "Export the trajectories as well.")
+    unit = (data["parameters"]["POINT"].get("UNITS", {}).get("value") or ["mm"])[0].strip()
+    scale = LENGTH_UNITS_M.get(unit.lower(), 1e-3)
+    labels = [str(label) for label in data["parameters"]["POINT"]["LABELS"]["value"]]
+    rate = float(data["header"]["points"]["frame_rate"])
+    positions = np.moveaxis(points, 0, -1).transpose(1, 0, 2) * scale
+    # An unseen marker is written as (0, 0, 0) by many programs, as NaN by others.
+    positions[np.all(positions == 0.0, axis=2)] = np.nan
+    times = np.arange(len(positions)) / rate
+    names = tuple(f"m{k}_{axis}_m" for k in range(positions.shape[1]) for axis in "xyz")
+    return Stream(times, positions.reshape(len(times), -1), names), labels[:positions.shape[1]]
+
+
+def _guess(source: Path) -> str:
+    if source.is_dir():
+        if (source / "pull.toml").exists():
+            return "pull"
+        if (source / "depth").is_dir():
+            return "rgbd"
+        return "clouds"
+    if source.suffix.lower() == ".c3d":
+        return "c3d"
+    try:
+        names = [split_title(title).name.lower() for title in read_table(source).titles]
+    except InputError:
+        return "markers"
+    moved = any(re.search(r"displacement|travel|stroke|deflection", name) for name in names)
+    forced = any(re.search(r"force|load", name) for name in names)
+    return "force-displacement" if moved and forced else "markers"
+
+
+def _digest(path: Path) -> str:
+    if path.is_file():
+        return file_digest(path)
+    import hashlib
+
+    joined = hashlib.sha256()
+    for file in sorted(path.rglob("*")):
+        if file.is_file():
+            joined.update(file.relative_to(path).as_posix().encode() + file_digest(file).encode())
+    return joined.hexdigest()
+
+
+def _import_force_table(source: Path, folder: Path, settings: ImportSettings, warn: Any,
+                        ) -> dict[str, Any]:
+    displacement, force, warnings = read_force_displacement(
+        source, unit=settings.unit, force_unit=settings.force_unit)
+    found = force_slope(displacement, force, warnings=warnings)
+    for message in found.warnings:
+        warn(message)
+    warn(f"No modulus from {source.name}. {WHY_NO_MODULUS}")
+    table = np.column_stack([displacement, force])
+    np.savetxt(folder / "force.csv", table, "%.9g", ",", header="displacement_m,force_n",
+               comments="")
+    return {"slope_n_per_m": found.slope, "slope_interval_n_per_m": list(found.interval),
+            "contact_m": found.contact, "contact_seen": found.contact_seen,
+            "baseline_n": found.baseline, "stiffening": found.stiffening,
+            "slips_m": list(found.slips), "slope_before_slip_n_per_m": found.slope_before_slip,
+            "return_slope_n_per_m": found.return_slope, "energy_lost": found.energy_lost,
+            "frame_count": len(force), "why_no_modulus": WHY_NO_MODULUS}
+
+
+def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
+                   branch: Branch, warn: Any, progress: Progress) -> dict[str, Any]:
+    if kind == "pull":
+        shutil.copytree(source, folder, dirs_exist_ok=True)
+        pull = read_pull(folder)
+    else:
+        pull = _assembled(kind, source, folder, name, settings, branch, progress)
+        write_pull(folder, pull)
+    cleaned = clean(pull)
+    for message in cleaned.warnings:
+        warn(message)
+    entry = pull.entry
+    if kind != "pull" and settings.time_offset is None and cleaned.observations is not None:
+        entry = _with_offset(cleaned, warn)
+        write_entry(folder / "pull.toml", entry)
+    seen = cleaned.observations
+    return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
+            "point_count": seen.point_count if seen is not None else 0,
+            "time_offset_s": entry.time_offset_s}
+
+
+def _with_offset(pull: Pull, warn: Any) -> PullEntry:
+    """The pull's entry with the clocks' offset, as far as the recording tells it."""
+    seen, offset = pull.observations.times, 0.0
+    if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
+        offset = float(pull.times[0] - seen[0])
+        warn(f"{pull.name}: the two clocks have no moment in common; the recordings were taken to "
+             "start together, and the offset was estimated from there.")
+    entry = pull.entry.model_copy(update={"time_offset_s": offset})
+    found, sigma = estimate_offset(replace(pull, entry=entry))
+    if sigma < 0.02:
+        return entry.model_copy(update={"time_offset_s": found})
+    warn(f"{pull.name}: the clocks' offset cannot be told from this pull; {offset:g} s was taken.")
+    return entry
+
+
+def _import_load(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
+                 branch: Branch, warn: Any) -> dict[str, Any]:
+    """A pull of a few frames from a recording of a branch that a steady load bends."""
+    if kind not in ("markers", "c3d"):
+        raise InputError(f"A steady load was given, but {source.name} is {kind}.",
+                         "Its rest is found in marker tracks.", "Give a CSV or C3D of markers.")
+    if settings.weight is not None and settings.load is not None:
+        raise InputError("Both --weight and --load were given.", "One load hangs on the branch.",
+                         "Give one of them.")
+    if settings.grasp_point is None:
+        raise InputError("A load was given, but not where it hangs.",
+                         "How far it bends the branch depends on that.", "Give --grasp-point.")
+    seen, labels = _markers(kind, source, settings)
+    for message in seen.warnings:
+        warn(message)
+    still = settled(Observations(seen.times, seen.values.reshape(len(seen), -1, 3)), name)
+    placed = _registered(still.rest, labels, name, settings, branch)
+    used = placed.used if placed else np.flatnonzero(np.isfinite(still.rest).all(axis=1))
+    rest, positions = still.rest[used], still.positions[:, used]
+    if placed:
+        rest, positions = placed.apply(rest), placed.apply(positions)
+    for message in (*still.warnings, *(placed.warnings if placed else ())):
+        warn(message)
+    _require_near(rest, name, branch)
+    sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
+    load = _load(settings, branch)
+    entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
+                   grasp=_place(settings.grasp_point, settings, branch), sigma=sigma)
+    poses = np.zeros((2, 6))
+    poses[:, :3] = entry.grasp.point_m
+    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
+    write_pull(folder, Pull(name, entry, still.times[[0, -1]], poses, wrenches,
+                            Observations(still.times, positions)))
+    moved = positions[-1] - rest
+    if suspicion := _against(moved, load):
+        warn(f"{name}: {suspicion}")
+    return {"frame_count": len(still.times), "point_count": len(used), "time_offset_s": 0.0,
+            "labels": [labels[k] for k in used], "load_n": load.tolist(),
+            "displacement_m": moved.tolist(), "settled_s": still.duration,
+            "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
+
+
+def _require_near(rest: np.ndarray, name: str, branch: Branch) -> None:
+    """Refuse markers that lie elsewhere than the branch, as those of a capture's own frame do.
+
+    Raises:
+        InputError: one is farther from the mesh than a quarter of its extent.
+    """
+    nodes = TetMesh.read(branch.require("mesh.vtu", "reconstruct")).nodes
+    off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in rest])
+    extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    if off.max() > 0.25 * extent:
+        raise InputError(
+            f"{name}: at rest a marker lies {off.max() * 1e3:.0f} mm from the branch, which is "
+            f"{extent * 1e3:.0f} mm long.",
+            "The recording is in another frame of reference, or in another unit.",
+            "Say with --nominal where on the branch the markers are, and check --unit.")
+
+
+def _against(moved: np.ndarray, load: np.ndarray) -> str:
+    """Say it where markers go against the load (displacements [m], load [N]); across it is well:
+    an upright branch gives way to a weight sideways.
+    """
+    size = np.linalg.norm(moved, axis=1)
+    mean = moved[size >= 0.5 * np.nanmax(size)].mean(axis=0)
+    turn = np.degrees(np.arccos(np.clip(
+        mean @ load / max(np.linalg.norm(mean) * np.linalg.norm(load), 1e-12), -1, 1)))
+    if turn < 100:
+        return ""
+    return (f"the markers move at {turn:.0f} degrees to the load. Is the recording in the "
+            "branch's frame (--nominal), and does the load pull that way?")
+
+
+def _load(settings: ImportSettings, branch: Branch) -> np.ndarray:
+    """Force on the branch [N] in the branch's frame, shape [3]."""
+    if settings.load is None:
+        down = np.array(branch.gravity)
+        return settings.weight * down / np.linalg.norm(down)
+    turn = np.array(branch.manifest.alignment.rotation)
+    return turn @ settings.load if settings.coordinates == "scan" else np.array(settings.load)
+
+
+def _place(point: tuple[float, float, float], settings: ImportSettings, branch: Branch,
+           ) -> tuple[float, float, float]:
+    """A point [m] of the user's frame in the branch's."""
+    x, y, z = _in_branch(np.array([point]), settings, branch)[0]
+    return float(x), float(y), float(z)
+
+
+def _in_branch(points: np.ndarray, settings: ImportSettings, branch: Branch) -> np.ndarray:
+    alignment = branch.manifest.alignment
+    return alignment.apply(points / alignment.scale) if settings.coordinates == "scan" else points
+
+
+def _markers(kind: str, source: Path, settings: ImportSettings) -> tuple[Stream, list[str]]:
+    if kind == "c3d":
+        return markers_from_c3d(source)
+    return marker_stream(source, settings.unit, settings.rate_hz)
+
+
+def _registered(rest: np.ndarray, labels: list[str], name: str, settings: ImportSettings,
+                branch: Branch) -> Registration | None:
+    if settings.nominal is None:
+        return None
+    known, nominal = read_nominal(Path(settings.nominal))
+    return register(rest, labels, known, _in_branch(nominal, settings, branch), name)
+
+
+def _assembled(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
+               branch: Branch, progress: Progress) -> Pull:
+    observations, rest, messages = None, None, []
+    if kind in ("markers", "c3d"):
+        stream, labels = _markers(kind, source, settings)
+        messages += stream.warnings
+        observations = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
+        placed = _registered(observations.positions[0], labels, name, settings, branch)
+        if placed:
+            moved = placed.apply(observations.positions[:, placed.used])
+            observations, rest = replace(observations, positions=moved), moved[0]
+            messages += placed.warnings
+    else:
+        copy = copy_rgbd if kind == "rgbd" else copy_clouds
+        messages += copy(source, folder, settings, progress)
+    if settings.robot is None:
+        raise InputError("No robot table was given.",
+                         "A pull needs what the gripper did: pose, and force where measured.",
+                         "Give it with --robot ROBOT.csv; a hung weight with --weight.")
+    robot = robot_stream(settings.robot, settings.force_unit, settings.rate_hz)
+    messages += robot.warnings
+    poses = with_columns(robot, POSE_COLUMNS).values
+    wrenches = with_columns(robot, WRENCH_COLUMNS).values
+    grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
+             else tuple(float(x) for x in poses[np.isfinite(poses).all(axis=1)][0, :3]))
+    observation = {"rgbd": "depth", "clouds": "clouds"}.get(kind, "markers")
+    entry = _entry(observation, source, settings, branch, rest, drive=settings.drive,
+                   mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
+    return Pull(name, entry, robot.times, poses, wrenches, observations, tuple(messages))
+
+
+def _entry(observation: Any, source: Path, settings: ImportSettings, branch: Branch,
+           rest: np.ndarray | None, *, drive: Any, mode: Any, sigma: float,
+           grasp: tuple[float, float, float]) -> PullEntry:
+    return PullEntry(
+        observation=observation, drive=drive, motion=settings.motion,
+        gravity_m_s2=branch.gravity if settings.own_weight else None,
+        time_offset_s=settings.time_offset or 0.0, source=source.name,
+        grasp=GraspEntry(point_m=grasp, radius_m=settings.grasp_radius, mode=mode),
+        sensor=SensorEntry(position_sigma_m=sigma, force_sigma_n=settings.force_sigma,
+                           torque_sigma_nm=settings.torque_sigma),
+        rest_points_m=None if rest is None else tuple(map(tuple, rest.tolist())))

@@ -1,0 +1,101 @@
+"""Observed points as a linear function of a mesh's nodal displacements."""
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from limber.geometry.tets.tet_mesh import TetMesh
+
+_CANDIDATES = 40
+
+
+def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
+    """Return B, shape [3 m, 3 n], with displacements of the points = B @ displacements.ravel().
+
+    A point inside a tetrahedron moves as its shape functions say. One outside, such as a marker
+    on a stalk, moves with the nearest point inside and turns with the section there: by the mean
+    gradient of the displacement over it, in which the strains of bending cancel. The gradient at
+    the foot itself would stretch the stalk by the strain of the skin.
+
+    Args:
+        mesh: Linear or quadratic tetrahedra at rest.
+        rest_points: [m], shape [m, 3].
+    """
+    points = np.asarray(rest_points, float)
+    tets, local, outside = _located(mesh, points)
+    values, _ = _shape(local, mesh.is_quadratic)
+    count, width = values.shape
+    rows = np.repeat(np.arange(count), width)
+    scalar = sparse.csr_matrix((values.ravel(), (rows, mesh.tets[tets, :width].ravel())),
+                               shape=(count, mesh.node_count))
+    return sparse.kron(scalar + _stalks(mesh, points, outside), sparse.identity(3), format="csr")
+
+
+def _stalks(mesh: TetMesh, points: np.ndarray, outside: np.ndarray) -> sparse.csr_matrix:
+    """What the turn of the section adds to a point that lies off it, shape [m, n]."""
+    size = np.linalg.norm(outside, axis=1)
+    corners = mesh.nodes[mesh.tets[:, :4]]
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
+    # About the thickness of a slender body.
+    thickness = float(np.sqrt(volume.sum() / np.linalg.norm(np.ptp(mesh.nodes, axis=0))))
+    tree, total = cKDTree(mesh.centroids), sparse.lil_matrix((len(points), mesh.node_count))
+    centre = np.full((1, 4), 0.25)
+    for row in np.flatnonzero(size > 1e-3 * thickness):
+        middle = points[row] - outside[row] * (1 + 0.5 * thickness / size[row])
+        near = np.array(tree.query_ball_point(middle, 0.75 * thickness), int)
+        near = near if len(near) else tree.query(middle, k=1)[1].reshape(1)
+        _, gradients = _shape(np.repeat(centre, len(near), axis=0), mesh.is_quadratic)
+        slopes = _slopes(mesh, near, gradients)
+        share = volume[near] / volume[near].sum()
+        weights = np.einsum("t,taj,j->ta", share, slopes, outside[row])
+        nodes = mesh.tets[near, :weights.shape[1]]
+        summed = np.bincount(nodes.ravel(), weights.ravel(), mesh.node_count)
+        used = np.flatnonzero(summed)
+        total[row, used] = summed[used]
+    return total.tocsr()
+
+
+def _slopes(mesh: TetMesh, tets: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """Gradients of the shape functions in space [1/m], shape [t, nodes, 3]."""
+    corners = mesh.nodes[mesh.tets[tets, :4]]
+    edges = np.transpose(corners[:, 1:] - corners[:, :1], (0, 2, 1))
+    # d xi / d x is the inverse of the edges; the first barycentric coordinate follows the others.
+    inverse = np.linalg.inv(edges)
+    return np.einsum("mak,mkj->maj", gradients[:, :, 1:] - gradients[:, :, :1], inverse)
+
+
+def _located(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tetrahedron, barycentric coordinates [m, 4] and what is left outside [m, 3] of each point."""
+    count = min(_CANDIDATES, mesh.tet_count)
+    near = cKDTree(mesh.centroids).query(points, k=count)[1].reshape(len(points), count)
+    tets, local, outside = [], [], []
+    for point, candidates in zip(points, near, strict=True):
+        corners = mesh.nodes[mesh.tets[candidates, :4]]
+        edges = np.transpose(corners[:, 1:] - corners[:, :1], (0, 2, 1))
+        others = np.linalg.solve(edges, (point - corners[:, 0])[..., None])[..., 0]
+        weights = np.column_stack([1 - others.sum(axis=1), others])
+        inside = np.maximum(weights, 0.0)
+        inside /= inside.sum(axis=1)[:, None]
+        foot = np.einsum("ca,caj->cj", inside, corners)
+        best = int(np.argmin(np.linalg.norm(point - foot, axis=1)))
+        tets.append(candidates[best])
+        local.append(inside[best])
+        outside.append(point - foot[best])
+    return np.array(tets), np.array(local), np.array(outside)
+
+
+def _shape(local: np.ndarray, quadratic: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Shape functions [m, a] and their derivatives to barycentric coordinates [m, a, 4]."""
+    count = len(local)
+    if not quadratic:
+        return local, np.broadcast_to(np.eye(4), (count, 4, 4))
+    pairs = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
+    first, second = local[:, pairs[:, 0]], local[:, pairs[:, 1]]
+    values = np.hstack([local * (2 * local - 1), 4 * first * second])
+    gradients = np.zeros((count, 10, 4))
+    for corner in range(4):
+        gradients[:, corner, corner] = 4 * local[:, corner] - 1
+    for edge, (a, b) in enumerate(pairs):
+        gradients[:, 4 + edge, a] = 4 * second[:, edge]
+        gradients[:, 4 + edge, b] = 4 * first[:, edge]
+    return values, gradients

@@ -1,0 +1,212 @@
+"""A pull: what the gripper did to the branch, and what was seen of it; its folder ``pulls/NAME``.
+
+``pull.toml`` says how to read the rest; ``robot.csv`` has the gripper's pose in the branch's
+frame and the wrench that the gripper exerts on the branch; ``markers.csv`` has observed points.
+Depth frames and clouds enter as files, and become points in :mod:`limber.perception`.
+"""
+
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tomlkit
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from limber.errors import InputError
+from limber.recordings.streams import Stream, read_stream, write_stream
+from limber.store import plain
+
+POSE_COLUMNS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+WRENCH_COLUMNS = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")
+
+Vector = tuple[float, float, float]
+
+
+class GraspEntry(BaseModel):
+    """Where and how the gripper holds the branch at rest."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    point_m: Vector = Field(description="Centre of the grasp patch at rest, branch frame.")
+    radius_m: float = Field(gt=0, description="Nodes within this distance are held.")
+    mode: Literal["clamped", "pinned"] = "clamped"
+
+
+class SensorEntry(BaseModel):
+    """What is known of the sensors' noise and range."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    position_sigma_m: float = Field(1e-3, gt=0)
+    force_sigma_n: float = Field(0.1, gt=0)
+    torque_sigma_nm: float | None = Field(None, gt=0)
+    force_range_n: float | None = Field(None, gt=0)
+    tared: bool = True
+
+
+class PullEntry(BaseModel):
+    """Content of ``pull.toml``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format_version: Literal[1] = 1
+    observation: Literal["markers", "clouds", "depth", "none"] = "markers"
+    drive: Literal["pose", "force"] = "pose"
+    motion: Literal["quasi_static", "dynamic"] = "quasi_static"
+    gravity_m_s2: Vector | None = Field(
+        None, description="Gravity that bends the branch out of its rest shape; absent where the "
+        "scanned shape already carries it.")
+    time_offset_s: float = Field(
+        0.0, description="Added to the observations' time stamps to get the robot's.")
+    grasp: GraspEntry
+    sensor: SensorEntry = SensorEntry()
+    rest_points_m: tuple[Vector, ...] | None = Field(
+        None, description="Where the observed points are at rest; absent: the control points.")
+    source: str = ""
+    truth: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Observed points over time.
+
+    Attributes:
+        times: [s] on the observer's clock, shape [n].
+        positions: [m] in the branch's frame, shape [n, m, 3]; NaN where a point was not seen.
+        covariance: [m^2], shape [n, m, 3, 3], or None: isotropic ``position_sigma_m``.
+    """
+
+    times: np.ndarray
+    positions: np.ndarray
+    covariance: np.ndarray | None = None
+
+    @property
+    def point_count(self) -> int:
+        return self.positions.shape[1]
+
+    @property
+    def visible(self) -> np.ndarray:
+        """Whether each point was seen, shape [n, m] of bool."""
+        return np.isfinite(self.positions).all(axis=2)
+
+
+@dataclass(frozen=True)
+class Pull:
+    """One recorded pull.
+
+    Attributes:
+        name: Name of its folder.
+        entry: Settings as in ``pull.toml``.
+        times: The robot's time stamps [s], shape [n].
+        poses: Poses of the grasp [m, rad], shape [n, 6].
+        wrenches: Force [N] and torque [N m] of the gripper on the branch, shape [n, 6]; NaN
+            where not measured.
+        observations: Observed points, or None where they have yet to be found in images.
+        warnings: What was wrong in the files.
+    """
+
+    name: str
+    entry: PullEntry
+    times: np.ndarray
+    poses: np.ndarray
+    wrenches: np.ndarray
+    observations: Observations | None = None
+    warnings: tuple[str, ...] = field(default=())
+
+    def warned(self, *messages: str) -> "Pull":
+        """Return the pull with more warnings."""
+        return replace(self, warnings=self.warnings + messages)
+
+
+def read_pull(folder: str | Path) -> Pull:
+    """Read the folder of a pull.
+
+    Raises:
+        InputError: a file is missing, a column is, or something in them makes no sense.
+    """
+    folder = Path(folder)
+    entry = read_entry(folder / "pull.toml")
+    robot = read_stream(folder / "robot.csv")
+    poses = _columns(folder / "robot.csv", robot, POSE_COLUMNS)
+    wrenches = _columns(folder / "robot.csv", robot, WRENCH_COLUMNS, missing=np.nan)
+    if not np.isfinite(poses).all():
+        bad = ~np.isfinite(poses).all(axis=1)
+        robot = replace(robot, times=robot.times[~bad], warnings=(
+            *robot.warnings, f"robot.csv: {bad.sum()} rows without a full pose were dropped."))
+        poses, wrenches = poses[~bad], wrenches[~bad]
+    warnings = list(robot.warnings)
+    observations = None
+    if entry.observation == "markers":
+        markers = read_stream(folder / "markers.csv")
+        observations = _marker_observations(folder / "markers.csv", markers)
+        warnings += markers.warnings
+    return Pull(folder.name, entry, robot.times, poses, wrenches, observations, tuple(warnings))
+
+
+def write_pull(folder: str | Path, pull: Pull) -> None:
+    """Write ``pull.toml``, ``robot.csv`` and, where there are observations, ``markers.csv``."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_entry(folder / "pull.toml", pull.entry)
+    robot = Stream(pull.times, np.hstack([pull.poses, pull.wrenches]),
+                   POSE_COLUMNS + WRENCH_COLUMNS)
+    write_stream(folder / "robot.csv", robot)
+    if pull.observations is not None:
+        seen = pull.observations
+        names = tuple(f"m{point}_{axis}_m" for point in range(seen.point_count) for axis in "xyz")
+        values = seen.positions.reshape(len(seen.times), -1)
+        write_stream(folder / "markers.csv", Stream(seen.times, values, names))
+
+
+def read_entry(path: Path) -> PullEntry:
+    """Read ``pull.toml``.
+
+    Raises:
+        InputError: missing, not TOML, or an entry that makes no sense (named).
+    """
+    try:
+        return PullEntry.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}).", "It describes the pull.",
+                         "Make the pull with `limber import-pull` or `limber record`.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: {place}: {first['msg']}.", "The pull cannot be read without it.",
+                         "Correct the entry.") from error
+
+
+def write_entry(path: Path, entry: PullEntry) -> None:
+    """Write ``pull.toml``; entries that are None are left out, TOML has no null."""
+    path.write_text(tomlkit.dumps(_without_none(plain(entry))), encoding="utf-8")
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return value
+
+
+def _columns(path: Path, stream: Stream, names: tuple[str, ...], missing: float | None = None,
+             ) -> np.ndarray:
+    absent = [name for name in names if name not in stream.columns]
+    if absent and missing is None:
+        raise InputError(f"{path} lacks {', '.join(absent)}.",
+                         "The gripper's pose is needed in every row.",
+                         "Add the columns (metres, radians; names as in the documentation).")
+    return np.column_stack([
+        stream.values[:, stream.columns.index(name)] if name in stream.columns
+        else np.full(len(stream), missing) for name in names])
+
+
+def _marker_observations(path: Path, stream: Stream) -> Observations:
+    if len(stream.columns) % 3 or not all(name.endswith("_m") for name in stream.columns):
+        raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
+                         "Three columns a marker, m0_x_m, m0_y_m, m0_z_m, ..., were expected.",
+                         "Bring the file in with `limber import-pull --unit ...`.")
+    positions = stream.values.reshape(len(stream), -1, 3)
+    partly = np.isfinite(positions).any(axis=2) & ~np.isfinite(positions).all(axis=2)
+    positions = np.where(partly[..., None], np.nan, positions)
+    return Observations(stream.times, positions)

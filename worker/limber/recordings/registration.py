@@ -1,0 +1,164 @@
+"""Markers of a capture system onto their nominal places on the branch at rest."""
+
+from dataclasses import dataclass
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError
+from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split_title
+
+POOR_FIT_M = 5e-3
+"""A rigid fit that leaves more than this at a marker is reported."""
+_MOST_FOR_PERMUTATION = 7
+
+
+@dataclass(frozen=True)
+class Registration:
+    """From the capture frame to the branch's: ``x = rotation p + shift``.
+
+    Attributes:
+        rotation: Shape [3, 3].
+        shift: [m], shape [3].
+        used: Indices of the recording's markers that have a nominal place, shape [m].
+        residual: Distance of each from it at rest [m], shape [m].
+        warnings: What the user should know.
+    """
+
+    rotation: np.ndarray
+    shift: np.ndarray
+    used: np.ndarray
+    residual: np.ndarray
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals over the degrees of freedom left [m]."""
+        freedom = max(3 * len(self.used) - 6, 1)
+        return float(np.sqrt(np.sum(self.residual**2) / freedom))
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Take points [m], shape [..., 3], to the branch's frame."""
+        return points @ self.rotation.T + self.shift
+
+
+def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
+    """Read ``label,x_m,y_m,z_m`` (or another unit of length): labels and places [m], [m, 3].
+
+    Raises:
+        InputError: the file cannot be read as that.
+    """
+    path = Path(path)
+    try:
+        lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines()
+                 if line.strip() and not line.startswith("#")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}).",
+                         "The markers' nominal places were expected.", "Check the path.") from error
+    sign = next((sign for sign in ("\t", ";", ",") if lines and sign in lines[0]), ",")
+    rows = [[part.strip().strip('"') for part in line.split(sign)] for line in lines]
+    try:
+        titles = [split_title(part) for part in rows[0][1:4]]
+        scale = [scale_of(title, LENGTH_UNITS_M, "m", path) for title in titles]
+        labels = [row[0] for row in rows[1:]]
+        places = np.array([[float(part) for part in row[1:4]] for row in rows[1:]])
+        if places.shape != (len(labels), 3) or not np.isfinite(places).all():
+            raise ValueError("three numbers a marker are needed")
+    except (IndexError, ValueError) as error:
+        raise InputError(f"{path} is no table of markers ({error}).",
+                         "Its first line is label,x_m,y_m,z_m, then one marker a line.",
+                         "Correct the file.") from error
+    return labels, places * scale
+
+
+def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
+             nominal: np.ndarray, name: str) -> Registration:
+    """Fit markers at rest rigidly onto their nominal places.
+
+    Markers are paired by name; where no name is shared and there are as many of both, by order,
+    or by the order that fits best. A marker far off is left out of the fit, if three others agree.
+
+    Args:
+        points: At rest in the capture frame [m], shape [n, 3].
+        labels: Of the recording's markers.
+        nominal_labels: Names in the table of nominal places.
+        nominal: Nominal places [m], shape [k, 3].
+        name: Of the pull, for messages.
+
+    Raises:
+        InputError: fewer than three markers in common.
+    """
+    pairs = [(k, j) for k, label in enumerate(labels) for j, known in enumerate(nominal_labels)
+             if same_label(label, known) and np.isfinite(points[k]).all()]
+    messages = []
+    if len(pairs) < 3 and len(labels) == len(nominal_labels) and np.isfinite(points).all():
+        pairs, told = _paired_by_fit(points, nominal)
+        messages.append(f"{name}: markers share no names with the nominal ones; {told}.")
+    if len(pairs) < 3:
+        raise InputError(
+            f"{name}: the recording has {', '.join(labels)}; nominal places are known of "
+            f"{', '.join(nominal_labels)}.",
+            "Three markers in common, in view at the start, are needed for a rigid fit.",
+            "Use the recording's labels.")
+    used = np.array([k for k, _ in pairs])
+    target = nominal[[j for _, j in pairs]]
+    inlier = _consistent(points[used], target)
+    rotation, shift = rigid_fit(points[used][inlier], target[inlier])
+    residual = np.linalg.norm(points[used] @ rotation.T + shift - target, axis=1)
+    for k, off, good in zip(used, residual, inlier, strict=True):
+        if not good or off > POOR_FIT_M:
+            messages.append(f"{name}: marker {labels[k]} lies {off * 1e3:.1f} mm from its nominal "
+                            f"place{'' if good else ' and was left out of the rigid fit'}.")
+    return Registration(rotation, shift, used, residual, tuple(messages))
+
+
+def rigid_fit(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and translation [3] that take ``points`` onto ``target`` (Kabsch), [n, 3]."""
+    centre, goal = points.mean(axis=0), target.mean(axis=0)
+    left, _, right = np.linalg.svd((points - centre).T @ (target - goal))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(right.T @ left.T))])
+    turn = right.T @ flip @ left.T
+    return turn, goal - turn @ centre
+
+
+def turned(rotation: np.ndarray) -> float:
+    """Angle of a rotation matrix [rad]."""
+    return float(Rotation.from_matrix(rotation).magnitude())
+
+
+def _residuals(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+    rotation, shift = rigid_fit(points, target)
+    return np.linalg.norm(points @ rotation.T + shift - target, axis=1)
+
+
+def _consistent(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Whether each marker agrees with the others; one that spoils the fit threefold does not."""
+    keep = np.ones(len(points), bool)
+    while keep.sum() > 4:
+        rms = np.sqrt(np.mean(_residuals(points[keep], target[keep])**2))
+        without = []
+        for k in np.flatnonzero(keep):
+            rest = keep.copy()
+            rest[k] = False
+            without.append((np.sqrt(np.mean(_residuals(points[rest], target[rest])**2)), k))
+        best, worst = min(without)
+        if rms < POOR_FIT_M or best > rms / 3:
+            break
+        keep[worst] = False
+    return keep
+
+
+def _paired_by_fit(points: np.ndarray, nominal: np.ndarray) -> tuple[list[tuple[int, int]], str]:
+    order = tuple(range(len(points)))
+    rms = float(np.sqrt(np.mean(_residuals(points, nominal)**2)))
+    told = "they were paired in their order"
+    if rms > POOR_FIT_M and len(points) <= _MOST_FOR_PERMUTATION:
+        found = min(permutations(order), key=lambda p: float(
+            np.sum(_residuals(points, nominal[list(p)])**2)))
+        better = float(np.sqrt(np.mean(_residuals(points, nominal[list(found)])**2)))
+        if better < rms / 3:
+            order, rms = found, better
+            told = "they were paired as fits best"
+    return [(k, order[k]) for k in range(len(points))], f"{told} ({rms * 1e3:.1f} mm RMS)"

@@ -1,0 +1,423 @@
+"""Tables of other programs: where header, columns, units and time are, whatever they are called.
+
+A recorder's own CSV has what :mod:`limber.recordings.streams` reads. Others separate by
+semicolons or tabs, write a preamble above the header, put units in brackets, call time "Time
+Stamp" and count it in milliseconds; here they become streams in SI units, at the door.
+"""
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
+from limber.recordings.streams import Stream, in_order
+
+LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "metres": 1.0,
+                  "meters": 1.0, "millimetres": 1e-3, "millimeters": 1e-3, "inch": 0.0254}
+FORCE_UNITS_N = {"N": 1.0, "gf": 9.80665e-3, "g": 9.80665e-3, "mN": 1e-3, "lbf": 4.4482216,
+                 "lb": 4.4482216, "kgf": 9.80665, "kg": 9.80665, "kN": 1e3, "newton": 1.0,
+                 "newtons": 1.0, "grams": 9.80665e-3, "gram": 9.80665e-3}
+TIME_UNITS_S = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3,
+                "msec": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+ANGLE_UNITS_RAD = {"rad": 1.0, "deg": np.pi / 180}
+TORQUE_UNITS_NM = {"Nm": 1.0, "Nmm": 1e-3, "mNm": 1e-3}
+
+_TIME_NAME = r"t|time|times|timestamp|timestamps|elapsed|elapsedtime|clock"
+_EMPTY = ("", "nan", "na", "n/a", "null", "none", "-")
+
+
+@dataclass
+class Table:
+    """A table as it stands in a file.
+
+    Attributes:
+        path: The file.
+        titles: Of the columns, as written (a row of units below them is joined in brackets).
+        values: Shape [n, columns]; NaN where there is no number.
+        warnings: What was wrong.
+    """
+
+    path: Path
+    titles: list[str]
+    values: np.ndarray
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Title:
+    """A column's name without its unit, and the unit if it names one."""
+
+    name: str
+    unit: str | None
+
+    @property
+    def plain(self) -> str:
+        """Lower-case letters and digits alone."""
+        return re.sub(r"[^a-z0-9]", "", self.name.lower())
+
+
+def read_table(path: str | Path) -> Table:
+    """Read a text table of numbers.
+
+    Raises:
+        InputError: it cannot be read, has no row of numbers, or no header above them.
+    """
+    path = Path(path)
+    text = _text(path)
+    lines = [line for line in text.splitlines() if line.strip()]
+    bare = [line for line in lines if not line.lstrip().startswith(("#", "%"))]
+    comments = [line.lstrip()[1:].strip() for line in lines if line not in bare]
+    separator = _separator(bare)
+    rows = [_fields(line, separator) for line in bare]
+    first, width = _first_numbers(path, rows)
+    titles = _titles(rows[:first], comments, width, separator)
+    if titles is None:
+        raise InputError(f"{path} has no header line with {width} names above its numbers.",
+                         "Without names nobody knows what the columns are.",
+                         "Add a first line such as t_s,x_m,y_m,z_m.")
+    table = Table(path, titles, np.empty((0, width)))
+    table.values = _numbers(table, bare[first:], rows[first:], text.endswith(("\n", "\r")))
+    return table
+
+
+def split_title(title: str) -> Title:
+    """Take the unit off a column's name: ``Force (N)``, ``x [mm]``, ``tip1_x_m``, ``Time_ms``."""
+    bracket = re.search(r"[(\[]\s*([^)\]]*)\s*[)\]]\s*$", title)
+    if bracket:
+        return Title(title[:bracket.start()].strip(), bracket.group(1).strip() or None)
+    units = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_UNITS_N, *TIME_UNITS_S,
+                                       *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
+    head, _, tail = title.strip().rpartition("_")
+    if head and tail.lower() in units:
+        return Title(head, tail)
+    return Title(title.strip(), None)
+
+
+def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -> float:
+    """Return the factor to SI of a column.
+
+    Raises:
+        InputError: it names a unit that is none of ``units``.
+    """
+    unit = title.unit or default
+    known = dict(units)
+    known |= {key.lower(): value for key, value in units.items() if key.lower() not in known}
+    if unit in known or unit.lower() in known:
+        return known.get(unit, known.get(unit.lower()))
+    raise InputError(f"{where}: the column {title.name!r} is in {unit!r}.",
+                     f"Known are {', '.join(units)}.", "Convert the column, or correct its name.")
+
+
+def time_column(table: Table) -> int | None:
+    """Return which column holds times, if any."""
+    return next((k for k, title in enumerate(table.titles)
+                 if re.fullmatch(_TIME_NAME, split_title(title).plain)), None)
+
+
+def time_stream(table: Table, rate_hz: float | None = None) -> Stream:
+    """Return the table with its time stamps [s] in order; other columns keep their titles.
+
+    Raises:
+        InputError: no column of times (and no ``rate_hz``), or too few or too disordered rows.
+    """
+    titles = [split_title(title) for title in table.titles]
+    at = time_column(table)
+    warnings = list(table.warnings)
+    if at is not None:
+        times = table.values[:, at] * scale_of(titles[at], TIME_UNITS_S, "s", table.path)
+        if titles[at].unit is None:
+            warnings += _suspicious_clock(table.path, times)
+    elif rate_hz is not None:
+        at = next((k for k, title in enumerate(titles)
+                   if re.fullmatch(r"frames?|samples?|index|framenumber", title.plain)), None)
+        count = np.arange(len(table.values)) if at is None else table.values[:, at]
+        times = (count - np.nanmin(count)) / rate_hz
+    else:
+        raise InputError(
+            f"{table.path} has the columns {', '.join(table.titles)}.",
+            "None is called time (t_s, Time (ms), timestamp, ...).",
+            "Rename the column of time stamps, or give --rate-hz.")
+    kept = [k for k in range(len(titles)) if k != at]
+    times, values = in_order(table.path, times, table.values[:, kept], warnings)
+    if len(times) < 2:
+        raise InputError(f"{table.path} has {len(times)} complete rows.",
+                         "A pull needs at least two samples.", "Record it again.")
+    return Stream(times, values, tuple(table.titles[k] for k in kept), tuple(warnings))
+
+
+def marker_stream(path: str | Path, unit: str | None = None, rate_hz: float | None = None,
+                  ) -> tuple[Stream, list[str]]:
+    """Read marker tracks: three columns a marker, named LABEL and x, y or z in any usual way.
+
+    Args:
+        path: The file.
+        unit: Of the positions; None takes the titles' own, metres where they have none.
+        rate_hz: Frames a second where there is no column of times.
+
+    Returns:
+        Columns ``m0_x_m, m0_y_m, m0_z_m, ...`` [m], and the markers' labels.
+
+    Raises:
+        InputError: no marker has all three coordinates.
+    """
+    table = read_table(path)
+    stream = time_stream(table, rate_hz)
+    places: dict[str, dict[str, int]] = {}
+    ignored = []
+    for column, title in enumerate(stream.columns):
+        named = split_title(title)
+        match = re.fullmatch(r"(.*?)[\s_.:\-]*([xyz])", named.name, re.IGNORECASE)
+        if match is None or re.search(r"rot|quat|angle", named.name, re.IGNORECASE):
+            ignored.append(title)
+            continue
+        places.setdefault(match.group(1).strip() or "m0", {})[match.group(2).lower()] = column
+    whole = {label: at for label, at in places.items() if set(at) == set("xyz")}
+    ignored += [stream.columns[k] for label, at in places.items() if label not in whole
+                for k in at.values()]
+    if not whole:
+        raise InputError(f"{path} has the columns {', '.join(stream.columns)}.",
+                         "No marker has an x, a y and a z column.",
+                         "Name them LABEL_x_m, LABEL_y_m, LABEL_z_m.")
+    values = np.empty((len(stream), 3 * len(whole)))
+    for number, at in enumerate(whole.values()):
+        for axis, letter in enumerate("xyz"):
+            named = split_title(stream.columns[at[letter]])
+            scale = (LENGTH_UNITS_M[unit] if unit else
+                     scale_of(named, LENGTH_UNITS_M, "m", Path(path)))
+            values[:, 3 * number + axis] = stream.values[:, at[letter]] * scale
+    # Motion capture writes (0, 0, 0) for a marker that it does not see.
+    positions = values.reshape(len(values), -1, 3)
+    positions[np.all(positions == 0.0, axis=2)] = np.nan
+    warnings = list(stream.warnings)
+    if ignored:
+        warnings.append(f"{Path(path).name}: columns not used: {', '.join(ignored)}.")
+    columns = tuple(f"m{k}_{axis}_m" for k in range(len(whole)) for axis in "xyz")
+    return Stream(stream.times, values, columns, tuple(warnings)), list(whole)
+
+
+_POSE_ALIASES = {
+    "x_m": ("x", "px", "posx", "positionx", "tcpx", "actualtcppose0"),
+    "y_m": ("y", "py", "posy", "positiony", "tcpy", "actualtcppose1"),
+    "z_m": ("z", "pz", "posz", "positionz", "tcpz", "actualtcppose2"),
+    "rx_rad": ("rx", "rotx", "rotvecx", "tcprx", "actualtcppose3"),
+    "ry_rad": ("ry", "roty", "rotvecy", "tcpry", "actualtcppose4"),
+    "rz_rad": ("rz", "rotz", "rotvecz", "tcprz", "actualtcppose5"),
+    "fx_n": ("fx", "forcex", "tcpfx", "actualtcpforce0"),
+    "fy_n": ("fy", "forcey", "tcpfy", "actualtcpforce1"),
+    "fz_n": ("fz", "forcez", "tcpfz", "actualtcpforce2"),
+    "tx_nm": ("tx", "mx", "torquex", "actualtcpforce3"),
+    "ty_nm": ("ty", "my", "torquey", "actualtcpforce4"),
+    "tz_nm": ("tz", "mz", "torquez", "actualtcpforce5"),
+}
+
+
+def robot_stream(path: str | Path, force_unit: str | None = None,
+                 rate_hz: float | None = None) -> Stream:
+    """Read a robot's table: columns x_m .. rz_rad, fx_n .. tz_nm as far as they are there.
+
+    Known are our own names, those of UR's RTDE (``actual_TCP_pose_0``, ...), and short ones with
+    a unit; a rotation may be a quaternion qx, qy, qz, qw.
+
+    Args:
+        path: The file.
+        force_unit: Of the forces (torques: times metres); None takes the titles' own.
+        rate_hz: Samples a second where there is no column of times.
+
+    Raises:
+        InputError: the position of the gripper is missing.
+    """
+    table = read_table(path)
+    stream = time_stream(table, rate_hz)
+    titles = [split_title(title) for title in stream.columns]
+    values, warnings = {}, list(stream.warnings)
+    for name, aliases in _POSE_ALIASES.items():
+        at = next((k for k, title in enumerate(titles) if title.plain in aliases), None)
+        if at is not None:
+            values[name] = stream.values[:, at] * _robot_scale(name, titles[at], force_unit,
+                                                               Path(path))
+    missing = [name for name in POSE_COLUMNS[:3] if name not in values]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}.",
+                         "The gripper's pose in the branch's frame is needed.",
+                         f"Columns: t_s, {', '.join(POSE_COLUMNS + WRENCH_COLUMNS)}.")
+    _add_rotation(values, titles, stream, warnings)
+    names = tuple(name for name in _POSE_ALIASES if name in values)
+    return Stream(stream.times, np.column_stack([values[name] for name in names]), names,
+                  tuple(warnings))
+
+
+def _robot_scale(name: str, title: Title, force_unit: str | None, path: Path) -> float:
+    if name.endswith("_rad"):
+        return scale_of(title, ANGLE_UNITS_RAD, "rad", path)
+    if name.endswith("_nm"):
+        if force_unit:
+            return FORCE_UNITS_N[force_unit]
+        return scale_of(title, TORQUE_UNITS_NM, "Nm", path)
+    if name.endswith("_n"):
+        if force_unit:
+            return FORCE_UNITS_N[force_unit]
+        return scale_of(title, FORCE_UNITS_N, "N", path)
+    return scale_of(title, LENGTH_UNITS_M, "m", path)
+
+
+def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: Stream,
+                  warnings: list[str]) -> None:
+    from scipy.spatial.transform import Rotation
+
+    if all(name in values for name in POSE_COLUMNS[3:]):
+        return
+    at = {title.plain: k for k, title in enumerate(titles)}
+    if all(name in at for name in ("qx", "qy", "qz", "qw")):
+        quaternion = stream.values[:, [at["qx"], at["qy"], at["qz"], at["qw"]]]
+        known = np.isfinite(quaternion).all(axis=1) & np.any(quaternion != 0, axis=1)
+        turns = np.full((len(stream), 3), np.nan)
+        turns[known] = Rotation.from_quat(quaternion[known]).as_rotvec()
+    else:
+        warnings.append("The robot's table has no rotation: the gripper is taken not to turn. "
+                        "Right for a grasp that is pinned (--grasp-mode pinned).")
+        turns = np.zeros((len(stream), 3))
+    values |= dict(zip(POSE_COLUMNS[3:], turns.T, strict=True))
+
+
+def same_label(one: str, other: str) -> bool:
+    """Whether two names mean one marker: ``Tip - 1`` and ``tip1``."""
+    return _bare(one) == _bare(other)
+
+
+def _bare(label: str) -> str:
+    # A subject's name before a colon, as Vicon writes it, is not the marker's.
+    return re.sub(r"[^a-z0-9]", "", label.rsplit(":", 1)[-1].lower())
+
+
+def _text(path: Path) -> str:
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
+                         "Check the path and the file.") from error
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16", errors="replace")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = raw.decode("latin-1")
+    if "\x00" in text:
+        raise InputError(f"{path} is no text.", "A table of numbers was expected.",
+                         "Export it as CSV.")
+    return text
+
+
+def _separator(lines: list[str]) -> str | None:
+    """The sign between fields; None is white space."""
+    sample = lines[-20:]
+    for sign in ("\t", ";", ","):
+        counts = [line.count(sign) for line in sample]
+        # The last line may be cut short.
+        if counts and np.median(counts) >= 1 and (
+                np.mean(np.array(counts[:-1] or counts) == np.median(counts)) > 0.6):
+            return sign
+    return None
+
+
+def _fields(line: str, separator: str | None) -> list[str]:
+    parts = line.split(separator) if separator else line.split()
+    return [part.strip().strip('"').strip() for part in parts]
+
+
+def _number(text: str, comma: bool) -> float | None:
+    if text.lower() in _EMPTY:
+        return np.nan
+    try:
+        return float(text.replace(",", ".") if comma else text)
+    except ValueError:
+        return None
+
+
+def _first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:
+    """Index of the first row of numbers, and how many fields the rows have."""
+    for index, row in enumerate(rows):
+        parsed = [_number(part, True) for part in row]
+        known = [value for value in parsed if value is not None and np.isfinite(value)]
+        follows = rows[index + 1] if index + 1 < len(rows) else row
+        # A preamble (NO_OF_FRAMES 600) has numbers too, but never two rows of several alike.
+        if len(row) > 1 and None not in parsed and len(known) > len(row) // 2 and (
+                len(follows) == len(row) or index + 2 >= len(rows)):
+            return index, len(row)
+    raise InputError(f"{path} has no row of numbers." if rows else f"{path} is empty.",
+                     "A header and rows of numbers were expected.",
+                     "Check the file; export it again.")
+
+
+def _titles(above: list[list[str]], comments: list[str], width: int, separator: str | None,
+            ) -> list[str] | None:
+    """The lowest line above the numbers with as many names; a line of units below it joins in."""
+    fitting = [row for row in above if len(row) == width and _is_named(row)]
+    if not fitting:
+        fitting = [row for comment in comments
+                   if len(row := _fields(comment, separator)) == width and _is_named(row)]
+    if not fitting:
+        return None
+    units = _units(fitting[-1]) if len(fitting) > 1 else None
+    if units is None:
+        return fitting[-1]
+    return [f"{name} ({unit})" if unit else name
+            for name, unit in zip(fitting[-2], units, strict=True)]
+
+
+def _is_named(row: list[str]) -> bool:
+    words = [part for part in row if part and _number(part, True) is None]
+    return len(words) >= max(1, (len(row) + 1) // 2)
+
+
+def _units(row: list[str]) -> list[str] | None:
+    known = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_UNITS_N, *TIME_UNITS_S,
+                                       *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
+    bare = [part.strip("()[] ") for part in row]
+    return bare if all(not part or part.lower() in known for part in bare) else None
+
+
+def _numbers(table: Table, lines: list[str], rows: list[list[str]], complete: bool) -> np.ndarray:
+    name, width = table.path.name, len(table.titles)
+    comma = any(re.fullmatch(r"-?\d+,\d+", part) for row in rows[:50] for part in row)
+    kept, bad = [], []
+    for index, row in enumerate(rows):
+        numbers = [_number(part, comma) for part in row]
+        # A separator at the line's end makes an empty field.
+        if len(numbers) == width + 1 and row[-1] == "":
+            numbers = numbers[:-1]
+        is_last = index == len(rows) - 1
+        whole = len(numbers) == width and None not in numbers
+        if is_last and (not whole or not complete):
+            # Without an end of line even a last line of full length may have lost digits.
+            table.warnings.append(f"{name}: the last line is unfinished; it was dropped.")
+        elif whole:
+            kept.append(numbers)
+        else:
+            bad.append(index)
+    if len(bad) > 0.05 * len(rows):
+        raise InputError(f"{table.path}: {len(bad)} of {len(rows)} rows are not "
+                         f"{width} numbers, the first {lines[bad[0]][:60]!r}.",
+                         "The table cannot be trusted.", "Correct or delete those lines.")
+    if bad:
+        table.warnings.append(f"{name}: {len(bad)} row(s) that are not {width} numbers were "
+                              f"dropped, the first {lines[bad[0]][:40]!r}.")
+    return np.array(kept, float).reshape(-1, width)
+
+
+def _suspicious_clock(path: Path, times: np.ndarray) -> list[str]:
+    step = float(np.median(np.diff(times[np.isfinite(times)]))) if len(times) > 2 else 0.0
+    if step < 1.0 or np.any(times != np.round(times)):
+        return []
+    return [f"{path.name}: time names no unit and steps by {step:g}; it was taken in seconds. "
+            "If it counts milliseconds, call the column t_ms."]
+
+
+def with_columns(stream: Stream, names: tuple[str, ...]) -> Stream:
+    """Return the stream with these columns in this order; absent ones are NaN."""
+    empty = np.full(len(stream), np.nan)
+    values = [stream.values[:, stream.columns.index(name)] if name in stream.columns else empty
+              for name in names]
+    return replace(stream, values=np.column_stack(values), columns=names)

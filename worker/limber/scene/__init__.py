@@ -1,0 +1,1 @@
+"""What a viewport shows of a branch, as arrays."""

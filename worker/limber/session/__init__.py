@@ -1,0 +1,1 @@
+"""The interactive session: a process that holds a branch, its client and its trainer."""
