@@ -161,7 +161,7 @@ def test_killed_in_the_last_move_is_finished_by_the_next_opener(tmp_path: Path):
     """A process killed between the journal and the manifest leaves a folder that opens whole."""
     program = (
         "import os, sys\n"
-        "from limber import store\n"
+        "from limber.store import branch as store\n"
         "branch = store.Branch.create(sys.argv[1])\n"
         "with branch.stage('a') as s: s.path('x.txt').write_text('old')\n"
         "real, count = os.replace, [0]\n"

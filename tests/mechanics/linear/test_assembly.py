@@ -8,8 +8,9 @@ import scipy.sparse as sp
 from tests.subjects.meshes import box_mesh
 
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics import BranchModel, Grasp, factor
+from limber.mechanics import BranchModel, Grasp
 from limber.mechanics.grasp import rotation_matrix
+from limber.mechanics.linear import factor
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.linear.fronts import make_fronts, postordered
 from limber.mechanics.statics.solve import solve_prescribed
