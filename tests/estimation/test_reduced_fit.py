@@ -49,7 +49,7 @@ def test_it_ends_where_the_full_model_ends(thick, noisy, tmp_path):
         ratio = (np.log(found.uncertainty.young_interval) @ [-1, 1]) / (
             np.log(full.uncertainty.young_interval) @ [-1, 1])
         assert np.abs(ratio - 1).max() < 0.1
-        assert found.objective.forwards[0].error[0] < 1e-4
+        assert found.objective.forwards[0].reduction_error[0] < 1e-4
     assert again.objective.forward_count < first.objective.forward_count
     # Another pull makes another basis, and the old file goes.
     fit(thick, [replace(noisy, name="pull-2")], REDUCED, cache=tmp_path)

@@ -10,6 +10,7 @@ import numpy as np
 
 from limber.errors import Cancelled, LimberError
 from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.forward.forward import Forward
 from limber.estimation.identifiability import (
     Identifiability,
     identifiability,
@@ -22,7 +23,7 @@ from limber.estimation.model_error import (
     mesh_error,
     total_interval,
 )
-from limber.estimation.objective import Evaluation, Forward, Objective, Stopped, held_out, without
+from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, gauss_newton, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import (
@@ -284,7 +285,7 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
         coarse = []
         values = objective.space.unpack(fit.evaluation.free)
         for forward in objective.forwards:
-            error = getattr(forward, "thinning_error", lambda _values: 0.0)(values)
+            error = forward.thinning_error(values)
             sigma = float(np.sqrt(np.median(np.einsum("fmii->fm", forward.frames.covariance)) / 3
                                   )) if forward.frames.covariance.size else np.inf
             if error > 0.3 * sigma:
@@ -295,7 +296,7 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
                      "noise; use more --key-frames.")
             return fit
         for forward in coarse:
-            forward.set_key_count(2 * forward.key_count)
+            forward.refine()
         fresh = objective.with_space(objective.space)
         fit = gauss_newton(fresh, fit.evaluation.free, robust=settings.robust,
                            evaluation_limit=settings.evaluations)
@@ -371,7 +372,7 @@ def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> 
 
     ``in_fit``: the pull is one of the estimate's, left out for this score alone.
     """
-    moved = forward.frames.positions - getattr(forward, "rest_points", np.nan)
+    moved = forward.frames.positions - forward.rest_points
     size = float(np.sqrt(np.nanmean(np.sum(moved**2, axis=2)))) if (
         np.isfinite(moved).any()) else np.nan
     pull = np.linalg.norm(forward.frames.wrenches[:, :3], axis=1)
@@ -465,7 +466,8 @@ def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
 
 def _reduced_error(found: Estimate) -> dict[str, Any]:
     """What the reduced model was off by before its correction by the full one."""
-    errors = [forward.error for forward in found.objective.forwards if hasattr(forward, "error")]
+    errors = [error for forward in found.objective.forwards
+              if (error := forward.reduction_error) is not None]
     if not errors:
         return {}
     position, force = np.max(errors, axis=0)

@@ -1,54 +1,19 @@
 """What an optimiser minimises: differences of simulated and measured, each over its deviation."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from limber.errors import Cancelled
 from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.input_force import Response
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import ParameterSpace
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
-from limber.recordings.recording import PullEntry
 
 FAILED_OBJECTIVE = 1e12
 """Objective of parameters under which the simulation finds no equilibrium."""
-
-
-@dataclass(frozen=True)
-class Simulated:
-    """A simulated pull at all frames, and its derivative to the physical parameters.
-
-    Attributes:
-        positions: Observed points [m], shape [f, m, 3].
-        forces: Of the gripper on the branch [N], shape [f, 3].
-        d_positions: Shape [f, m, 3, P], or None; P parameters in the order log E_1..log E_K and
-            the extra ones of the parameter space.
-        d_forces: Shape [f, 3, P], or None.
-        torques: About the grasp point [N m], shape [f, 3]; None: not known.
-        d_torques: Shape [f, 3, P], or None.
-    """
-
-    positions: np.ndarray
-    forces: np.ndarray
-    d_positions: np.ndarray | None = None
-    d_forces: np.ndarray | None = None
-    torques: np.ndarray | None = None
-    d_torques: np.ndarray | None = None
-
-
-class Forward(Protocol):
-    """Simulates one pull for given values; None where no equilibrium was found."""
-
-    name: str
-    entry: PullEntry
-    frames: Frames
-    uses_force: bool
-
-    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
-                 ) -> Simulated | None: ...
 
 
 @dataclass(frozen=True)
@@ -168,7 +133,7 @@ class Objective:
         """
         moved = False
         for index, simulated in enumerate(evaluation.pulls):
-            response = getattr(self.forwards[index], "response", None)
+            response = self.forwards[index].response
             if response is None:
                 continue
             columns, triangle = self._span(index, response)
@@ -186,7 +151,7 @@ class Objective:
             frames = self.forwards[index].frames
             loss += float(np.sum((simulated.positions - frames.positions)[_seen(frames)]**2))
             residual, jacobian = self._rows(index, simulated)
-            response = getattr(self.forwards[index], "response", None)
+            response = self.forwards[index].response
             if response is not None:
                 # What another force would explain is no sign of the moduli.
                 columns, _ = self._span(index, response)
@@ -288,8 +253,7 @@ def held_out(objective: Objective, free: np.ndarray, index: int) -> tuple[float,
     simulated = forward.simulate(objective.space.unpack(free), (), False)
     if simulated is None:
         return np.inf, np.inf
-    if hasattr(forward, "under_readings"):
-        simulated = forward.under_readings(simulated)
+    simulated = forward.under_readings(simulated)
     off = (simulated.positions - forward.frames.positions)[_seen(forward.frames)]
     force = simulated.forces - forward.frames.wrenches[:, :3]
     force = force[np.isfinite(force).all(axis=1)]

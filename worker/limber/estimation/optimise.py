@@ -111,7 +111,7 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
     """
     lower, upper = objective.space.bounds()
     rule = _Settling(objective, delta_m2)
-    if any(getattr(forward, "drive", "") == "force" for forward in objective.forwards):
+    if any(forward.drive == "force" for forward in objective.forwards):
         # What its errors do to the points is found with the derivatives.
         _required(objective, start)
 

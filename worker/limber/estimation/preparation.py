@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
+from limber.estimation.forward.forward import Forward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.objective import Forward
 from limber.estimation.parameters import Values
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.skeleton.control_points import control_points

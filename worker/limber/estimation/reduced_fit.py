@@ -11,16 +11,18 @@ moves, its residuals and derivatives are the full model's.
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from limber.errors import InputError, WorkError
+from limber.estimation.forward.corrected import CorrectedForward
+from limber.estimation.forward.forward import Forward
 from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.forward.reduced import ReducedForward
-from limber.estimation.objective import Objective, Simulated
+from limber.estimation.objective import Objective
 from limber.estimation.optimise import Fit
 from limber.estimation.parameters import Values
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
@@ -49,79 +51,6 @@ Optimise = Callable[..., Fit]
 Tell = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class _Correction:
-    """Full model less reduced model at some values, at all frames."""
-
-    values: Values
-    positions: np.ndarray
-    forces: np.ndarray
-    d_positions: np.ndarray
-    d_forces: np.ndarray
-    torques: np.ndarray | None
-    d_torques: np.ndarray | None
-
-
-class CorrectedForward:
-    """A reduced forward plus what the full model said of its error."""
-
-    def __init__(self, full: QuasiStaticForward, reduced: ReducedForward):
-        self.full, self.reduced = full, reduced
-        self.name, self.frames, self.uses_force = full.name, full.frames, full.uses_force
-        self.entry = full.entry
-        self._correction: _Correction | None = None
-
-    def correct(self, values: Values, extra: tuple[str, ...]) -> bool:
-        """Measure the reduced model's error at ``values``; whether both models have an answer."""
-        rough = self.reduced.simulate(values, extra, True)
-        if rough is None:
-            return False
-        # Two Newton iterations from there instead of a way from elsewhere.
-        self.full.hint(self.reduced.displacements(self.full.keys))
-        exact = self.full.simulate(values, extra, True)
-        if exact is None:
-            return False
-        keys, spread = self.full.keys, self.full.spread
-        names = ("positions", "forces", "d_positions", "d_forces", "torques", "d_torques")
-        off = [None if getattr(exact, name) is None else np.tensordot(
-            spread, (getattr(exact, name) - getattr(rough, name))[keys], axes=1) for name in names]
-        self._correction = _Correction(values, *off)
-        return True
-
-    @property
-    def error(self) -> tuple[float, float]:
-        """Largest error of the reduced model: in position [m], in force over the largest force."""
-        if self._correction is None:
-            return np.inf, np.inf
-        force = self.frames.wrenches[:, :3]
-        size = float(np.nanmax(np.linalg.norm(force, axis=1), initial=0.0)) or np.inf
-        return (float(np.linalg.norm(self._correction.positions, axis=2).max(initial=0.0)),
-                float(np.linalg.norm(self._correction.forces, axis=1).max()) / size)
-
-    def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
-                 ) -> Simulated | None:
-        """Return the pull under ``values``; None where a frame finds no equilibrium."""
-        found = self.reduced.simulate(values, extra, sensitivities)
-        known = self._correction
-        if found is None or known is None:
-            return found
-        step = _coordinates(values, extra) - _coordinates(known.values, extra)
-        return Simulated(
-            found.positions + known.positions + known.d_positions @ step,
-            found.forces + known.forces + known.d_forces @ step,
-            found.d_positions + known.d_positions if sensitivities else None,
-            found.d_forces + known.d_forces if sensitivities else None,
-            *self._torques(found, step, sensitivities))
-
-    def _torques(self, found: Simulated, step: np.ndarray, sensitivities: bool,
-                 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        known = self._correction
-        if found.torques is None:
-            return None, None
-        return (found.torques + known.torques + known.d_torques @ step,
-                found.d_torques + known.d_torques if sensitivities else None)
-
-
 class Reduction:
     """Reduced models of the pulls of an estimate.
 
@@ -134,7 +63,7 @@ class Reduction:
         InputError: a pull is driven by force or dynamic.
     """
 
-    def __init__(self, forwards: list[object], cache: Path | None = None, digest: str = ""):
+    def __init__(self, forwards: list[Forward], cache: Path | None = None, digest: str = ""):
         self.forwards = [_required(forward) for forward in forwards]
         self.groups = _groups(self.forwards)
         self.paths = [None if cache is None else cache / f".reduced-{_digest(group, digest)}.npz"
@@ -249,7 +178,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, tell: T
     return replace(fit, converged=False)
 
 
-def _required(forward: object) -> QuasiStaticForward:
+def _required(forward: Forward) -> QuasiStaticForward:
     if not isinstance(forward, QuasiStaticForward) or forward.drive != "pose":
         entry = forward.entry
         raise InputError(f"{forward.name} is {entry.drive}-driven and {entry.motion}.",
@@ -284,13 +213,6 @@ def _training_poses(forward: QuasiStaticForward) -> np.ndarray:
     keys, _ = key_frames(travel(forward.frames.poses), STATES_PER_PULL)
     return np.array([pose_on(forward.grasp, forward.entry.grasp, pose)
                      for pose in forward.frames.poses[keys]])
-
-
-def _coordinates(values: Values, extra: tuple[str, ...]) -> np.ndarray:
-    """The physical parameters that derivatives are taken to, as one vector."""
-    tail = {"poisson": values.poisson, "density": np.log(values.density), "alpha": 0.0,
-            "beta": 0.0}
-    return np.r_[np.log(values.young), [tail[name] for name in extra]]
 
 
 def _digest(group: list[QuasiStaticForward], digest: str) -> str:

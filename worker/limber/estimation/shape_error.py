@@ -10,8 +10,9 @@ import numpy as np
 from scipy import stats
 
 from limber.errors import WorkError
+from limber.estimation.forward.forward import Forward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.objective import Evaluation, Forward, Objective
+from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.preparation import Subject
 from limber.geometry.skeleton.likely_shapes import likely_skeletons, reshaped
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -84,7 +85,7 @@ def _pulled(evaluation: Evaluation, objective: Objective, subject: Subject, mesh
         forward.hint(hint)
     alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
     # Forces with errors of their own are eliminated from residuals by their derivatives.
-    linearised = any(getattr(forward, "has_force_unknowns", False) for forward in forwards)
+    linearised = any(forward.has_force_unknowns for forward in forwards)
     try:
         found = alone.evaluate(evaluation.free, jacobian=linearised)
     except WorkError:
@@ -95,6 +96,6 @@ def _pulled(evaluation: Evaluation, objective: Objective, subject: Subject, mesh
 
 
 def _forward(forward: Forward, model: BranchModel, weights: np.ndarray) -> QuasiStaticForward:
-    forward = getattr(forward, "full", forward)  # of a reduced one
+    forward = forward.full
     return QuasiStaticForward(forward.name, model, weights, forward.entry, forward.frames,
                               forward.rest_points, key_count=KEY_FRAMES)

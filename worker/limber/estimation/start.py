@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from limber.estimation.objective import Forward, Objective
+from limber.estimation.forward.forward import Forward
+from limber.estimation.objective import Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 
@@ -19,7 +20,7 @@ def scaled_start(objective: Objective, values: Values) -> Values:
     How far a force moves a branch depends on force over modulus alone: a few solutions give the
     scale. Where a force or gravity drives, a few decades are tried instead.
     """
-    if any(hasattr(forward, "until") for forward in objective.forwards):
+    if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
     return _scaled(objective, values)
 
@@ -30,8 +31,7 @@ def _scaled(objective: Objective, values: Values) -> Values:
     if factors:
         young = values.young * float(np.exp(np.mean(np.log(factors))))
         return replace(values, young=np.clip(young, *YOUNG_BOUNDS_PA))
-    if all(getattr(forward, "drive", "") == "force" and hasattr(forward, "rest_points")
-           for forward in objective.forwards):
+    if all(forward.drive == "force" for forward in objective.forwards):
         return _from_the_stiff_side(objective, values)
     return _scanned(objective, values)
 
@@ -47,7 +47,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
     likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
     for number, part in enumerate(PARTS):
         forwards = [forward.until(max(int(part * len(forward.frames)), FEWEST_FRAMES))
-                    if hasattr(forward, "until") else forward for forward in objective.forwards]
+                    for forward in objective.forwards]
         short = objective.with_forwards(forwards).with_space(likely)
         if number == 0:
             values = _scaled(short, values)
@@ -59,8 +59,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
 
 
 def _force_ratio(forward: Forward, values: Values) -> float | None:
-    usable = (forward.uses_force and forward.entry.drive == "pose"
-              and hasattr(forward, "force_ratio"))
+    usable = forward.uses_force and forward.drive == "pose"
     return forward.force_ratio(values) if usable else None
 
 

@@ -127,8 +127,7 @@ def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> l
 
 
 def _from_images(objective: Objective) -> bool:
-    entries = [getattr(forward, "entry", None) for forward in objective.forwards]
-    return any(entry is not None and entry.observation in ("depth", "clouds") for entry in entries)
+    return any(forward.entry.observation in ("depth", "clouds") for forward in objective.forwards)
 
 
 def _scale(residual: np.ndarray) -> float:

@@ -6,9 +6,9 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.estimation.forward.force_motion import motion_response
+from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.input_force import Response, nodal_loads
 from limber.estimation.forward.quasi_static import mechanics_names
-from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.materials import RayleighDamping
@@ -20,21 +20,22 @@ from limber.recordings.points import point_operator
 from limber.recordings.recording import PullEntry
 
 
-class DynamicForward:
-    """Simulates one pull by Newmark steps; see :class:`limber.estimation.objective.Forward`.
+class DynamicForward(Forward):
+    """Simulates one pull by Newmark steps.
 
     Arguments as for :class:`limber.estimation.forward.quasi_static.QuasiStaticForward`. Every frame
     counts, none is thinned: motion has no shortcuts.
     """
 
+    is_dynamic = True
+
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray):
-        self.name, self.frames, self.entry = name, frames, entry
+        super().__init__(name, entry, frames, rest_points)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if entry.drive == "force" and not measured.all():
             raise InputError(f"{name}: the force is missing in {np.sum(~measured)} frames.",
                              "A force-driven motion needs it throughout.", "Use --drive pose.")
-        self.drive = entry.drive
         if self.drive == "force" and entry.grasp.mode == "clamped":
             raise InputError(
                 f"{name}: the force of a clamped gripper is to drive a motion.",
@@ -42,11 +43,8 @@ class DynamicForward:
                 "what moves fast.",
                 'Use --drive pose; or set mode = "pinned" under [grasp] of pull.toml if the '
                 "branch could turn.")
-        self.uses_force = bool(measured.any())
         self._forces = frames.wrenches[:, :3]
-        self.response: Response | None = None
         self._arguments = (name, model, weights, entry)
-        self.rest_points = np.asarray(rest_points, float)
         self.weights = weights
         gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
         self._model = model.with_parameters(gravity=gravity)
@@ -57,9 +55,12 @@ class DynamicForward:
         columns = (3 * self._nodes[:, None] + np.arange(3)).ravel()
         self._near = self._operator[:, columns]
 
+    @property
+    def has_force_unknowns(self) -> bool:
+        return self.drive == "force"
+
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        """Return the pull under ``values``; None where the motion cannot be followed."""
         model = self._model.with_parameters(
             young=self.weights @ values.young, poisson=values.poisson, density=values.density,
             damping=RayleighDamping(*values.damping))
@@ -91,7 +92,7 @@ class DynamicForward:
         return Simulated(positions, forces, d_positions * scale, d_forces * scale)
 
     def until(self, count: int) -> "DynamicForward":
-        """Return the first ``count`` frames of the pull, driven by force where that is known.
+        """Return the first ``count`` frames, driven by force where that is known.
 
         Led along a path, a branch of wrong moduli is stretched, and its force is thousandfold;
         by a force it is merely moved too far.
@@ -103,12 +104,10 @@ class DynamicForward:
         return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points)
 
     def shift_force(self, change: np.ndarray) -> None:
-        """Move the force by what a fit says of it, shape [3 f]; respond anew from there on."""
         self._forces = self._forces + change.reshape(-1, 3)
         self.response = None
 
     def under_readings(self, simulated: Simulated) -> Simulated:
-        """Foretell a pull from its force's readings alone, without what its points say of it."""
         if self.response is None:
             return simulated
         change = (self.frames.wrenches[:, :3] - self._forces).ravel()

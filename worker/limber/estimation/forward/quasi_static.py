@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.errors import InputError, WorkError
+from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.input_force import (
     Course,
     Response,
@@ -14,7 +15,6 @@ from limber.estimation.forward.input_force import (
 )
 from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.gripper_path import force_for_travel
-from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.linear.factor import NotPositiveDefiniteError
@@ -44,8 +44,8 @@ class _Memory:
         return self.result.displacement
 
 
-class QuasiStaticForward:
-    """Simulates one pull in equilibrium; see :class:`limber.estimation.objective.Forward`.
+class QuasiStaticForward(Forward):
+    """Simulates one pull in equilibrium.
 
     States of the key frames are kept from call to call: parameters change little from one
     evaluation to the next, so that two Newton iterations a frame are enough.
@@ -62,18 +62,14 @@ class QuasiStaticForward:
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
                  frames: Frames, rest_points: np.ndarray, *, key_count: int = 12):
-        self.name, self.frames = name, frames
-        self.drive = entry.drive
+        super().__init__(name, entry, frames, rest_points)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if self.drive == "force" and measured.sum() < 2:
             raise InputError(f"{name}: a force-driven simulation without measured force.",
                              "Nothing would pull.", "Use --drive pose, or record the force.")
         if self.drive == "force" and entry.grasp.mode == "clamped":
             _require_torque(name, entry, frames)
-        self.uses_force = bool(measured.any())
         self.weights = weights
-        self.rest_points = np.asarray(rest_points, float)
-        self.entry = entry
         gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
         self._model = model.with_parameters(gravity=gravity)
         self.uses_torque = uses_torque(entry, frames)
@@ -85,7 +81,7 @@ class QuasiStaticForward:
         """Simulate at most ``count`` frames from now on; more where the force asks for it."""
         frames = self.frames
         self._course: Course | None = None
-        self.response: Response | None = None
+        self.response = None
         if self.drive == "pose":
             self.keys, self.spread = key_frames(travel(frames.poses), count)
             self._drives = [pose_on(self.grasp, self.entry.grasp, pose)
@@ -100,6 +96,9 @@ class QuasiStaticForward:
         self._memory: list[_Memory | None] = [None] * len(self.keys)
         self._values: Values | None = None
         self._hints: list[np.ndarray] | None = None
+
+    def refine(self) -> None:
+        self.set_key_count(2 * self.key_count)
 
     @property
     def key_count(self) -> int:
@@ -117,7 +116,6 @@ class QuasiStaticForward:
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        """Return the pull under ``values``; None where a frame finds no equilibrium."""
         model = self.model_with(values)
         log_young = np.log(values.young)
         jump = None if self._values is None else log_young - np.log(self._values.young)
@@ -167,15 +165,9 @@ class QuasiStaticForward:
 
     @property
     def has_force_unknowns(self) -> bool:
-        """Whether a measured force, with its errors, drives."""
         return self._course is not None and not self._course.exact
 
     def shift_force(self, change: np.ndarray) -> None:
-        """Move the course of the force by what a fit says of it; linearise anew from there on.
-
-        Args:
-            change: Of the unknowns, in the order of the response's columns, shape [L].
-        """
         steps = change.reshape(len(self.keys), -1)
         self._drives = [drive + step for drive, step in zip(self._drives, steps, strict=True)]
         self._hints = [memory.displacement + np.tensordot(step, moved, axes=1)
@@ -184,7 +176,6 @@ class QuasiStaticForward:
         self._values, self.response = None, None
 
     def under_readings(self, simulated: Simulated) -> Simulated:
-        """Foretell a pull from its force's readings alone, without what its points say of it."""
         if not self.has_force_unknowns or self.response is None:
             return simulated
         change = (self._measured - np.array(self._drives)).ravel()

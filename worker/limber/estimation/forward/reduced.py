@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from limber.errors import InputError
+from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.forward.quasi_static import uses_torque
-from limber.estimation.objective import Simulated
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.reduced.model import ReducedModel, ReducedSensitivities, ReducedState
@@ -20,8 +20,8 @@ STEPS = {"poisson": 2e-3, "density": 2e-2}
 """Steps of the central differences for what the reduced model has no derivatives to."""
 
 
-class ReducedForward:
-    """Simulates one pose-driven pull; see :class:`limber.estimation.objective.Forward`.
+class ReducedForward(Forward):
+    """Simulates one pose-driven pull on the reduced model.
 
     Args:
         name: The pull's name.
@@ -44,10 +44,8 @@ class ReducedForward:
             raise InputError(f"{name} is {entry.drive}-driven and {entry.motion}.",
                              "The reduced model is held at poses, slowly.",
                              "Use the full model for this pull (--forward full).")
-        self.name, self.frames, self.entry = name, frames, entry
-        self.uses_force = bool(np.isfinite(frames.wrenches[:, :3]).all(axis=1).any())
+        super().__init__(name, entry, frames, rest_points)
         self.uses_torque = uses_torque(entry, frames)
-        self.rest_points = np.asarray(rest_points, float)
         self.keys, self.spread = key_frames(travel(frames.poses), key_count)
         self._reduced, self._density = reduced, density
         columns = reduced.basis.columns.reshape(reduced.size, -1)
@@ -59,7 +57,6 @@ class ReducedForward:
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
-        """Return the pull under ``values``; None where a frame finds no equilibrium."""
         model = self._model(values)
         moved = {name: [self._model(_shifted(values, name, sign * STEPS[name]))
                         for sign in (1, -1)] for name in extra if name in STEPS}

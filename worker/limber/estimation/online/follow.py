@@ -82,8 +82,8 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
                 progress(0.5 + 0.45 * share, "following", time_s=frame.time,
                          young_mpa=" ".join(f"{young / 1e6:.4g}" for young in latest.young),
                          enough=latest.enough)
-                for kind in ("enough", "idle"):
-                    if getattr(latest, kind) and kind not in told:
+                for kind, is_so in (("enough", latest.enough), ("idle", latest.idle)):
+                    if is_so and kind not in told:
                         warn(f"{name}: {frame.time:.2f} s: {SAID[kind]}")
                         told.add(kind)
             progress(0.95, "waiting for the full model")
