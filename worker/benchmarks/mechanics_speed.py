@@ -96,11 +96,11 @@ def parts_of(model: BranchModel, count: int = 15) -> Parts:
     for _ in range(count + 1):
         stamps = [time.process_time()]
         model.internal(zero)
-        equations.assemble(model, zero)
+        values = equations.assemble(model, zero)
         stamps.append(time.process_time())
-        equations.factorise()
+        tangent = equations.factorised(values)
         stamps.append(time.process_time())
-        equations.solve(right)
+        tangent.solve(right)
         stamps.append(time.process_time())
         times.append(np.diff(stamps))
     return Parts(*np.min(times[1:], axis=0))
@@ -111,10 +111,9 @@ def cholmod_seconds(model: BranchModel) -> float:
     from limber.mechanics.linear.factor import CholmodFactor
 
     equations = model.equations()
-    equations.assemble(model, np.zeros_like(model.mesh.nodes))
+    values = equations.assemble(model, np.zeros_like(model.mesh.nodes))
     pattern = equations.pattern
     general = CholmodFactor(*pattern.entries(), pattern.size)
-    values = equations._values[:pattern.value_count]
     return least_seconds(lambda: general.factorise(values), 7)
 
 
@@ -176,9 +175,8 @@ def linear_row() -> Row:
 
     def step() -> None:
         model.internal(zero)
-        equations.assemble(model, zero, mass_factor=14400.0)
-        equations.factorise()
-        equations.solve(right - model.mass_matrix @ zero)
+        tangent = equations.tangent(model, zero, mass_factor=14400.0)
+        tangent.solve(right - model.mass_matrix @ zero)
 
     seconds = least_seconds(step)
     return Row(f"linear tetrahedra, one-Newton step, {mesh.tet_count} tetrahedra",

@@ -10,6 +10,7 @@ from tests.subjects.meshes import box_mesh
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp
 from limber.mechanics.grasp import rotation_matrix
+from limber.mechanics.linear import equations as equations_module
 from limber.mechanics.linear import factor
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.linear.fronts import make_fronts, postordered
@@ -31,10 +32,8 @@ def curved_box():
     return TetMesh(nodes, mesh.tets, point_data=mesh.point_data)
 
 
-def full_stiffness(model, equations):
-    pattern = equations.pattern
-    lower = sp.csc_matrix((equations._values[:pattern.value_count],
-                           pattern.entries()), shape=(pattern.size,) * 2)
+def full_stiffness(pattern, values):
+    lower = sp.csc_matrix((values, pattern.entries()), shape=(pattern.size,) * 2)
     return lower + sp.tril(lower, -1).T
 
 
@@ -86,8 +85,8 @@ def test_force_and_stiffness_are_derivatives(mesh, material):
     product = model.tangent_times(u, d)[~model.fixed]
     assert np.linalg.norm(product - by_force) < 1e-6 * np.linalg.norm(by_force)
     equations = model.equations()
-    equations.assemble(model, u)
-    assembled = full_stiffness(model, equations) @ d[equations.pattern.order].ravel()
+    values = equations.assemble(model, u)
+    assembled = full_stiffness(equations.pattern, values) @ d[equations.pattern.order].ravel()
     exact = model.tangent_times(u, d)[equations.pattern.order].ravel()
     assert np.linalg.norm(assembled - exact) < 1e-12 * np.linalg.norm(exact)
 
@@ -105,9 +104,9 @@ def test_viscous_stiffness_is_the_derivative(material):
     change = (model.internal(u + h * d, viscous=viscous).force
               - model.internal(u - h * d, viscous=viscous).force) / (2 * h)
     equations = model.equations()
-    equations.assemble(model, u, viscous=viscous)
+    values = equations.assemble(model, u, viscous=viscous)
     order = equations.pattern.order
-    assembled = full_stiffness(model, equations) @ d[order].ravel()
+    assembled = full_stiffness(equations.pattern, values) @ d[order].ravel()
     assert np.linalg.norm(assembled - change[order].ravel()) < 1e-6 * np.linalg.norm(change)
 
 
@@ -128,10 +127,10 @@ def test_pinned_solution_keeps_the_mean_and_balances(short_box):
     model = make_model(short_box)
     equations = model.equations([grasp])
     zero = np.zeros_like(short_box.nodes)
-    equations.assemble(model, zero)
-    assert equations.factorise()
+    tangent = equations.tangent(model, zero)
+    assert tangent.is_positive_definite
     move = np.array([[1e-4, 2e-4, -1e-4]])
-    solution = equations.solve(zero, move)
+    solution = tangent.solve(zero, move)
     assert grasp.weights @ solution[grasp.nodes] == pytest.approx(move[0], rel=1e-9)
     left = equations.free_part(model.tangent_times(zero, solution))
     assert np.linalg.norm(left) < 1e-9 * np.linalg.norm(model.tangent_times(zero, solution))
@@ -155,9 +154,8 @@ def test_every_factor_solves_and_refuses(name, quadratic):
     model = make_model(mesh)
     equations = model.equations()
     pattern = equations.pattern
-    equations.assemble(model, np.zeros_like(mesh.nodes))
-    values = equations._values[:pattern.value_count].copy()
-    matrix = full_stiffness(model, equations)
+    values = equations.assemble(model, np.zeros_like(mesh.nodes)).copy()
+    matrix = full_stiffness(pattern, values)
     right = np.random.default_rng(0).standard_normal((pattern.size, 4))
     candidate = factor_of(name, pattern)
     for _ in range(2):
@@ -171,6 +169,31 @@ def test_every_factor_solves_and_refuses(name, quadratic):
         raised[pattern.diagonal] -= 0.5 * values[pattern.diagonal].mean()
         with pytest.raises(factor.NotPositiveDefiniteError):
             candidate.factorise(raised)
+
+
+@pytest.mark.parametrize("name", FACTORS)
+def test_a_tangent_stays_what_it_is(name, short_box, monkeypatch):
+    """Another tangent of the same equations changes nothing in one that is still held; the memory
+    of one that is not serves the next, and one that cannot be factorised takes none along."""
+    monkeypatch.setattr(equations_module, "make_factor", lambda pattern: factor_of(name, pattern))
+    grasp = Grasp.of_nodes(short_box, np.flatnonzero(short_box.nodes[:, 2] > 0.0299), "pinned")
+    model = make_model(short_box)
+    equations = model.equations([grasp])
+    zero = np.zeros_like(short_box.nodes)
+    right, move = np.ones_like(zero), np.array([[1e-4, 2e-4, -1e-4]])
+    first = equations.tangent(model, zero)
+    before, norm = first.solve(right, move), first.diagonal_norm
+    second = equations.tangent(model.with_young(3 * model.young), zero)
+    np.testing.assert_array_equal(first.solve(right, move), before)
+    assert first.diagonal_norm == norm
+    np.testing.assert_allclose(second.solve(right, 0 * move),
+                               first.solve(right, 0 * move) / 3, rtol=1e-8, atol=1e-16)
+    del first, second
+    assert len(equations._spare) == 2
+    with pytest.raises(factor.NotPositiveDefiniteError):
+        equations.factorised(np.full(equations.pattern.value_count, -1.0))
+    assert len(equations._spare) == 2
+    np.testing.assert_array_equal(equations.tangent(model, zero).solve(right, move), before)
 
 
 def test_fronts_hold_all_that_fills_in():

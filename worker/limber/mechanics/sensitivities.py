@@ -13,7 +13,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.linear.equations import Equations, Viscous
+from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.materials import lame_by_poisson
 from limber.mechanics.model import BranchModel
 
@@ -81,42 +81,41 @@ def static_sensitivities(model: BranchModel, result: "StaticResult",  # noqa: F8
     grasps = [] if grasp is None else [grasp] if isinstance(grasp, Grasp) else list(grasp)
     equations = model.equations(grasps if is_held else ())
     u = result.displacement
-    equations.assemble(model, u)
-    equations.factorise()
+    tangent = equations.tangent(model, u)
     explicit = explicit_forces(model, wanted, result, None)
 
-    def tangent(direction: np.ndarray) -> np.ndarray:
+    def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(u, direction)
 
     columns, forces, energies = [], [], []
     internal = model.internal(u)
     for partial in explicit:
-        change = refined_solve(equations, tangent, -partial)
+        change = refined_solve(tangent, force, -partial)
         columns.append(change)
-        out = partial + tangent(change)
+        out = partial + force(change)
         forces.append(reactions(grasps, out) if is_held else np.zeros((len(grasps), 3)))
         energies.append(float((internal.force * change).sum()))
     energies = np.array(energies) + explicit_energies(model, wanted, u)
-    force = np.stack(forces, axis=-1) if grasps else np.zeros((1, 3, len(columns)))
+    reaction = np.stack(forces, axis=-1) if grasps else np.zeros((1, 3, len(columns)))
     if isinstance(grasp, Grasp) or grasp is None:
-        force = force[0]
-    return StaticSensitivities(wanted.labels(), np.stack(columns, axis=-1), force, energies)
+        reaction = reaction[0]
+    return StaticSensitivities(wanted.labels(), np.stack(columns, axis=-1), reaction, energies)
 
 
-def refined_solve(equations: Equations, tangent: Callable[[np.ndarray], np.ndarray],
-                  right: np.ndarray, guess: np.ndarray | None = None) -> np.ndarray:
-    """Return x with tangent(x) = right on the free nodes, from a nearby factor."""
-    solution = equations.solve(right) if guess is None else guess
+def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
+                  right: np.ndarray) -> np.ndarray:
+    """Return x with force(x) = right on the free nodes, from a nearby tangent."""
+    equations, solution = tangent.equations, tangent.solve(right)
     scale = np.linalg.norm(equations.free_part(right))
     last = np.inf
     for _ in range(_REFINEMENTS):
-        left = equations.free_part(right - tangent(solution))
+        left = equations.free_part(right - force(solution))
         norm = float(np.linalg.norm(left))
         if norm <= 1e-10 * scale or norm >= 0.5 * last:
             # Round-off is reached, or the factor is too far away to get nearer.
             break
         last = norm
-        solution = solution + equations.solve(left)
+        solution = solution + tangent.solve(left)
     return solution
 
 

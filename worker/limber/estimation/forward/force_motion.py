@@ -46,17 +46,15 @@ def motion_response(model: BranchModel, loads: np.ndarray, observed: object, tim
 
 def _modes(model: BranchModel, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Squared angular frequencies [1/s^2], modes of unit modal mass, and static solutions."""
-    equations = model.equations(())
-    equations.assemble(model, np.zeros_like(model.mesh.nodes))
-    equations.factorise()
-    static = np.array([equations.solve(load) for load in loads])
+    tangent = model.equations(()).tangent(model, np.zeros_like(model.mesh.nodes))
+    static = np.array([tangent.solve(load) for load in loads])
     rng = np.random.default_rng(0)
     free = rng.standard_normal((MODES + SPARE - len(loads), *model.mesh.nodes.shape))
     free[:, model.fixed] = 0.0
     vectors = np.concatenate([static, free])
     for _ in range(ITERATIONS):
         pushed = np.array([model.mass_times(vector) for vector in vectors])
-        vectors = np.array([equations.solve(force) for force in pushed])
+        vectors = np.array([tangent.solve(force) for force in pushed])
         flat = vectors.reshape(len(vectors), -1)
         stiffness = flat @ pushed.reshape(len(vectors), -1).T
         mass = flat @ np.array([model.mass_times(v).ravel() for v in vectors]).T

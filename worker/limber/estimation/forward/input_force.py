@@ -132,12 +132,10 @@ def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndar
 
 def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) -> np.ndarray:
     """Change of an equilibrium by each nodal load, shape [c, node_count, 3]."""
-    equations = model.equations(())
-    equations.assemble(model, displacement)
-    equations.factorise()
+    tangent = model.equations(()).tangent(model, displacement)
 
-    def tangent(direction: np.ndarray) -> np.ndarray:
+    def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(displacement, direction)
 
-    return np.array([refined_solve(equations, tangent, load) for load in loads])
+    return np.array([refined_solve(tangent, force, load) for load in loads])
 

@@ -1,4 +1,4 @@
-"""Derivatives along a motion: each step's, from the factor that it was solved with."""
+"""Derivatives along a motion: each step's, from the tangent that it was solved with."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
-from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.sensitivities import (
     ParameterSet,
     explicit_forces,
@@ -66,8 +66,8 @@ class MotionTangents:
                          for out, now, was in zip(self._out, after, before, strict=True)]
 
     def advance(self, old: MotionState, new: MotionState, dt: float,
-                viscous: Viscous | None) -> None:
-        """Go a step along with the motion."""
+                viscous: Viscous | None, tangent: Tangent) -> None:
+        """Go a step along with the motion, which was solved with ``tangent``."""
         model, settings = self.model, self.settings
         beta, gamma = settings.beta, settings.gamma
         rate, inertia = gamma / (beta * dt), 1 / (beta * dt**2)
@@ -90,7 +90,7 @@ class MotionTangents:
                 memory = model.damping.stiffness * (formula[1] * past.strain
                                                     + formula[2] * past.strain_before)
                 history = history + viscous_force(model, new.displacement, memory)
-            change = refined_solve(self.equations, force, -history)
+            change = refined_solve(tangent, force, -history)
             strain = past.strain if viscous is None else model.strain_changes(
                 new.displacement, change)
             motion = (v_zero + rate * change, a_zero + inertia * change)

@@ -1,4 +1,4 @@
-"""One implicit Newmark step: mixed-point Newton with factors kept as long as they serve."""
+"""One implicit Newmark step: mixed-point Newton with tangents kept as long as they serve."""
 
 from dataclasses import replace
 
@@ -6,18 +6,19 @@ import numpy as np
 
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
-from limber.mechanics.linear.equations import Viscous
+from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.linear.factor import NotPositiveDefiniteError
 
-_GOOD_FACTOR = 1e-3
+_GOOD_TANGENT = 1e-3
 
 
 class NewmarkStepper:
-    """Takes steps, and remembers the factor of the last.
+    """Takes steps, and keeps the tangent of the last.
 
     Attributes:
         iteration_count: So far.
         status, trouble: Why the last step failed.
+        tangent: The last step was solved with; None before the first.
     """
 
     def __init__(self, drive: Drive, settings: NewmarkSettings):
@@ -25,11 +26,12 @@ class NewmarkStepper:
         self.model, self.equations = drive.model, drive.equations
         self.iteration_count = 0
         self.status, self.trouble = "converged", ""
-        self._factor_step, self._factor_error = 0.0, np.inf
+        self.tangent: Tangent | None = None
+        self._tangent_step, self._tangent_error = 0.0, np.inf
 
-    def forget_factor(self) -> None:
-        """Use the last factor no more."""
-        self._factor_step = 0.0
+    def forget_tangent(self) -> None:
+        """Use the last tangent no more."""
+        self.tangent = None
 
     def viscous(self, old: MotionState, dt: float) -> Viscous | None:
         """Return the viscous part of a step of ``dt`` from ``old``."""
@@ -66,15 +68,15 @@ class NewmarkStepper:
             if increment is not None and norm <= max(settings.tolerance * reference,
                                                      self._floor()):
                 if fresh:
-                    self._factor_error = norm / norms[-1]
+                    self._tangent_error = norm / norms[-1]
                 return self._accepted(new, min_det_f)
             first = increment is None
             if fresh:
-                self._factor_error, fresh = norm / norms[-1], False
+                self._tangent_error, fresh = norm / norms[-1], False
             keep = self._may_keep(dt) if first else (
                 norm <= settings.keep_factor * reference and norm < 0.1 * norms[-1])
             if not keep:
-                if not self._factorise(new, increment, viscous, dt):
+                if not self._make_tangent(new, increment, viscous, dt):
                     return None
                 fresh = True
             norms.append(norm)
@@ -82,7 +84,7 @@ class NewmarkStepper:
             if first and moved is not None:
                 residual = equations.free_part(
                     out - model.tangent_times(old.displacement, moved, viscous))
-            increment = equations.solve(residual, pins)
+            increment = self.tangent.solve(residual, pins)
             if moved is not None and equations.held.any():
                 increment = increment + moved
             moved, pins = None, np.zeros_like(pins)
@@ -102,25 +104,27 @@ class NewmarkStepper:
         self.drive.hold(new)
 
     def _may_keep(self, dt: float) -> bool:
-        """Whether the last factor fits the state before this step.
+        """Whether the last tangent fits the state before this step.
 
         It does if its own solve brought the residual down a thousandfold.
         """
-        return (self.settings.keep_factor > 0 and self._factor_step == dt
-                and self._factor_error <= _GOOD_FACTOR)
+        return (self.settings.keep_factor > 0 and self.tangent is not None
+                and self._tangent_step == dt and self._tangent_error <= _GOOD_TANGENT)
 
-    def _factorise(self, new: MotionState, increment: np.ndarray | None,
+    def _make_tangent(self, new: MotionState, increment: np.ndarray | None,
                    viscous: Viscous | None, dt: float) -> bool:
         settings, damping = self.settings, self.model.damping
         rate, inertia = settings.gamma / (settings.beta * dt), 1 / (settings.beta * dt**2)
+        # Its memory serves the new one.
+        self.tangent = None
         try:
-            self.equations.assemble(self.model, new.displacement, increment=increment,
-                                    viscous=viscous, mass_factor=inertia + damping.mass * rate)
-            self.equations.factorise()
+            self.tangent = self.equations.tangent(
+                self.model, new.displacement, increment=increment, viscous=viscous,
+                mass_factor=inertia + damping.mass * rate)
         except NotPositiveDefiniteError:
             self.trouble, self.status = "the stiffness has no positive pivots", "stalled"
             return False
-        self._factor_step = dt
+        self._tangent_step = dt
         return True
 
     def _imbalance(self, new: MotionState, load: np.ndarray, viscous: Viscous | None,
@@ -133,7 +137,7 @@ class NewmarkStepper:
 
     def _floor(self) -> float:
         # Differences of displacements in an element carry round-off of about one unit each.
-        return 8 * np.finfo(float).eps * self.equations.diagonal_norm() * self.model.mean_edge
+        return 8 * np.finfo(float).eps * self.tangent.diagonal_norm * self.model.mean_edge
 
     def _accepted(self, new: MotionState, min_det_f: float) -> MotionState | None:
         if min_det_f <= 0:

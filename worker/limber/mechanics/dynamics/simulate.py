@@ -119,9 +119,7 @@ class _Motion:
                - model.internal(state.displacement).force
                - model.mass_times(model.damping.mass * state.velocity + state.acceleration))
         if np.linalg.norm(self.equations.free_part(out)) > 1e-12 * np.linalg.norm(out):
-            self.equations.factorise_mass(model)
-            state.acceleration += self.equations.solve(out)
-            self.stepper.forget_factor()
+            state.acceleration += self.equations.mass(model).solve(out)
 
     def go(self, progress: Progress) -> DynamicResult:
         started = time.perf_counter()
@@ -153,7 +151,7 @@ class _Motion:
         viscous = stepper.viscous(old, dt)
         new = stepper.step(old, dt, drive.load_at(old.time + dt), viscous)
         if new is None:
-            stepper.forget_factor()
+            stepper.forget_tangent()
             return False
         stretch = principal_stretch(self.model, new.displacement)
         if stretch.value > self.settings.stretch_limit:
@@ -165,7 +163,7 @@ class _Motion:
         self.viscous, self.state = viscous, new
         tangents = self.tangents
         if tangents:
-            tangents.advance(old, new, dt, viscous)
+            tangents.advance(old, new, dt, viscous, stepper.tangent)
             before = tangents.explicit(new, viscous)
         if drive.path:
             drive.impose(new)

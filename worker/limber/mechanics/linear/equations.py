@@ -1,4 +1,4 @@
-"""The linear equations of the free nodes: assembled, factorised and solved again and again."""
+"""The linear equations of the free nodes, assembled again and again; each gives a tangent."""
 
 import copy
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from limber.compiled import for_kernels
 from limber.mechanics.elements.stiffness import tangent_stiffness
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.linear.factor import NotPositiveDefiniteError, make_factor
+from limber.mechanics.linear.factor import Factor, NotPositiveDefiniteError, make_factor
 from limber.mechanics.linear.pattern import LaneLayout, Pattern
 from limber.mechanics.materials import Material
 
@@ -36,6 +36,72 @@ class Viscous:
     memory: np.ndarray
 
 
+class Tangent:
+    """A factorised stiffness, with inertia perhaps; it stays what it is while others are made.
+
+    Its memory goes back to the equations when nothing refers to it any more.
+
+    Attributes:
+        equations: Whose tangent it is: their constraints hold.
+        is_positive_definite: Whether it was, as it was assembled. If not, its diagonal was raised
+            until it was: a solution is then still a descent direction of the energy, but not
+            Newton's.
+        diagonal_norm: 2-norm of its diagonal [N/m].
+        drag: What was added to its diagonal on purpose [N/m].
+    """
+
+    def __init__(self, equations: "Equations", factor: Factor, values: np.ndarray, drag: float):
+        self.equations, self._factor = equations, factor
+        diagonal = equations.pattern.diagonal
+        self.drag = 0.0
+        if drag:
+            self.drag = drag * float(np.abs(values[diagonal]).mean())
+            values[diagonal] += self.drag
+        self.is_positive_definite = self._factorise(values, diagonal)
+        self.diagonal_norm = float(np.linalg.norm(values[diagonal]))
+        if equations.pinned:
+            self._pin_solutions = factor.solve(equations.pin_rows)
+            self._compliance = equations.pin_rows.T @ self._pin_solutions
+
+    def __del__(self) -> None:
+        self.equations.take_back(self._factor)
+
+    def _factorise(self, values: np.ndarray, diagonal: np.ndarray) -> bool:
+        scale = np.abs(values[diagonal]).mean()
+        shift = 0.0
+        while True:
+            self.equations.factorisation_count += 1
+            try:
+                self._factor.factorise(values)
+            except NotPositiveDefiniteError:
+                raised = max(10 * shift, _FIRST_SHIFT)
+                if raised > _LAST_SHIFT or not np.isfinite(scale):
+                    raise
+                values[diagonal] += (raised - shift) * scale
+                shift = raised
+                continue
+            return shift == 0.0
+
+    def solve(self, right: np.ndarray, pin_moves: np.ndarray | None = None) -> np.ndarray:
+        """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
+
+        Args:
+            right: Forces [N] on all nodes, shape [node_count, 3]; those on held nodes are left
+                out.
+            pin_moves: Prescribed means of the pinned patches [m], shape [pinned, 3]; default 0.
+        """
+        equations = self.equations
+        order = equations.pattern.order
+        solution = self._factor.solve(right[order].ravel())
+        if equations.pinned:
+            moves = 0.0 if pin_moves is None else np.ravel(pin_moves)
+            excess = equations.pin_rows.T @ solution - moves
+            solution = solution - self._pin_solutions @ np.linalg.solve(self._compliance, excess)
+        result = np.zeros_like(right)
+        result[order] = solution.reshape(-1, 3)
+        return result
+
+
 class Equations:
     """Stiffness equations for one set of constraints; shared by models of one mesh.
 
@@ -47,6 +113,7 @@ class Equations:
     Attributes:
         held: Whether a node is fixed or clamped, shape [node_count].
         pinned: The pinned grasps.
+        pin_rows: Their constraints: rows of the mean of each patch, shape [size, 3 pinned].
         factorisation_count: Numeric factorisations so far.
     """
 
@@ -60,32 +127,69 @@ class Equations:
         self.pattern = Pattern(tets, len(fixed), ~self.held, [g.nodes for g in self.pinned])
         self.layout = LaneLayout(self.pattern, tets, gradients, weights)
         self.factorisation_count = 0
-        self._factor = make_factor(self.pattern)
+        # Factors that no tangent uses: their memory and symbolic part serve the next one.
+        self._spare: list[Factor] = [make_factor(self.pattern)]
+        self._twin = self._spare[0].twin
         self._values = self.pattern.scratch_values()
         self._mass: tuple[object, np.ndarray] | None = None
         self._pin_entries = [self._entries_of(grasp) for grasp in self.pinned]
-        self._pin_rows = np.zeros((self.pattern.size, 3 * len(self.pinned)))
+        self.pin_rows = np.zeros((self.pattern.size, 3 * len(self.pinned)))
         for number, grasp in enumerate(self.pinned):
             rows = 3 * self.pattern.position[grasp.nodes]
             for axis in range(3):
-                self._pin_rows[rows + axis, 3 * number + axis] = grasp.weights
-        self._pin_solutions = np.zeros_like(self._pin_rows)
+                self.pin_rows[rows + axis, 3 * number + axis] = grasp.weights
 
     def placed(self, tets: np.ndarray, gradients: np.ndarray, weights: np.ndarray) -> "Equations":
-        """Return the equations of the same tetrahedra elsewhere; pattern and factor are shared."""
+        """Return the equations of the same tetrahedra elsewhere; pattern and memory are shared."""
         other = copy.copy(self)
         other.layout = LaneLayout(self.pattern, tets, gradients, weights)
         other._mass = None
         return other
 
-    def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
-                 increment: np.ndarray | None = None, viscous: Viscous | None = None,
-                 mass_factor: float = 0.0) -> None:
-        """Assemble tangent stiffness plus ``mass_factor`` [1/s^2] times the mass.
+    def tangent(self, model: "BranchModel", displacement: np.ndarray, *,
+                increment: np.ndarray | None = None, viscous: Viscous | None = None,
+                mass_factor: float = 0.0, drag: float = 0.0) -> Tangent:
+        """Return tangent stiffness plus ``mass_factor`` [1/s^2] times the mass, factorised.
 
         Args:
             increment: The last increment [m], for mixed-point Newton (StVK only).
             viscous: Viscous part in motion.
+            drag: Part of the mean diagonal that is added to the diagonal.
+
+        Raises:
+            NotPositiveDefiniteError: it is not positive definite, however far its diagonal is
+                raised.
+        """
+        return self.factorised(self.assemble(
+            model, displacement, increment=increment, viscous=viscous, mass_factor=mass_factor),
+            drag)
+
+    def mass(self, model: "BranchModel") -> Tangent:
+        """Return the factorised mass matrix, for accelerations at the start."""
+        self._values[:] = self._mass_values(model)
+        self._add_pins()
+        return self.factorised(self._values[:self.pattern.value_count])
+
+    def factorised(self, values: np.ndarray, drag: float = 0.0) -> Tangent:
+        """Return the tangent of assembled ``values``; they are raised in place where it needs it.
+
+        Args:
+            values: Lower triangle by columns, from :meth:`assemble`.
+            drag: As for :meth:`tangent`.
+        """
+        factor = self._spare.pop() if self._spare else self._twin()
+        return Tangent(self, factor, values, drag)
+
+    def take_back(self, factor: Factor) -> None:
+        """Keep the memory of a tangent that is no longer used for the next one."""
+        self._spare.append(factor)
+
+    def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
+                 increment: np.ndarray | None = None, viscous: Viscous | None = None,
+                 mass_factor: float = 0.0) -> np.ndarray:
+        """Return the matrix of :meth:`tangent`, lower triangle by columns, shape [value_count].
+
+        In the one memory that all assembly of these equations writes to.
         """
         if mass_factor:
             np.multiply(self._mass_values(model), mass_factor, out=self._values)
@@ -103,57 +207,7 @@ class Equations:
                           int(model.material), growth, memory, layout.slots, layout.lengths,
                           self._values)
         self._add_pins()
-
-    def factorise(self) -> bool:
-        """Factorise what was assembled; return whether it was positive definite.
-
-        If it was not, the diagonal is raised until it is: the solution is then still a descent
-        direction of the energy, but not Newton's.
-        """
-        values = self._values[:self.pattern.value_count]
-        scale = np.abs(values[self.pattern.diagonal]).mean()
-        shift = 0.0
-        while True:
-            self.factorisation_count += 1
-            try:
-                self._factor.factorise(values)
-            except NotPositiveDefiniteError:
-                raised = max(10 * shift, _FIRST_SHIFT)
-                if raised > _LAST_SHIFT or not np.isfinite(scale):
-                    raise
-                values[self.pattern.diagonal] += (raised - shift) * scale
-                shift = raised
-                continue
-            break
-        if self.pinned:
-            self._pin_solutions = self._factor.solve(self._pin_rows)
-        return shift == 0.0
-
-    def raise_diagonal(self, part: float) -> float:
-        """Add ``part`` of the mean diagonal to what was assembled; return what was added [N/m]."""
-        values = self._values[:self.pattern.value_count]
-        added = part * float(np.abs(values[self.pattern.diagonal]).mean())
-        values[self.pattern.diagonal] += added
-        return added
-
-    def solve(self, right: np.ndarray, pin_moves: np.ndarray | None = None) -> np.ndarray:
-        """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
-
-        Args:
-            right: Forces [N] on all nodes, shape [node_count, 3]; those on held nodes are left
-                out.
-            pin_moves: Prescribed means of the pinned patches [m], shape [pinned, 3]; default 0.
-        """
-        free = right[self.pattern.order].ravel()
-        solution = self._factor.solve(free)
-        if self.pinned:
-            moves = 0.0 if pin_moves is None else np.ravel(pin_moves)
-            compliance = self._pin_rows.T @ self._pin_solutions
-            excess = self._pin_rows.T @ solution - moves
-            solution = solution - self._pin_solutions @ np.linalg.solve(compliance, excess)
-        result = np.zeros_like(right)
-        result[self.pattern.order] = solution.reshape(-1, 3)
-        return result
+        return self._values[:self.pattern.value_count]
 
     def free_part(self, force: np.ndarray) -> np.ndarray:
         """Return forces without what the constraints bear: held nodes, means of pinned patches."""
@@ -166,16 +220,6 @@ class Equations:
         """Return the force [N] that each pinned grasp takes of nodal forces, shape [pinned, 3]."""
         return np.array([grasp.weights @ force[grasp.nodes] / (grasp.weights @ grasp.weights)
                          for grasp in self.pinned]).reshape(-1, 3)
-
-    def diagonal_norm(self) -> float:
-        """Return the 2-norm of the assembled diagonal [N/m]."""
-        return float(np.linalg.norm(self._values[self.pattern.diagonal]))
-
-    def factorise_mass(self, model: "BranchModel") -> None:
-        """Factorise the mass matrix, for accelerations at the start."""
-        self._values[:] = self._mass_values(model)
-        self._add_pins()
-        self.factorise()
 
     def _mass_values(self, model: "BranchModel") -> np.ndarray:
         matrix = model.mass_matrix

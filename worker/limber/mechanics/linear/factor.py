@@ -37,8 +37,12 @@ class CholmodFactor:
         # A numpy view on cvxopt's own memory: one copy less for each factorisation.
         self._values = matrix(0.0, (len(rows), 1))
         self._view = np.asarray(self._values)[:, 0]
-        self._size = size
+        self._rows, self._columns, self._size = rows, columns, size
         self._factor = None
+
+    def twin(self) -> "CholmodFactor":
+        """Return a factor of the same pattern with memory of its own."""
+        return CholmodFactor(self._rows, self._columns, self._size)
 
     def factorise(self, values: np.ndarray) -> None:
         """Factorise the matrix with these ``values``, shape [nnz].
@@ -74,6 +78,10 @@ class SuperLuFactor:
         self._rows, self._columns, self._size = rows, columns, size
         self._factor = None
 
+    def twin(self) -> "SuperLuFactor":
+        """As :meth:`CholmodFactor.twin`."""
+        return SuperLuFactor(self._rows, self._columns, self._size)
+
     def factorise(self, values: np.ndarray) -> None:
         """As :meth:`CholmodFactor.factorise`."""
         from scipy.sparse.linalg import splu
@@ -94,7 +102,10 @@ class SuperLuFactor:
         return self._factor.solve(np.ascontiguousarray(right))
 
 
-def make_factor(pattern: "Pattern") -> SupernodalFactor | CholmodFactor | SuperLuFactor:
+Factor = SupernodalFactor | CholmodFactor | SuperLuFactor
+
+
+def make_factor(pattern: "Pattern") -> Factor:
     """Return the fastest factor for a pattern that is installed; one thread from now on.
 
     The pattern's order of elimination has loaded cvxopt, the last of the libraries to limit.

@@ -5,6 +5,8 @@ them (CHOLMOD through cvxopt: a third on transposing the matrix, a quarter in BL
 matrix goes straight to its place, and all loops run over rows in whole vectors.
 """
 
+import copy
+
 import numpy as np
 
 from limber.compiled import compiled
@@ -30,6 +32,12 @@ class SupernodalFactor:
         self._factor = np.zeros(fronts.panel[-1])
         self._inverse = np.zeros(3 * int(fronts.first[-1]))
         self._even, self._odd = (np.zeros(int(size)) for size in fronts.work_size)
+
+    def twin(self) -> "SupernodalFactor":
+        """Return a factor of the same pattern with memory of its own."""
+        other = copy.copy(self)
+        other._factor, other._inverse = np.zeros_like(self._factor), np.zeros_like(self._inverse)
+        return other
 
     def factorise(self, values: np.ndarray) -> None:
         """Factorise the matrix with these ``values``, lower triangle by columns.

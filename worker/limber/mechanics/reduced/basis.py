@@ -175,16 +175,14 @@ def _beside(metric: sp.csr_matrix, modes: np.ndarray, fields: np.ndarray,
 def elastic_lifts(model: BranchModel, coordinates: GraspCoordinates) -> np.ndarray:
     """Return the linear elastic displacement per grasp coordinate, shape [count, n, 3]."""
     grasp, zero = coordinates.grasp, np.zeros((model.mesh.node_count, 3))
-    equations = model.equations([grasp])
-    equations.assemble(model, zero)
-    equations.factorise()
+    tangent = model.equations([grasp]).tangent(model, zero)
     if grasp.mode == "pinned":
-        return np.array([equations.solve(zero, unit[None]) for unit in np.eye(3)])
+        return np.array([tangent.solve(zero, unit[None]) for unit in np.eye(3)])
     lifts = []
     for patch in coordinates.fields(model.mesh.nodes):
         held = zero.copy()
         held[grasp.nodes] = patch
-        lifts.append(held + equations.solve(-model.tangent_times(zero, held)))
+        lifts.append(held + tangent.solve(-model.tangent_times(zero, held)))
     return np.array(lifts)
 
 

@@ -89,12 +89,12 @@ def _corrected(full: BranchModel, reduced: ReducedModel, start: np.ndarray, stra
     u, increment, certain, first = start, None, False, now
     for _ in range(_CORRECTIONS):
         try:
-            equations.assemble(full, u, increment=increment)
-            certain = equations.factorise()
+            tangent = equations.tangent(full, u, increment=increment)
         except NotPositiveDefiniteError:
             certain = False
             break
-        increment = equations.solve(equations.free_part(load - now.force))
+        certain = tangent.is_positive_definite
+        increment = tangent.solve(equations.free_part(load - now.force))
         u = u + increment
         now = full.internal(u)
     off = float(np.linalg.norm(u - start, axis=1).max()) / full.extent

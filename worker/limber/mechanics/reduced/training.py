@@ -12,6 +12,7 @@ import numpy as np
 
 from limber.errors import ConvergenceError, InputError
 from limber.mechanics.grasp import Grasp, rotation_matrix, rotation_vector
+from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.progress import SILENT, Progress
@@ -251,9 +252,10 @@ class Trainer:
                 continue
             at_pose, at_young = poses[number], young[number]
             starts.append((at_pose, at_young, result.displacement))
-            rows.append(self._differentiated(result, at_pose, at_young))
+            tangent = self._tangent(result, at_young)
+            rows.append(self._differentiated(result, at_pose, at_young, tangent))
             if vibration_every and (len(rows) - 1) % vibration_every == 0:
-                modes = self._vibrations(vibration_count)
+                modes = self._vibrations(tangent, vibration_count)
                 vibrations += list(modes)
                 owners += [len(rows) - 1] * len(modes)
                 found = self._swings(result.displacement, modes.astype(float), at_pose, at_young,
@@ -278,7 +280,8 @@ class Trainer:
             model = self.model.with_young(self.weights @ modulus)
             result = solve_static(model, grasp=self.grasp, pose=pose, start=displacement,
                                   settings=self.solver)
-            rows.append(self._differentiated(result, pose, modulus))
+            rows.append(self._differentiated(result, pose, modulus,
+                                             self._tangent(result, modulus)))
         return self._snapshots(rows, ([], []), ([], []), 0)
 
     def _snapshots(self, rows: list[dict[str, np.ndarray]],
@@ -301,14 +304,15 @@ class Trainer:
                                  np.array([start[1] for start in starts]), pose, young)
         return starts[int(distance.argmin())][2]
 
-    def _differentiated(self, result: StaticResult, pose: np.ndarray,
-                        young: np.ndarray) -> dict[str, np.ndarray]:
+    def _tangent(self, result: StaticResult, young: np.ndarray) -> Tangent:
+        model = self.model.with_young(self.weights @ young)
+        return model.equations([self.grasp]).tangent(model, result.displacement)
+
+    def _differentiated(self, result: StaticResult, pose: np.ndarray, young: np.ndarray,
+                        tangent: Tangent) -> dict[str, np.ndarray]:
         model = self.model.with_young(self.weights @ young)
         u = result.displacement
-        self._equations = model.equations([self.grasp])
-        self._equations.assemble(model, u)
-        self._equations.factorise()
-        moved = [self._pose_tangent(model, u, pose, axis)
+        moved = [self._pose_tangent(tangent, model, u, pose, axis)
                  for axis in range(6 if self.grasp.mode == "clamped" else 3)]
         stiffer = []
         shares = zip(self.weights.T, young, strict=True) if self.young_tangents else ()
@@ -316,23 +320,23 @@ class Trainer:
             part = share * modulus / model.young
             force = model.internal(u, lame_pair=(model.lame_lambda * part,
                                                  model.lame_mu * part)).force
-            stiffer.append(self._equations.solve(-force))
+            stiffer.append(tangent.solve(-force))
         return {"poses": pose, "young": young, "displacement": u,
                 "energy": np.float64(result.strain_energy), "force": result.reaction_force,
                 "pose_tangents": np.array(moved, np.float32),
                 "young_tangents": np.array(stiffer, np.float32).reshape(-1, *u.shape)}
 
-    def _pose_tangent(self, model: BranchModel, u: np.ndarray, pose: np.ndarray,
-                      axis: int) -> np.ndarray:
+    def _pose_tangent(self, tangent: Tangent, model: BranchModel, u: np.ndarray,
+                      pose: np.ndarray, axis: int) -> np.ndarray:
         if self.grasp.mode == "pinned":
-            return self._equations.solve(np.zeros_like(u), np.eye(3)[axis][None])
+            return tangent.solve(np.zeros_like(u), np.eye(3)[axis][None])
         held = np.zeros_like(u)
         if axis < 3:
             held[self.grasp.nodes, axis] = 1.0
         else:
             arm = model.mesh.nodes[self.grasp.nodes] + u[self.grasp.nodes] - pose[:3]
             held[self.grasp.nodes] = np.cross(np.eye(3)[axis - 3], arm)
-        return held + self._equations.solve(-model.tangent_times(u, held))
+        return held + tangent.solve(-model.tangent_times(u, held))
 
     def _swings(self, state: np.ndarray, modes: np.ndarray, pose: np.ndarray, young: np.ndarray,
                 rng: np.random.Generator) -> list[np.ndarray]:
@@ -355,18 +359,18 @@ class Trainer:
                 found.append(swung.displacement)
         return found
 
-    def _vibrations(self, count: int) -> np.ndarray:
-        """Lowest modes about the state whose tangent was factorised last, by subspace iteration."""
+    def _vibrations(self, tangent: Tangent, count: int) -> np.ndarray:
+        """Lowest modes about the state of a tangent, by subspace iteration."""
         mass, n = self.model.mass_matrix, self.model.mesh.node_count
         block = np.random.default_rng(0).normal(size=(2 * count + 2, n, 3))
         for _ in range(4):
-            block = np.array([self._equations.solve(mass @ field) for field in block])
+            block = np.array([tangent.solve(mass @ field) for field in block])
             heavy = np.array([mass @ field for field in block]).reshape(len(block), -1)
             gram = block.reshape(len(block), -1) @ heavy.T
             block = np.einsum("ij,jnk->ink", np.linalg.inv(np.linalg.cholesky(gram)), block)
         # The inverse's Rayleigh quotient: the largest are the lowest vibrations.
         heavy = np.array([mass @ field for field in block])
-        soft = np.array([self._equations.solve(field) for field in heavy])
+        soft = np.array([tangent.solve(field) for field in heavy])
         quotient = heavy.reshape(len(block), -1) @ soft.reshape(len(block), -1).T
         vectors = np.linalg.eigh((quotient + quotient.T) / 2)[1][:, ::-1][:, :count]
         modes = np.einsum("ij,ink->jnk", vectors, block)

@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 from limber.mechanics.grasp import pose_between
+from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import Material
 from limber.mechanics.model import InternalState
@@ -93,36 +94,46 @@ class Path:
         """Try a step to ``part`` of the way; return the length taken, None if it failed."""
         settings, equations, held = self.settings, self.equations, self.equations.held
         try:
-            equations.assemble(self.model, self.displacement)
-            equations.factorise()
+            tangent = equations.tangent(self.model, self.displacement)
         except NotPositiveDefiniteError:
             self.trouble = "the stiffness has no positive pivots"
             return None
         target, pins = self.constraint_at(part)
-        increment = self._predict(target, pins, part)
+        increment = self._predict(tangent, target, pins, part)
         longest = np.linalg.norm(increment, axis=1).max()
         limit = settings.max_step * self.model.extent
         if longest > limit:
             part = self.reached + (part - self.reached) * limit / longest
             target, pins = self.constraint_at(part)
-            increment = self._predict(target, pins, part)
+            increment = self._predict(tangent, target, pins, part)
         trial = self.displacement + increment
         trial[held] = target[held]
-        return self.correct(trial, increment, part)
+        return self.correct(trial, increment, part, tangent)
 
     def load_at(self, part: float) -> np.ndarray:
         return self.goal.load - (1.0 - part) * self.imbalance
 
-    def _predict(self, target: np.ndarray, pins: np.ndarray, part: float) -> np.ndarray:
+    def _predict(self, tangent: Tangent, target: np.ndarray, pins: np.ndarray,
+                 part: float) -> np.ndarray:
         equations, held = self.equations, self.equations.held
         moved = np.where(held[:, None], target - self.displacement, 0.0)
         right = self.load_at(part) - self.state.force
         if moved.any():
             right = right - self.model.tangent_times(self.displacement, moved)
         now = np.array([g.weights @ self.displacement[g.nodes] for g in equations.pinned])
-        return equations.solve(right, pins - now.reshape(-1, 3)) + moved
+        return tangent.solve(right, pins - now.reshape(-1, 3)) + moved
 
-    def correct(self, trial: np.ndarray, increment: np.ndarray, part: float) -> float | None:
+    def correct(self, trial: np.ndarray, increment: np.ndarray, part: float,
+                tangent: Tangent) -> float | None:
+        """Iterate from ``trial`` to equilibrium at ``part`` of the way.
+
+        Args:
+            trial: Displacement [m], shape [node_count, 3], after ``increment``.
+            tangent: Near it: tells the floor that round-off sets.
+
+        Returns:
+            The length taken, None if none was found.
+        """
         settings, equations = self.settings, self.equations
         load = self.load_at(part)
         best, worse = np.inf, 0
@@ -137,7 +148,7 @@ class Path:
                 return None
             reference = float(np.linalg.norm(out - residual) + np.linalg.norm(load))
             self.history.append(norm / reference if reference else 0.0)
-            if norm <= max(settings.tolerance * reference, self._floor()):
+            if norm <= max(settings.tolerance * reference, self._floor(tangent)):
                 return self._accept(trial, state, part, stable)
             worse = worse + 1 if norm > 0.9 * best else 0
             best = min(best, norm)
@@ -146,13 +157,13 @@ class Path:
                 return None
             self.iterations += 1
             try:
-                equations.assemble(self.model, trial,
-                                   increment=increment if self.problem.mixed else None)
-                stable = equations.factorise()
+                tangent = equations.tangent(
+                    self.model, trial, increment=increment if self.problem.mixed else None)
             except NotPositiveDefiniteError:
                 self.trouble = "the stiffness has no positive pivots"
                 return None
-            increment = equations.solve(residual)
+            stable = tangent.is_positive_definite
+            increment = tangent.solve(residual)
             if not self.problem.mixed:
                 increment = self._searched(trial, increment, load, residual)
             trial = trial + increment
@@ -172,9 +183,9 @@ class Path:
             length *= 0.5
         return length * increment
 
-    def _floor(self) -> float:
+    def _floor(self, tangent: Tangent) -> float:
         # Differences of displacements in an element carry round-off of about one unit each.
-        return 8 * np.finfo(float).eps * self.equations.diagonal_norm() * self.model.mean_edge
+        return 8 * np.finfo(float).eps * tangent.diagonal_norm * self.model.mean_edge
 
     def _accept(self, trial: np.ndarray, state: InternalState, part: float,
                 stable: bool) -> float | None:
@@ -194,8 +205,7 @@ class Path:
         return taken
 
     def _is_stable(self, trial: np.ndarray) -> bool:
-        self.equations.assemble(self.model, trial)
-        return self.equations.factorise()
+        return self.equations.tangent(self.model, trial).is_positive_definite
 
     def _result(self, converged: bool) -> StaticResult:
         stretch = principal_stretch(self.model, self.displacement)

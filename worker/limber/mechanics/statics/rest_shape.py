@@ -107,13 +107,12 @@ class _Search:
         equations = candidate.equations()
         # Minus the strain itself as a constant part: stress 0, so no geometric stiffness.
         no_stress = Viscous(1.0, -candidate.strains(u))
-        equations.assemble(candidate, u, viscous=no_stress)
         try:
-            equations.factorise()
+            tangent = equations.tangent(candidate, u, viscous=no_stress)
         except NotPositiveDefiniteError as error:
             raise _too_soft("The material stiffness is not positive.") from error
         out = equations.free_part(candidate.weight_force - candidate.internal(u).force)
-        moved = equations.solve(out)
+        moved = tangent.solve(out)
         inverse = np.linalg.inv(deformation_gradients(candidate, u))
         wanted = -inverse @ _gradients(candidate, moved)
         return _straight(self.model.mesh, _integrated(candidate, wanted))
@@ -129,9 +128,7 @@ class _Search:
         return found.require()
 
     def _check_stable(self, candidate: BranchModel, displacement: np.ndarray) -> None:
-        equations = candidate.equations()
-        equations.assemble(candidate, displacement)
-        if not equations.factorise():
+        if not candidate.equations().tangent(candidate, displacement).is_positive_definite:
             raise ConvergenceError(
                 "No rest shape: a shape is in balance with the scan under its load, but not stably"
                 " so: it would fall or roll over.",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.mechanics.linear.equations import Equations
+from limber.mechanics.linear.equations import Equations, Tangent
 from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel
@@ -45,12 +45,13 @@ def settle(path: "Path", part: float) -> float | None:
             if drag > 1:
                 break
             continue
-        trial, quick, error, stable = crept
+        trial, quick, error, tangent = crept
+        stable = tangent.is_positive_definite
         if error < _RESTING and not stable and pushes < _PUSHES:
             trial, pushed = pushed_off(path.model, path.equations, trial, load)
             pushes += pushed
         elif error < _RESTING and stable:
-            taken = path.correct(trial, np.zeros_like(trial), part)
+            taken = path.correct(trial, np.zeros_like(trial), part, tangent)
             if taken is not None:
                 path.snaps.append((path.reached + taken, pushes > 0))
                 return taken
@@ -60,8 +61,8 @@ def settle(path: "Path", part: float) -> float | None:
 
 
 def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray,
-           load: np.ndarray, drag: float) -> tuple[np.ndarray, bool, float, bool] | None:
-    """Return the state after one creep, whether it was quick, its imbalance, stability."""
+           load: np.ndarray, drag: float) -> tuple[np.ndarray, bool, float, Tangent] | None:
+    """Return the state after one creep, whether it was quick, its imbalance and tangent."""
     model, equations, held = path.model, path.equations, path.equations.held
     moved = np.where(held[:, None], target - start, 0.0)
     now = np.array([g.weights @ start[g.nodes] for g in equations.pinned]).reshape(-1, 3)
@@ -76,21 +77,20 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
             return None
         if increment is not None and norm <= 1e-4 * reference:
             left = float(np.linalg.norm(equations.free_part(out)))
-            equations.assemble(model, trial)
-            return trial, count <= 4, left / reference, equations.factorise()
+            return trial, count <= 4, left / reference, equations.tangent(model, trial)
         path.iterations += 1
         try:
-            equations.assemble(model, trial, increment=increment)
-            honey = equations.raise_diagonal(drag)
-            if not equations.factorise():
-                return None
+            tangent = equations.tangent(model, trial, increment=increment, drag=drag)
         except NotPositiveDefiniteError:
             return None
+        if not tangent.is_positive_definite:
+            return None
+        honey = tangent.drag
         if increment is None:
             right = out - model.tangent_times(start, moved) if moved.any() else out
-            increment = equations.solve(right, pins - now) + moved
+            increment = tangent.solve(right, pins - now) + moved
         else:
-            increment = equations.solve(pull)
+            increment = tangent.solve(pull)
         trial = trial + increment
     return None
 
@@ -118,10 +118,9 @@ def lowest_mode(model: BranchModel, equations: Equations, state: np.ndarray,
     Inverse iteration on the tangent whose diagonal was raised until it could be factorised:
     raising moves no eigenvector. Its Rayleigh quotient is of the tangent itself.
     """
-    equations.assemble(model, state)
-    equations.factorise()
+    tangent = equations.tangent(model, state)
     mode = np.random.default_rng(0).normal(size=state.shape)
     for _ in range(_MODE_ITERATIONS):
-        mode = equations.solve(mode)
+        mode = tangent.solve(mode)
         mode /= np.linalg.norm(mode)
     return mode, float((mode * model.tangent_times(state, mode)).sum())
