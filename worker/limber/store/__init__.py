@@ -1,20 +1,16 @@
-"""The branch folder on disk: manifest, stages that enter whole or not at all, checksums."""
+"""The branch folder on disk: manifest, stages that enter whole or not at all, locks, streams."""
 
-from limber.store.branch import (
-    FORMAT_VERSION,
-    GRAVITY,
-    MANIFEST,
-    Alignment,
-    Branch,
-    BranchFolderError,
-    Stage,
-    file_digest,
-    plain,
-    program_versions,
-    write_atomically,
-)
+from limber.alignment import Alignment
+from limber.constants import GRAVITY
+from limber.files import file_digest, write_atomically
+from limber.plain import plain
+from limber.store.branch import Branch, BranchFolderError, Stage
+from limber.store.manifest import FORMAT_VERSION, MANIFEST, program_versions
+from limber.store.streams import Stream, stream_lines
+from limber.store.verify import Damage, damage_error, unlisted
 
 __all__ = [
-    "FORMAT_VERSION", "GRAVITY", "MANIFEST", "Alignment", "Branch", "BranchFolderError", "Stage",
-    "file_digest", "plain", "program_versions", "write_atomically",
+    "FORMAT_VERSION", "GRAVITY", "MANIFEST", "Alignment", "Branch", "BranchFolderError", "Damage",
+    "Stage", "Stream", "damage_error", "file_digest", "plain", "program_versions", "stream_lines",
+    "unlisted", "write_atomically",
 ]

@@ -8,121 +8,70 @@ Every stage of the pipeline writes through :meth:`Branch.stage`::
         stage.result["tet_count"] = 2500
 
 Files are written beside the folder's own and enter it together when the block ends without an
-error; otherwise the folder stays as it was. A process that dies in the middle of that last move
-is finished by the next one that opens the folder (the journal is the folder ``.commit``).
+error; otherwise the folder stays as it was (:mod:`limber.store.journal`). One program at a time
+writes (:mod:`limber.store.lock`), any number read. What killed programs left behind is swept by
+the next one that writes.
 """
 
-import hashlib
-import json
 import os
-import platform
 import shutil
-import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel
 
-from limber.errors import BranchFolderError, InputError
-from limber.version import VERSION
+from limber.constants import GRAVITY
+from limber.errors import BranchFolderError
+from limber.files import file_digest, flush_folder, write_atomically
+from limber.owner import is_owned_name, owned_name, sweep, sweep_beside
+from limber.plain import plain
+from limber.store import journal
+from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, run_lock
+from limber.store.manifest import (
+    MANIFEST,
+    FileEntry,
+    Manifest,
+    StageEntry,
+    checked_name,
+    program_versions,
+    read_manifest,
+)
+from limber.store.streams import Stream
+from limber.store.verify import Checker, Damage, damage_error
 
-FORMAT_VERSION = 1
-MANIFEST = "branch.json"
-GRAVITY = (0.0, 0.0, -9.80665)
-"""Standard gravity [m/s^2] along -z: that of a branch whose stages do not say otherwise."""
-
-_COMMIT = ".commit"
-_LOCK = ".lock"
-_PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
-
-
-class FileEntry(BaseModel):
-    """What the manifest vouches for: the bytes of one file, and which stage wrote them."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    sha256: str
-    bytes: int
-    stage: str
-
-
-class StageEntry(BaseModel):
-    """One finished stage: its settings, what it read (name to sha256), wrote and found."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    settings: dict[str, Any]
-    reads: dict[str, str]
-    writes: list[str]
-    result: dict[str, Any]
-    programs: dict[str, str]
-    seconds: float
-    finished: str
-
-
-class Alignment(BaseModel):
-    """From the input file's coordinates to the branch's: ``x = rotation (scale * p - origin)``.
-
-    ``scale`` is metres per input unit, ``origin`` [m] the recentring in scaled input axes,
-    ``rotation`` the upright turn. All three are kept so that a result can be taken back.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-
-    scale: float = 1.0
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[tuple[float, float, float], ...] = (
-        (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-    def apply(self, points: np.ndarray) -> np.ndarray:
-        """Take input coordinates, shape [n, 3], to branch coordinates [m]."""
-        return (np.asarray(points) * self.scale - self.origin) @ np.array(self.rotation).T
-
-    def undo(self, points: np.ndarray) -> np.ndarray:
-        """Take branch coordinates [m], shape [n, 3], back to those of the input file."""
-        return (np.asarray(points) @ np.array(self.rotation) + self.origin) / self.scale
-
-
-class Manifest(BaseModel):
-    """Content of ``branch.json``."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    format_version: int = FORMAT_VERSION
-    name: str
-    unit: str = "m"
-    created_with: str = f"limber {VERSION}"
-    source: dict[str, Any] = Field(default_factory=dict)
-    alignment: Alignment = Field(default_factory=Alignment)
-    stages: dict[str, StageEntry] = Field(default_factory=dict)
-    files: dict[str, FileEntry] = Field(default_factory=dict)
+_STREAMS = ".streams"
 
 
 class Stage:
     """A stage in progress. ``path`` gives where to write; ``result`` goes to the manifest."""
 
-    def __init__(self, folder: Path, manifest: Manifest):
+    def __init__(self, folder: Path, manifest: Manifest, streams: Path):
         self._folder = folder
+        self._streams = streams
         self.manifest = manifest
         self.result: dict[str, Any] = {}
         self.removes: set[str] = set()
+        self.adopted: list[Path] = []
 
     def path(self, name: str) -> Path:
         """Return where to write file ``name`` (relative, ``/``) of the branch folder."""
-        path = self._folder / _checked_name(name)
+        path = self._folder / checked_name(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def remove(self, name: str) -> None:
         """Drop file ``name`` of an earlier run when this stage ends well."""
-        self.removes.add(_checked_name(name))
+        self.removes.add(checked_name(name))
+
+    def adopt(self, name: str) -> None:
+        """Take over what the closed stream ``name`` of the branch holds, as the file ``name``."""
+        stream = self._streams / checked_name(name)
+        shutil.copyfile(stream, self.path(name))
+        self.adopted.append(stream)
 
     def written(self) -> list[str]:
         """Return the names written so far, sorted."""
@@ -134,13 +83,18 @@ class Branch:
     """An opened branch folder."""
 
     def __init__(self, folder: Path, manifest: Manifest):
-        self.folder = folder
+        self.folder = Path(folder)
         self.manifest = manifest
-        self._verified: dict[str, tuple[int, int, str]] = {}
+        self._checker = Checker(self.folder)
 
     @property
     def name(self) -> str:
         return self.manifest.name
+
+    @property
+    def uuid(self) -> str | None:
+        """What names the branch wherever it goes; None for one of format 1, until written to."""
+        return self.manifest.uuid
 
     @property
     def gravity(self) -> tuple[float, float, float]:
@@ -158,18 +112,16 @@ class Branch:
             BranchFolderError: it holds other files, or cannot be made or written to.
         """
         folder = Path(folder)
-        if (folder / MANIFEST).exists() or (folder / _COMMIT).exists():
+        if (folder / MANIFEST).exists() or journal.is_pending(folder):
             return cls.open(folder)
-        if folder.is_dir() and any(p.name != _LOCK for p in folder.iterdir()):
+        if folder.is_dir() and any(not _is_litter(p.name) for p in folder.iterdir()):
             raise BranchFolderError(
                 f"{folder} exists and is not a branch folder.",
                 f"It has files but no {MANIFEST}; writing there could overwrite them.",
                 "Name a new folder with -o, for example NAME.branch.")
-        _make_writable(folder)
         name = folder.name.removesuffix(".branch") or folder.resolve().name.removesuffix(".branch")
-        branch = cls(folder, Manifest(name=name))
-        write_atomically(folder / MANIFEST, branch._manifest_text())
-        return branch
+        _begin(folder, Manifest(name=name))
+        return cls.open(folder)
 
     @classmethod
     def open(cls, folder: str | os.PathLike, *, verify: bool = False) -> "Branch":
@@ -186,10 +138,8 @@ class Branch:
             raise BranchFolderError(
                 f"There is no folder {folder}.", "A branch folder was expected.",
                 "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
-        if (folder / _COMMIT).is_dir():
-            with _locked(folder):
-                _roll_forward(folder)
-        branch = cls(folder, _read_manifest(folder))
+        _finish_pending(folder)
+        branch = cls(folder, read_manifest(folder))
         if verify:
             branch.verify()
         return branch
@@ -200,12 +150,12 @@ class Branch:
         Raises:
             BranchFolderError: the manifest has it, or files in it, and they are damaged.
         """
-        name = _checked_name(name)
+        name = checked_name(name)
         self._check(n for n in self.manifest.files if n == name or n.startswith(name + "/"))
         return self.folder / name
 
     def has(self, name: str) -> bool:
-        return name in self.manifest.files and (self.folder / _checked_name(name)).is_file()
+        return name in self.manifest.files and (self.folder / checked_name(name)).is_file()
 
     def require(self, name: str, made_by: str) -> Path:
         """Return the path of file ``name``; ``made_by`` is the command that would make it.
@@ -233,32 +183,53 @@ class Branch:
         """
         self._check(self.manifest.files)
 
-    def _check(self, names: Iterable[str]) -> None:
-        wrong = {name: trouble for name in names if (trouble := self._trouble(name))}
-        if not wrong:
-            return
-        shown = [f"{name} ({trouble})" for name, trouble in list(wrong.items())[:4]]
-        more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""
-        stages = sorted({self.manifest.files[name].stage for name in wrong})
-        raise BranchFolderError(
-            f"Damaged files in {self.folder}: {', '.join(shown)}{more}.",
-            "They differ from the checksums written when they were made.",
-            f"Restore them from a copy, or run again with --force: {', '.join(stages)}.")
+    def damages(self) -> list[Damage]:
+        """Return what is wrong with the folder's files; empty where all is as it was written."""
+        return self._checker.damages(self.manifest, sorted(self.manifest.files))
 
-    def _trouble(self, name: str) -> str:
-        """Say what is wrong with a file, or "": read again only when its time or size changed."""
-        path, entry = self.folder / name, self.manifest.files[name]
-        if not path.is_file():
-            return "missing"
-        about = path.stat()
-        if about.st_size != entry.bytes:
-            return f"{about.st_size} bytes where {entry.bytes} were written"
-        state = (about.st_mtime_ns, about.st_size, entry.sha256)
-        if self._verified.get(name) != state:
-            if file_digest(path) != entry.sha256:
-                return "other content"
-            self._verified[name] = state
-        return ""
+    def _check(self, names: Iterable[str]) -> None:
+        damages = self._checker.damages(self.manifest, names)
+        if not damages:
+            return
+        _finish_pending(self.folder)
+        now = read_manifest(self.folder).files
+        renewed = [d.name for d in damages if now.get(d.name) != self.manifest.files[d.name]]
+        if renewed:
+            raise BranchFolderError(
+                f"Another run made {', '.join(renewed[:4])} of {self.folder} anew, or removed it, "
+                "while this one was reading.", "What has been read does not belong with it.",
+                "Run this again.")
+        raise damage_error(self.folder, damages)
+
+    @contextmanager
+    def writing(self, purpose: str) -> Iterator[None]:
+        """Hold the right to write to this folder, and sweep what killed programs left in it.
+
+        :meth:`stage` takes it by itself; a stage whose work begins long before asks for it first.
+
+        Args:
+            purpose: What another program's user reads that finds the folder taken.
+
+        Raises:
+            BranchFolderError: another program holds it; says who and since when.
+        """
+        with run_lock(self.folder, purpose) as is_first:
+            if is_first:
+                sweep(self.folder)
+            yield
+
+    def stream(self, name: str) -> Stream:
+        """Open the stream ``name``, new or left by a program that ended; see :class:`Stream`.
+
+        It stays beside the branch's files until a stage takes it over (:meth:`Stage.adopt`).
+        """
+        return Stream(self.folder / _STREAMS / checked_name(name))
+
+    def streams(self) -> list[str]:
+        """Return the names of the streams that no stage has taken over yet, sorted."""
+        folder = self.folder / _STREAMS
+        return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*")
+                      if path.is_file() and not path.name.startswith("."))
 
     def digest(self, name: str) -> str:
         """Return the sha256 that the manifest has for file ``name``."""
@@ -272,7 +243,7 @@ class Branch:
             return False
         wanted = self._read_digests(reads, digests)
         intact = all(name in self.manifest.files
-                     and not self._trouble(name)
+                     and not self._checker.trouble(name, self.manifest.files[name])
                      for name in entry.writes if self._owner(name) == key)
         return intact and entry.reads == wanted and entry.settings == plain(settings or {})
 
@@ -289,37 +260,40 @@ class Branch:
             digests: Further inputs, label to digest (a file from outside, part of a file).
         """
         started = time.perf_counter()
-        read = self._read_digests(reads, digests)
-        work = Path(tempfile.mkdtemp(prefix=f".{key.replace(':', '-')}-", dir=self.folder))
-        try:
-            stage = Stage(work, self.manifest.model_copy(deep=True))
-            yield stage
-            entry = StageEntry(
-                settings=plain(settings or {}), reads=read, writes=stage.written(),
-                result=plain(stage.result), programs=program_versions(),
-                seconds=round(time.perf_counter() - started, 3),
-                finished=datetime.now(UTC).isoformat(timespec="seconds"))
-            self._commit(key, entry, stage, work)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
+        with self.writing(f"the stage {key}"):
+            read = self._read_digests(reads, digests)
+            work = self.folder / owned_name(f"stage-{_short(key)}")
+            work.mkdir()
+            try:
+                stage = Stage(work, self.manifest.model_copy(deep=True), self.folder / _STREAMS)
+                yield stage
+                entry = StageEntry(
+                    settings=plain(settings or {}), reads=read, writes=stage.written(),
+                    result=plain(stage.result), programs=program_versions(),
+                    seconds=round(time.perf_counter() - started, 3),
+                    finished=datetime.now(UTC).isoformat(timespec="seconds"))
+                self._commit(key, entry, stage, work)
+            finally:
+                shutil.rmtree(work, ignore_errors=True)
+            for path in stage.adopted:
+                path.unlink(missing_ok=True)
 
     def _commit(self, key: str, entry: StageEntry, stage: Stage, work: Path) -> None:
-        with _locked(self.folder):
-            manifest = _read_manifest(self.folder)
+        written = {name: FileEntry(sha256=file_digest(work / name),
+                                   bytes=(work / name).stat().st_size, stage=key)
+                   for name in entry.writes}
+        with commit_lock(self.folder):
+            # One that a killed program left comes first: its files count already.
+            journal.roll_forward(self.folder)
+            manifest = read_manifest(self.folder)
             manifest.alignment, manifest.source = stage.manifest.alignment, stage.manifest.source
             manifest.unit = stage.manifest.unit
             manifest.stages[key] = entry
             for name in stage.removes - set(entry.writes):
                 manifest.files.pop(name, None)
-            for name in entry.writes:
-                path = work / name
-                manifest.files[name] = FileEntry(
-                    sha256=file_digest(path), bytes=path.stat().st_size, stage=key)
+            manifest.files |= written
+            journal.commit(self.folder, work, manifest)
             self.manifest = manifest
-            (work / MANIFEST).write_text(self._manifest_text(), encoding="utf-8")
-            _flush_to_disk(work)
-            os.replace(work, self.folder / _COMMIT)
-            _roll_forward(self.folder)
 
     def _owner(self, name: str) -> str | None:
         entry = self.manifest.files.get(name)
@@ -336,146 +310,46 @@ class Branch:
         self._check(reads)
         return {name: self.digest(name) for name in reads} | dict(digests or {})
 
-    def _manifest_text(self) -> str:
-        return json.dumps(self.manifest.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
 
-
-def plain(value: Any) -> Any:
-    """Return ``value`` as JSON has it: models, numpy and paths become dicts, lists, numbers.
-
-    A number that is not finite becomes None: JSON has no NaN.
-    """
-    if isinstance(value, BaseModel):
-        return plain(value.model_dump())
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray | list | tuple | set):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
-
-
-def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file so that a reader sees the old or the new content, never a part."""
-    path = Path(path)
-    data = content.encode("utf-8") if isinstance(content, str) else content
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+def _begin(folder: Path, manifest: Manifest) -> None:
+    """Make the folder with its manifest: a new one appears whole, an empty one is filled."""
+    unfinished = folder.with_name(owned_name(folder.name))
     try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def file_digest(path: str | os.PathLike) -> str:
-    """Return the sha256 of a file's bytes, in hexadecimal."""
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def program_versions() -> dict[str, str]:
-    """Return the versions of Limber, Python and the numerical packages that are installed."""
-    found = {"limber": VERSION, "python": platform.python_version()}
-    for name in _PROGRAMS:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return found
-
-
-def _read_manifest(folder: Path) -> Manifest:
-    path = folder / MANIFEST
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise BranchFolderError(
-            f"{folder} has no {MANIFEST}.", "So it is not a branch folder.",
-            "Name a folder that `limber reconstruct` or `limber mesh` made.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise BranchFolderError(
-            f"{path} is not readable JSON ({error}).", "The manifest is damaged.",
-            "Restore it from a copy, or reconstruct into a new folder.") from error
-    version = content.get("format_version") if isinstance(content, dict) else None
-    if isinstance(version, int) and version > FORMAT_VERSION:
-        raise BranchFolderError(
-            f"{folder} has format {version}; this Limber ({VERSION}) reads up to {FORMAT_VERSION}.",
-            "It was made by a newer Limber.", "Update Limber.")
-    try:
-        return Manifest.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise BranchFolderError(
-            f"{path}: {place or 'content'}: {first['msg']}.", "The manifest is damaged.",
-            "Restore it from a copy, or reconstruct into a new folder.") from error
-
-
-def _checked_name(name: str) -> str:
-    pure = PurePosixPath(name)
-    inside = not pure.is_absolute() and ".." not in pure.parts and pure.parts
-    if not inside or name in (MANIFEST, _LOCK, _COMMIT) or "\\" in name:
-        raise InputError(f"{name!r} is not a name of a file in a branch folder.",
-                         "It must be relative and stay inside.", "Use a plain name.")
-    return pure.as_posix()
-
-
-def _make_writable(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        sweep_beside(folder)
+        if folder.is_dir():
+            with commit_lock(folder):
+                sweep(folder)
+                if not (folder / MANIFEST).exists():
+                    write_atomically(folder / MANIFEST, manifest.text())
             return
+        unfinished.mkdir()
+        try:
+            write_atomically(unfinished / MANIFEST, manifest.text())
+            os.rename(unfinished, folder)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        flush_folder(folder.parent)
     except OSError as error:
+        if (folder / MANIFEST).exists():
+            # Another program made it in the same moment.
+            return
         raise BranchFolderError(
             f"{folder} cannot be written to ({error.strerror}).",
             "Results go there.", "Choose another place with -o, or change its permissions.",
         ) from error
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    try:
-        with FileLock(folder / _LOCK, timeout=60):
-            yield
-    except Timeout as error:
-        raise BranchFolderError(
-            f"{folder} has been locked by another Limber for a minute.",
-            "Two stages must not enter results at once.", "Wait for it to end, or stop it.",
-        ) from error
+def _finish_pending(folder: Path) -> None:
+    if journal.is_pending(folder):
+        with commit_lock(folder):
+            journal.roll_forward(folder)
 
 
-def _roll_forward(folder: Path) -> None:
-    """Move the journal's files into place, the manifest last; safe to repeat."""
-    commit = folder / _COMMIT
-    if not commit.is_dir():
-        return
-    old = _read_manifest(folder) if (folder / MANIFEST).exists() else None
-    for path in sorted(p for p in commit.rglob("*") if p.is_file()):
-        name = path.relative_to(commit).as_posix()
-        if name == MANIFEST:
-            continue
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        os.replace(path, target)
-    if (commit / MANIFEST).exists():
-        kept = _read_manifest(commit)
-        for name in set(old.files if old else ()) - set(kept.files):
-            (folder / name).unlink(missing_ok=True)
-        os.replace(commit / MANIFEST, folder / MANIFEST)
-    shutil.rmtree(commit)
+def _is_litter(name: str) -> bool:
+    """Whether a file of this name may be in a folder that was killed while it was made."""
+    return name in (COMMIT_LOCK, RUN_LOCK) or is_owned_name(name)
 
 
-def _flush_to_disk(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with open(path, "rb") as stream:
-                os.fsync(stream.fileno())
+def _short(key: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_" else "-" for c in key)[:60]

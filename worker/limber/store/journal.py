@@ -1,0 +1,79 @@
+"""How a stage's files enter a branch folder: all of them or none, also when the program is killed.
+
+The work folder, with the new manifest in it, is renamed to ``.commit``: that is the moment from
+which the stage counts. Then its files are moved into place, the manifest last. Whoever finds a
+``.commit`` finishes it first.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+from limber.errors import BranchFolderError
+from limber.files import flush_folder, flush_tree
+from limber.store.manifest import MANIFEST, Manifest, read_manifest
+
+_COMMIT = ".commit"
+
+
+def is_pending(folder: Path) -> bool:
+    """Whether a killed program left a commit to finish, or a living one is in the middle of it."""
+    return (folder / _COMMIT).is_dir()
+
+
+def commit(folder: Path, work: Path, manifest: Manifest) -> None:
+    """Enter the files in ``work``, and ``manifest``; under the commit lock.
+
+    Args:
+        folder: The branch folder, without a pending commit.
+        work: A folder in it with the new files under their names.
+        manifest: What ``branch.json`` shall be.
+    """
+    (work / MANIFEST).write_text(manifest.text(), encoding="utf-8")
+    flush_tree(work)
+    os.replace(work, folder / _COMMIT)
+    flush_folder(folder)
+    roll_forward(folder)
+
+
+def roll_forward(folder: Path) -> None:
+    """Finish a pending commit, if any; under the commit lock. Safe to repeat from any point.
+
+    Raises:
+        BranchFolderError: a file cannot be replaced.
+    """
+    pending = folder / _COMMIT
+    if not pending.is_dir():
+        return
+    try:
+        if (pending / MANIFEST).exists():
+            _move_into_place(folder, pending)
+        # Without its manifest everything has been moved already.
+        shutil.rmtree(pending)
+        flush_folder(folder)
+    except PermissionError as error:
+        raise BranchFolderError(
+            f"{error.filename2 or error.filename} cannot be replaced ({error.strerror}).",
+            "Another program has it open, or the folder is read-only; the new results wait in "
+            f"{pending}.", "Close that program, or change the permissions, and run any command "
+            "on the folder again.") from error
+
+
+def _move_into_place(folder: Path, pending: Path) -> None:
+    new = read_manifest(pending)
+    old = read_manifest(folder) if (folder / MANIFEST).exists() else None
+    touched = {folder}
+    for path in sorted(p for p in pending.rglob("*") if p.is_file()):
+        name = path.relative_to(pending).as_posix()
+        if name == MANIFEST:
+            continue
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, target)
+        touched |= {place for place in target.parents if place.is_relative_to(folder)}
+    for name in set(old.files if old else ()) - set(new.files):
+        (folder / name).unlink(missing_ok=True)
+    for place in touched:
+        flush_folder(place)
+    os.replace(pending / MANIFEST, folder / MANIFEST)
+    flush_folder(folder)

@@ -1,0 +1,118 @@
+"""Who may write to a branch folder: one program at a time, and its results enter one by one.
+
+Both locks are the operating system's, so that a program's end, however it came, sets them free.
+"""
+
+import getpass
+import json
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+from filelock import BaseFileLock, FileLock, Timeout
+
+from limber.errors import BranchFolderError
+from limber.files import write_atomically
+
+COMMIT_LOCK = ".lock"
+RUN_LOCK = ".run.lock"
+_HOLDER = ".run.json"
+_COMMIT_WAIT_SECONDS = 60.0
+
+
+@contextmanager
+def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
+    """Hold the right to write to ``folder``: for a whole stage, from before its work begins.
+
+    A program that holds it may ask for it again. Readers need none of it.
+
+    Args:
+        folder: The branch folder.
+        purpose: What for, as another program's user shall read it.
+
+    Yields:
+        Whether this program did not hold it yet.
+
+    Raises:
+        BranchFolderError: another program has it; says who and since when.
+    """
+    # One lock object a folder in this program, however often it is asked for.
+    lock = FileLock((folder / RUN_LOCK).resolve(), is_singleton=True, thread_local=False)
+    try:
+        _acquire(lock, folder, 0.0)
+    except Timeout as error:
+        raise BranchFolderError(
+            f"Another Limber is writing to {folder}: {_holder(folder)}.",
+            "Two at once would spoil each other's results; reading goes on meanwhile.",
+            "Wait for it to end, or stop it.") from error
+    is_first = lock.lock_counter == 1
+    try:
+        if is_first:
+            write_atomically(folder / _HOLDER, json.dumps({
+                "purpose": purpose, "user": _user(), "host": socket.gethostname(),
+                "process": os.getpid(), "since": datetime.now(UTC).isoformat(timespec="seconds"),
+            }) + "\n")
+        yield is_first
+    finally:
+        if lock.lock_counter == 1:
+            (folder / _HOLDER).unlink(missing_ok=True)
+        lock.release()
+
+
+@contextmanager
+def commit_lock(folder: Path) -> Iterator[None]:
+    """Hold the right to move results into ``folder``: for moments; another waits for it.
+
+    Raises:
+        BranchFolderError: it was not to be had for a minute, or the folder cannot be written to.
+    """
+    lock = FileLock(folder / COMMIT_LOCK)
+    try:
+        _acquire(lock, folder, _COMMIT_WAIT_SECONDS)
+    except Timeout as error:
+        raise BranchFolderError(
+            f"{folder} has been locked by another Limber for a minute.",
+            "Two stages must not enter results at once.", "Wait for it to end, or stop it.",
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _acquire(lock: BaseFileLock, folder: Path, wait_seconds: float) -> None:
+    try:
+        lock.acquire(timeout=wait_seconds)
+    except OSError as error:
+        if isinstance(error, Timeout):
+            raise
+        raise BranchFolderError(
+            f"{folder} cannot be written to ({error.strerror or error}).", "Results go there.",
+            "Change its permissions, or work on a copy.") from error
+
+
+def _holder(folder: Path) -> str:
+    """Who has the run lock, in words."""
+    for _ in range(5):
+        try:
+            found = json.loads((folder / _HOLDER).read_text(encoding="utf-8"))
+            since = datetime.fromisoformat(found["since"])
+            minutes = (datetime.now(UTC) - since).total_seconds() / 60
+            return (f"{found['purpose']}, process {found['process']} of {found['user']} on "
+                    f"{found['host']}, since {since:%Y-%m-%d %H:%M:%S} UTC ({minutes:.0f} min)")
+        except (OSError, ValueError, KeyError, TypeError):
+            # It has just begun, or just ended.
+            time.sleep(0.05)
+    return "one that has not said who it is"
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        # A user without a name, as in some containers.
+        return f"user {os.getuid()}" if hasattr(os, "getuid") else "an unnamed user"

@@ -1,0 +1,128 @@
+"""The manifest ``branch.json``: what a branch folder holds, and what it was made from."""
+
+import json
+import platform
+import uuid
+from importlib import metadata
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from limber.alignment import Alignment
+from limber.errors import BranchFolderError, InputError
+from limber.version import VERSION
+
+FORMAT_VERSION = 2
+"""1: until 0.1; 2: with the branch's UUID. Older ones are read, and written as this one."""
+MANIFEST = "branch.json"
+_PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
+
+
+class FileEntry(BaseModel):
+    """What the manifest vouches for: the bytes of one file, and which stage wrote them."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    sha256: str
+    bytes: int
+    stage: str
+
+
+class StageEntry(BaseModel):
+    """One finished stage: its settings, what it read (name to sha256), wrote and found."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    settings: dict[str, Any]
+    reads: dict[str, str]
+    writes: list[str]
+    result: dict[str, Any]
+    programs: dict[str, str]
+    seconds: float
+    finished: str
+
+
+class Manifest(BaseModel):
+    """Content of ``branch.json``.
+
+    ``uuid`` names the branch wherever its folder is moved and whatever it is called; a folder of
+    format 1 has none until a stage writes to it.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    format_version: int = FORMAT_VERSION
+    uuid: str | None = None
+    name: str
+    unit: str = "m"
+    created_with: str = f"limber {VERSION}"
+    source: dict[str, Any] = Field(default_factory=dict)
+    alignment: Alignment = Field(default_factory=Alignment)
+    stages: dict[str, StageEntry] = Field(default_factory=dict)
+    files: dict[str, FileEntry] = Field(default_factory=dict)
+
+    def text(self) -> str:
+        """Return the manifest as it is written: in this format, with a UUID."""
+        self.format_version = FORMAT_VERSION
+        self.uuid = self.uuid or str(uuid.uuid4())
+        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of a branch folder.
+
+    Raises:
+        BranchFolderError: there is none, or it is damaged or of a newer format.
+    """
+    path = folder / MANIFEST
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise BranchFolderError(
+            f"{folder} has no {MANIFEST}.", "So it is not a branch folder.",
+            "Name a folder that `limber reconstruct` or `limber mesh` made.") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BranchFolderError(
+            f"{path} is not readable JSON ({error}).", "The manifest is damaged.",
+            "Restore it from a copy, or reconstruct into a new folder.") from error
+    version = content.get("format_version") if isinstance(content, dict) else None
+    if isinstance(version, int) and version > FORMAT_VERSION:
+        raise BranchFolderError(
+            f"{folder} has format {version}; this Limber ({VERSION}) reads up to {FORMAT_VERSION}.",
+            "It was made by a newer Limber.", "Update Limber.")
+    try:
+        return Manifest.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise BranchFolderError(
+            f"{path}: {place or 'content'}: {first['msg']}.", "The manifest is damaged.",
+            "Restore it from a copy, or reconstruct into a new folder.") from error
+
+
+def checked_name(name: str) -> str:
+    """Return the name of a file in a branch folder, relative with ``/``.
+
+    Raises:
+        InputError: it leads out of the folder, or is one of the folder's own.
+    """
+    pure = PurePosixPath(name)
+    inside = not pure.is_absolute() and ".." not in pure.parts and pure.parts
+    own = inside and (name == MANIFEST or pure.parts[0].startswith("."))
+    if not inside or own or "\\" in name:
+        raise InputError(f"{name!r} is not a name of a file in a branch folder.",
+                         "It must be relative, stay inside and not begin with a dot.",
+                         "Use a plain name.")
+    return pure.as_posix()
+
+
+def program_versions() -> dict[str, str]:
+    """Return the versions of Limber, Python and the numerical packages that are installed."""
+    found = {"limber": VERSION, "python": platform.python_version()}
+    for name in _PROGRAMS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
