@@ -23,6 +23,7 @@ from limber.mechanics.elements.forces import (
     tangent_times,
 )
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.hanging import Hanging, carried
 from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials import (
     Material,
@@ -64,18 +65,25 @@ class InternalState:
     """Internal forces of one state.
 
     Attributes:
-        force: Internal force on the nodes [N], shape [node_count, 3].
-        tet_energy: Strain energy of each tetrahedron [J], shape [tet_count].
+        force: Internal force on the nodes [N], shape [node_count, 3]; the gradient of ``energy``.
+        tet_energy: Energy of each tetrahedron's strain since the mesh's shape [J], [tet_count].
         min_det_f: Smallest determinant of the deformation gradient at a quadrature point.
+        weight_energy: What the weight of a hanging branch adds to the potential [J].
     """
 
     force: np.ndarray
     tet_energy: np.ndarray
     min_det_f: float
+    weight_energy: float = 0.0
 
     @property
     def strain_energy(self) -> float:
         return float(self.tet_energy.sum())
+
+    @property
+    def energy(self) -> float:
+        """Potential above the mesh's shape [J]: strain and, where it hangs so, its weight."""
+        return self.strain_energy + self.weight_energy
 
 
 class _MeshData:
@@ -123,6 +131,8 @@ class BranchModel:
 
     Attributes:
         lame_lambda, lame_mu: Lamé coefficients [Pa], shape [tet_count].
+        hanging: How the mesh's shape carries the weight; None where the mesh is the shape without
+            load, which gravity bends. See :meth:`as_scanned`.
         gradients, weights: Strain operators at the quadrature points, from
             limber.mechanics.elements.shapes.
 
@@ -144,6 +154,7 @@ class BranchModel:
         self.damping = damping
         self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
+        self.hanging: Hanging | None = None
         self._set(young, poisson, density)
 
     @classmethod
@@ -208,7 +219,8 @@ class BranchModel:
         if damping is not None:
             other.damping = damping
         if gravity is not None:
-            other.gravity = np.asarray(gravity, float)
+            # What carries the weight now is not what carried it on the scan.
+            other.gravity, other.hanging = np.asarray(gravity, float), None
         other._set(self.young if young is None else young,
                    self.poisson if poisson is None else poisson,
                    self.density if density is None else density)
@@ -217,12 +229,33 @@ class BranchModel:
     def with_rest_nodes(self, nodes: np.ndarray) -> "BranchModel":
         """Return the model with other rest positions [m] of the same tetrahedra."""
         other = copy.copy(self)
+        other.hanging = None
         other._data = self._data.moved(nodes)
         other._mass = {}
         # Added masses stay with their node, not with the place in space.
         other.point_masses = tuple(
             replace(point, position=tuple(nodes[node]))
             for point, (node, _) in zip(self.point_masses, self._added, strict=True))
+        return other
+
+    def as_scanned(self) -> "BranchModel":
+        """Return the model that hangs in its mesh's shape: weight acts, and is carried there.
+
+        Weight of what is hung on later bends it further. See :mod:`limber.mechanics.hanging`.
+
+        Raises:
+            NotPositiveDefiniteError: the mesh cannot bear anything.
+        """
+        other = copy.copy(self)
+        other.hanging = None
+        other.hanging = carried(other)
+        return other
+
+    def linear(self, young: float, poisson: float) -> "BranchModel":
+        """Return the branch of one linear material, without what it carries."""
+        other = copy.copy(self)
+        other.hanging, other.material = None, Material.linear
+        other._set(young, poisson, self.density)
         return other
 
     def with_point_masses(self, masses: Iterable[PointMass]) -> "BranchModel":
@@ -237,6 +270,8 @@ class BranchModel:
             return self
         other = copy.copy(self)
         other.point_masses, other._mass = (), {}
+        if other.hanging is not None:
+            other.hanging = replace(other.hanging, added=None, mass_count=0)
         return other
 
     def equations(self, grasps: Sequence[Grasp] = ()) -> Equations:
@@ -259,7 +294,8 @@ class BranchModel:
 
         Args:
             viscous: Viscous part in motion.
-            lame_pair: Lamé coefficients instead of the model's; the force is linear in them.
+            lame_pair: Lamé coefficients instead of the model's, and no weight; the force is
+                linear in them.
         """
         data = self._data
         lam, mu = lame_pair or (self.lame_lambda, self.lame_mu)
@@ -269,7 +305,11 @@ class BranchModel:
         det = internal_force(for_kernels(displacement), layout.gradients,
                              layout.weights, layout.per_element(lam), layout.per_element(mu),
                              layout.nodes, int(self.material), growth, memory, force, energies)
-        return InternalState(force, energies, float(det))
+        if lame_pair is not None or self.weight_stiffness is None:
+            return InternalState(force, energies, float(det))
+        lifted = self._weight_times(displacement)
+        return InternalState(force + lifted, energies, float(det),
+                             0.5 * float((lifted * displacement).sum()))
 
     def tangent_times(self, displacement: np.ndarray, direction: np.ndarray,
                       viscous: Viscous | None = None) -> np.ndarray:
@@ -282,7 +322,7 @@ class BranchModel:
                       layout.weights, layout.per_element(self.lame_lambda),
                       layout.per_element(self.lame_mu), layout.nodes, int(self.material), growth,
                       memory, self.mesh.tet_count, product)
-        return product
+        return product if self.weight_stiffness is None else product + self._weight_times(direction)
 
     def strains(self, displacement: np.ndarray) -> np.ndarray:
         """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12)."""
@@ -308,19 +348,43 @@ class BranchModel:
         return out
 
     @property
+    def weight_stiffness(self) -> sp.csr_matrix | None:
+        """Geometric stiffness of the carried weight [N/m], each axis; None where it carries none.
+
+        At small strains (Material.linear) a weight that is carried has no effect.
+        """
+        if self.hanging is None or self.material == Material.linear:
+            return None
+        return self.hanging.total.stiffness
+
+    def _weight_times(self, field: np.ndarray) -> np.ndarray:
+        return product_with(self.weight_stiffness, field)
+
+    @property
     def weight_force(self) -> np.ndarray:
-        """Force of gravity on the nodes [N], shape [node_count, 3]."""
-        return self.mass_load[:, None] * self.gravity
+        """Weight that the mesh's shape does not carry already [N], shape [node_count, 3]."""
+        if self.hanging is None:
+            return self.mass_load[:, None] * self.gravity
+        later = self._nodal(self._added[self.hanging.mass_count:])
+        return later[:, None] * self.gravity
+
+    @property
+    def nodal_masses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mass of the branch, and of what hangs on it, at each node [kg]: each [node_count]."""
+        own = np.bincount(self.mesh.tets.ravel(),
+                          (self._data.volume_weights * self.density[:, None]).ravel(),
+                          self.mesh.node_count)
+        return own, self._nodal(self._added)
 
     @property
     def mass_load(self) -> np.ndarray:
         """Mass that gravity acts on at each node [kg], consistent, shape [node_count]."""
-        load = np.bincount(self.mesh.tets.ravel(),
-                           (self._data.volume_weights * self.density[:, None]).ravel(),
-                           self.mesh.node_count)
-        for node, mass in self._added:
-            load[node] += mass
-        return load
+        own, added = self.nodal_masses
+        return own + added
+
+    def _nodal(self, masses: list[tuple[int, float]]) -> np.ndarray:
+        nodes = np.array([node for node, _ in masses], np.int64)
+        return np.bincount(nodes, [mass for _, mass in masses], self.mesh.node_count)
 
     @property
     def total_mass(self) -> float:
@@ -336,11 +400,7 @@ class BranchModel:
 
     def mass_times(self, field: np.ndarray) -> np.ndarray:
         """Return the mass matrix times a nodal field of shape [node_count, 3]."""
-        matrix = self.mass_matrix
-        product = np.empty((self.mesh.node_count, 3))
-        sparse_times(matrix.indptr, matrix.indices, matrix.data,
-                     for_kernels(field), product)
-        return product
+        return product_with(self.mass_matrix, field)
 
     @property
     def _added(self) -> list[tuple[int, float]]:
@@ -377,7 +437,8 @@ class BranchModel:
         self.poisson = per_tet("Poisson's ratio", poisson, count)
         check_young(self.young)
         check_poisson(self.poisson)
-        changed = not hasattr(self, "density") or density is not self.density
+        before = getattr(self, "density", None)
+        changed = density is not before
         self.density = per_tet("Density", density, count)
         if self.density.min() <= 0:
             raise InputError(f"Density is {self.density.min():g} kg/m3.", "It must be positive.",
@@ -386,6 +447,10 @@ class BranchModel:
         if changed:
             # Shared by the models that are made of this one with the same density.
             self._mass: dict[str, sp.csr_matrix] = {}
+        if changed and self.hanging is not None:
+            ratio = self.density / before
+            self.hanging = (self.hanging.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12
+                            else carried(self))
 
     def _check_grasps(self, grasps: Sequence[Grasp]) -> None:
         taken = self.fixed.copy()
@@ -399,6 +464,13 @@ class BranchModel:
         if taken.all():
             raise InputError("Every node is fixed or grasped.", "Nothing is left to compute.",
                              "Use a smaller grasp or a finer mesh.")
+
+
+def product_with(matrix: sp.csr_matrix, field: np.ndarray) -> np.ndarray:
+    """Return a matrix of each axis times a nodal field of shape [node_count, 3]."""
+    product = np.empty((matrix.shape[0], 3))
+    sparse_times(matrix.indptr, matrix.indices, matrix.data, for_kernels(field), product)
+    return product
 
 
 def fixed_mask(mesh: TetMesh, fixed: np.ndarray | None) -> np.ndarray:

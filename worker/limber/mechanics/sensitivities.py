@@ -15,7 +15,7 @@ from limber.errors import InputError
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.materials import lame_by_poisson
-from limber.mechanics.model import BranchModel
+from limber.mechanics.model import BranchModel, product_with
 
 PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")
 """What can be differentiated for. ``log_young`` is one column for each column of the weights."""
@@ -56,7 +56,7 @@ class StaticSensitivities:
         displacement: [m per parameter], shape [node_count, 3, p].
         reaction_force: Of the gripper on the branch [N per parameter], shape [3, p], or
             [grasps, 3, p] for several.
-        strain_energy: [J per parameter], shape [p].
+        strain_energy: With that of a carried weight [J per parameter], shape [p].
     """
 
     labels: list[str]
@@ -184,6 +184,9 @@ def viscous_force(model: BranchModel, displacement: np.ndarray,
 def _density_force(model: BranchModel, state: object) -> np.ndarray:
     bare = model.without_point_masses()
     force = -bare.weight_force
+    if bare.weight_stiffness is not None:
+        # What carries the weight grows with it.
+        force = force + product_with(bare.weight_stiffness, state.displacement)
     velocity = getattr(state, "velocity", None)
     if velocity is not None:
         force = force + bare.mass_times(state.acceleration + model.damping.mass * velocity)

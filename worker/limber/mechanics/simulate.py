@@ -237,7 +237,7 @@ def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
     strain, stress = _largest(model, displacement)
     frames = {
         "frame_count": len(displacement), "rate": settings.frame_rate,
-        "times_s": motion.times.tolist(), "energies_j": motion.strain_energy.tolist(),
+        "times_s": motion.times.tolist(), "energies_j": motion.energy.tolist(),
         "kinetic_energies_j": motion.kinetic_energy.tolist(),
         "grasp_forces_n": motion.grasp_force.tolist(),
         "grasp_torques_nm": motion.grasp_torque.tolist(),
@@ -247,7 +247,7 @@ def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
     write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
     return {
         "converged": motion.converged, "frame_count": len(displacement),
-        "energy_j": float(motion.strain_energy[-1]),
+        "energy_j": float(motion.energy[-1]),
         "grasp_force_n": motion.grasp_force[-1].tolist(),
         "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
         "min_det_f": float(motion.min_det_f.min())}

@@ -26,8 +26,10 @@ class Place:
 class StrainState:
     """Mean over each tetrahedron, shape [tet_count] or [tet_count, 3].
 
+    Strain and stress of a branch that hangs as it was scanned include those that carry its weight.
+
     Attributes:
-        energy_density: Strain energy density [J/m^3].
+        energy_density: Strain energy density [J/m^3], of the strain since the model's mesh.
         principal_strain: Principal Green-Lagrange strains, ascending.
         principal_stress: Principal Cauchy stresses [Pa], ascending.
         det_f: Volume relative to that at rest, at the quadrature point where it is least.
@@ -59,11 +61,28 @@ def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
     part = model.weights / model.weights.sum(axis=1, keepdims=True)
     F_t = np.swapaxes(F, 2, 3)
     green = 0.5 * (F_t @ F - np.eye(3))
-    strain = np.einsum("eq,eqij->eij", part, green)
+    carried = _carried(model)
+    strain = np.einsum("eq,eqij->eij", part, green + strain_of(model, carried))
     energy = model.internal(displacement).tet_energy / model.weights.sum(axis=1)
-    stress = np.einsum("eq,eqij->eij", part, _cauchy(model, F, green))
+    det = np.linalg.det(F)
+    cauchy = _cauchy(model, F, green) + F @ carried @ F_t / det[..., None, None]
+    stress = np.einsum("eq,eqij->eij", part, cauchy)
     return StrainState(energy, np.linalg.eigvalsh(strain), np.linalg.eigvalsh(stress),
-                       np.linalg.det(F).min(axis=1))
+                       det.min(axis=1))
+
+
+def strain_of(model: BranchModel, stress: np.ndarray) -> np.ndarray:
+    """Return the small strain that a stress [Pa] makes, both of shape [tet_count, q, 3, 3]."""
+    young, poisson = (values[:, None, None, None] for values in (model.young, model.poisson))
+    trace = np.trace(stress, axis1=2, axis2=3)[..., None, None]
+    return ((1 + poisson) * stress - poisson * trace * np.eye(3)) / young
+
+
+def _carried(model: BranchModel) -> np.ndarray:
+    """Return the stress that carries the weight on the scan [Pa], shape [tet_count, q, 3, 3]."""
+    if model.hanging is None:
+        return np.zeros((*model.weights.shape, 3, 3))
+    return model.hanging.total.stress[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 
 
 def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray) -> np.ndarray:

@@ -110,9 +110,7 @@ class ReducedForward(Forward):
 
     def _model(self, values: Values) -> ReducedModel:
         model = self._reduced.with_young(values.young, values.poisson)
-        # The load of the coordinates is weight alone; with_young has made a copy.
-        model.load = self._reduced.load * (values.density / self._density)
-        return model
+        return model.with_density(values.density / self._density)
 
 
 def _wrench(of: ReducedState | ReducedSensitivities, arm: np.ndarray) -> np.ndarray:

@@ -97,6 +97,7 @@ class DynamicResult:
         times: [s], shape [frames].
         displacement: [m], shape [frames, node_count, 3].
         strain_energy, kinetic_energy: [J], shape [frames].
+        energy: Potential of strain and weight, as in StaticResult [J], shape [frames].
         load_energy: Potential [J] of gravity and nodal forces, shape [frames].
         reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], the torque about
             the pose's position, shape [frames, 3] ([frames, g, 3] for several grasps).
@@ -112,6 +113,7 @@ class DynamicResult:
     times: np.ndarray
     displacement: np.ndarray
     strain_energy: np.ndarray
+    energy: np.ndarray
     kinetic_energy: np.ndarray
     load_energy: np.ndarray
     reaction_force: np.ndarray

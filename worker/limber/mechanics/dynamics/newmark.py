@@ -68,7 +68,7 @@ class NewmarkStepper:
             if increment is not None and norm <= max(settings.tolerance * reference,
                                                      self._floor()):
                 if fresh:
-                    self._tangent_error = norm / norms[-1]
+                    self._tangent_error = norm / norms[-1] if norms[-1] else 0.0
                 return self._accepted(new, min_det_f)
             first = increment is None
             if fresh:

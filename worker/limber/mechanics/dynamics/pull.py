@@ -78,7 +78,8 @@ class Motion:
     Attributes:
         times: [s], shape [frames].
         displacement: Of all nodes from the rest shape [m], shape [frames, node_count, 3].
-        strain_energy, kinetic_energy: [J], shape [frames].
+        energy, kinetic_energy: [J], shape [frames]; energy: the potential of strain and weight
+            above the first state of the pull, before anything pulls.
         grasp_force, grasp_torque: Of the gripper on the branch [N, Nm], shape [frames, 3].
         hold_forces: Of the other holds [N], shape [frames, holds, 3].
         min_det_f: Smallest det F, shape [frames].
@@ -88,7 +89,7 @@ class Motion:
 
     times: np.ndarray
     displacement: np.ndarray
-    strain_energy: np.ndarray
+    energy: np.ndarray
     kinetic_energy: np.ndarray
     grasp_force: np.ndarray
     grasp_torque: np.ndarray
@@ -116,7 +117,7 @@ def static_motion(pull: Pull, progress: Progress) -> Motion:
     force, hold_forces = _forces(pull, reactions)
     return Motion(
         times=pull.times[:count], displacement=np.array([r.displacement for r in results]),
-        strain_energy=np.array([r.strain_energy for r in results]),
+        energy=np.array([r.energy for r in results]) - pull.start.energy,
         kinetic_energy=np.zeros(count), grasp_force=force,
         grasp_torque=pull.at_grippers(torques)[0], hold_forces=hold_forces,
         min_det_f=np.array([r.min_det_f for r in results]), converged=last.converged,
@@ -133,7 +134,8 @@ def dynamic_motion(pull: Pull, settings: NewmarkSettings, progress: Progress) ->
     count = len(found.times)
     force, hold_forces = _forces(pull, found.reaction_force.reshape(count, -1, 3))
     return Motion(
-        times=found.times, displacement=found.displacement, strain_energy=found.strain_energy,
+        times=found.times, displacement=found.displacement,
+        energy=found.energy - pull.start.energy,
         kinetic_energy=found.kinetic_energy, grasp_force=force,
         grasp_torque=pull.at_grippers(found.reaction_torque.reshape(count, -1, 3))[0],
         hold_forces=hold_forces, min_det_f=found.min_det_f, converged=found.converged,

@@ -26,7 +26,7 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import ParameterSet, reactions
-from limber.mechanics.statics.problem import checked_forces, strain_warnings
+from limber.mechanics.statics.problem import base_forces, checked_forces, strain_warnings
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.strain import principal_stretch
 from limber.progress import SILENT, Progress
@@ -191,10 +191,11 @@ class _Motion:
         frame = {
             "time": state.time, "displacement": state.displacement.copy(),
             "strain_energy": internal.strain_energy,
+            "energy": internal.energy - float((model.weight_force * state.displacement).sum()),
             "kinetic_energy": 0.5 * float((state.velocity * momentum).sum()),
             "load_energy": -float((load * state.displacement).sum()),
             "reaction_force": forces, "reaction_torque": torques,
-            "base_force": out[model.fixed].sum(axis=0), "min_det_f": internal.min_det_f}
+            "base_force": base_forces(model, out).sum(axis=0), "min_det_f": internal.min_det_f}
         if self.tangents:
             frame["displacement_change"], frame["reaction_change"] = self.tangents.frame(state)
         return frame
@@ -221,8 +222,9 @@ class _Motion:
         return DynamicResult(
             converged=complete, status="converged" if complete else self.stepper.status,
             times=stacked("time"), displacement=stacked("displacement"),
-            strain_energy=stacked("strain_energy"), kinetic_energy=stacked("kinetic_energy"),
-            load_energy=stacked("load_energy"), reaction_force=per_grasp("reaction_force"),
+            strain_energy=stacked("strain_energy"), energy=stacked("energy"),
+            kinetic_energy=stacked("kinetic_energy"), load_energy=stacked("load_energy"),
+            reaction_force=per_grasp("reaction_force"),
             reaction_torque=per_grasp("reaction_torque"), base_force=stacked("base_force"),
             min_det_f=stacked("min_det_f"), last=self.state, step_count=self.step_count,
             iteration_count=self.stepper.iteration_count,

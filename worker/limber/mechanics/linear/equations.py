@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 
 from limber.compiled import for_kernels
 from limber.mechanics.elements.stiffness import tangent_stiffness
@@ -131,7 +132,7 @@ class Equations:
         self._spare: list[Factor] = [make_factor(self.pattern)]
         self._twin = self._spare[0].twin
         self._values = self.pattern.scratch_values()
-        self._mass: tuple[object, np.ndarray] | None = None
+        self._axes: dict[str, tuple[sp.csr_matrix, np.ndarray]] = {}
         self._pin_entries = [self._entries_of(grasp) for grasp in self.pinned]
         self.pin_rows = np.zeros((self.pattern.size, 3 * len(self.pinned)))
         for number, grasp in enumerate(self.pinned):
@@ -143,7 +144,7 @@ class Equations:
         """Return the equations of the same tetrahedra elsewhere; pattern and memory are shared."""
         other = copy.copy(self)
         other.layout = LaneLayout(self.pattern, tets, gradients, weights)
-        other._mass = None
+        other._axes = {}
         return other
 
     def tangent(self, model: "BranchModel", displacement: np.ndarray, *,
@@ -195,6 +196,8 @@ class Equations:
             np.multiply(self._mass_values(model), mass_factor, out=self._values)
         else:
             self._values[:] = 0.0
+        if model.weight_stiffness is not None:
+            self._values += self._axis_values("weight", model.weight_stiffness)
         layout = self.layout
         lam, mu = layout.per_element(model.lame_lambda), layout.per_element(model.lame_mu)
         growth, memory = 1.0, _NO_MEMORY
@@ -222,15 +225,18 @@ class Equations:
                          for grasp in self.pinned]).reshape(-1, 3)
 
     def _mass_values(self, model: "BranchModel") -> np.ndarray:
-        matrix = model.mass_matrix
-        if self._mass is None or self._mass[0] is not matrix:
+        return self._axis_values("mass", model.mass_matrix)
+
+    def _axis_values(self, name: str, matrix: sp.csr_matrix) -> np.ndarray:
+        """Return a matrix that is the same in each axis, in the pattern; kept until it changes."""
+        if name not in self._axes or self._axes[name][0] is not matrix:
             entries = matrix.tocoo()
             lower = self.pattern.position[entries.row] >= self.pattern.position[entries.col]
-            row, column, mass = entries.row[lower], entries.col[lower], entries.data[lower]
+            row, column, part = entries.row[lower], entries.col[lower], entries.data[lower]
             where = self.pattern.scalar_entries(row, column)
-            values = np.bincount(where.ravel(), np.repeat(mass, 3), len(self._values))
-            self._mass = (matrix, values)
-        return self._mass[1]
+            values = np.bincount(where.ravel(), np.repeat(part, 3), len(self._values))
+            self._axes[name] = (matrix, values)
+        return self._axes[name][1]
 
     def _entries_of(self, grasp: Grasp) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         later, earlier = np.tril_indices(len(grasp.nodes))

@@ -85,8 +85,18 @@ class ReducedStepper:
             0.0, state.coordinates.copy(), zero, zero.copy())
         self.pose = None if isinstance(state, ReducedMotionState) else state.pose
         self.iteration_count = 0
-        self.strain_energy = 0.0
         self.out = zero.copy()
+
+    @property
+    def strain_energy(self) -> float:
+        """Of the strain since the model's mesh [J]."""
+        return self.model.strain_energy(self.state.coordinates)
+
+    @property
+    def energy(self) -> float:
+        """Potential of strain and weight, as in StaticResult [J]."""
+        q = self.state.coordinates
+        return self.model.energy(q) - float(self.model.load @ q)
 
     @property
     def kinetic_energy(self) -> float:
@@ -181,7 +191,6 @@ class ReducedStepper:
                 velocity[free] += by_rate * change
                 acceleration[free] += by_mass * change
                 self.out[:count] += coupling.T @ change
-                self.strain_energy = energy
                 self.state = ReducedMotionState(old.time + step, q, velocity, acceleration)
                 return True
             last = gain
@@ -212,7 +221,6 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
     begin = start or model.solve_static(poses[0], nodal_forces=nodal_forces)
     stepper = ReducedStepper(model, begin, nodal_forces=nodal_forces, settings=settings)
     stepper.state.time = float(times[0])
-    stepper.strain_energy = model.strain_energy(stepper.state.coordinates)
     if not isinstance(begin, ReducedMotionState):
         stepper.begin(_held_at(model, path, float(times[0]))[2])
     rows, seconds, message = [_row(stepper, poses[0])], [], ""

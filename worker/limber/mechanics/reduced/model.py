@@ -44,7 +44,7 @@ from limber.mechanics.reduced.training import (
 )
 from limber.progress import SILENT, Progress
 
-FORMAT = 2
+FORMAT = 3
 _STATIC = ReducedStaticSettings()
 _DEFAULT = ReducedSettings()
 _NO_INCREMENT = np.empty(0)
@@ -77,7 +77,9 @@ class ReducedModel:
         rest: Rest positions of all nodes [m], shape [node_count, 3].
         basis: The subspace.
         polynomial: Strain as a polynomial of the coordinates.
-        load: Gravity on the coordinates [N], shape [size].
+        load: Weight that the mesh's shape does not carry, on the coordinates [N], shape [size].
+        weight_stiffness: Of the weight that it carries (limber.mechanics.hanging) [N/m], shape
+            [size, size].
         mass: Mass matrix of the coordinates, shape [size, size].
         damping: Rayleigh damping.
         control_young: Young's modulus at the control points [Pa], shape [K].
@@ -92,6 +94,7 @@ class ReducedModel:
     basis: Basis
     polynomial: StrainPolynomial
     load: np.ndarray
+    weight_stiffness: np.ndarray
     mass: np.ndarray
     damping: RayleighDamping
     control_young: np.ndarray
@@ -112,6 +115,7 @@ class ReducedModel:
         self._known = np.flatnonzero(modes & (self._largest > 0))[:_LEADING]
         self._table = _PoseTable(self.poses, self.extent)
         self._spacing = self._table.spacing()
+        self._weight_lower = np.tril(self.weight_stiffness)
         self._set()
 
     @property
@@ -139,13 +143,21 @@ class ReducedModel:
         other._set()
         return other
 
+    def with_density(self, factor: float) -> "ReducedModel":
+        """Return the model of a branch ``factor`` times as heavy, at rest."""
+        other = copy.copy(self)
+        other.load = factor * self.load
+        other.weight_stiffness = factor * self.weight_stiffness
+        other._weight_lower = factor * self._weight_lower
+        return other
+
     def _set(self) -> None:
         moduli = self.polynomial.moduli(self.young, self.poisson)
         self.linear, self.quadratic, self.root = self.polynomial.whitened(moduli)
         self._work = Workspace.of(self.linear)
 
     def energy_force(self, q: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return strain energy [J] and its derivative [size] at coordinates."""
+        """Return energy [J], with that of a carried weight, and its derivative [size]."""
         energy, gradient, _ = self.tangent(q)
         return energy, gradient.copy()
 
@@ -154,7 +166,8 @@ class ReducedModel:
                 ) -> tuple[float, np.ndarray, np.ndarray]:
         """Return energy, force and tangent (lower triangle); arrays are overwritten next time.
 
-        With ``increment`` the geometric stiffness is that of the mixed-integration-point Newton;
+        Energy and force with those of the weight that the mesh's shape carries. With ``increment``
+        the geometric stiffness is that of the mixed-integration-point Newton;
         with ``velocity``, which changes by ``by_rate`` [1/s] with q, the stiffness damping acts.
         """
         work = self._work
@@ -163,11 +176,18 @@ class ReducedModel:
         energy = evaluate_strain(self.linear, self.quadratic, q, dq, moving,
                                  self.damping.stiffness, by_rate, work.strain, work.jacobian,
                                  work.gradient, work.tangent)
-        return energy, work.gradient, work.tangent
+        lifted = self.weight_stiffness @ q
+        work.gradient += lifted
+        work.tangent += self._weight_lower
+        return energy + 0.5 * float(lifted @ q), work.gradient, work.tangent
 
     def strain_energy(self, q: np.ndarray) -> float:
-        """Return the strain energy [J] at coordinates."""
+        """Return the energy of the strain since the model's mesh [J] at coordinates."""
         return strain_only(self.linear, self.quadratic, q, self._work.strain)
+
+    def energy(self, q: np.ndarray) -> float:
+        """Return that energy with the carried weight's [J]."""
+        return self.strain_energy(q) + 0.5 * float(q @ self.weight_stiffness @ q)
 
     def displacement_of(self, q: np.ndarray) -> np.ndarray:
         """Return the displacement of all nodes [m], shape [node_count, 3]."""
@@ -292,7 +312,7 @@ class ReducedModel:
             if move is None and gain <= settings.tolerance * max(energy, 1e-12):
                 novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
                 return _Found(q, stable, novelty, iteration + 1,
-                              self.strain_energy(q) - float(load @ q))
+                              self.energy(q) - float(load @ q))
             move = None
         return _Found(q, False, np.inf, settings.max_iterations, np.inf)
 
@@ -300,11 +320,13 @@ class ReducedModel:
                began: float, settings: ReducedStaticSettings) -> ReducedState:
         energy, force = self.energy_force(found.q)
         reaction, torque = self.wrench(pose, force - load)
+        strain = energy - 0.5 * float(found.q @ self.weight_stiffness @ found.q)
         doubt = "" if found.converged else "no stable equilibrium was found"
         doubt = doubt or self.doubt(pose, found.novelty, settings.novelty_limit)
         return ReducedState(
-            found.converged, not doubt, doubt, found.q, pose, self.young, float(energy), reaction,
-            torque, found.novelty, iterations, time.perf_counter() - began)
+            found.converged, not doubt, doubt, found.q, pose, self.young, strain,
+            float(energy - self.load @ found.q), reaction, torque, found.novelty, iterations,
+            time.perf_counter() - began)
 
     def wrench(self, pose: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return force and torque of the gripper from the forces on the grasp coordinates."""
@@ -319,7 +341,7 @@ class ReducedModel:
             "columns": self.basis.columns, "lift_count": self.basis.lift_count,
             "states": self.basis.states, "captured": self.basis.captured, "reach": self.basis.reach,
             **{f"polynomial_{k}": v for k, v in vars(self.polynomial).items()},
-            "load": self.load, "mass": self.mass,
+            "load": self.load, "weight_stiffness": self.weight_stiffness, "mass": self.mass,
             "damping": [self.damping.mass, self.damping.stiffness],
             "control_young": self.control_young, "poses": self.poses,
             "training_young": self.training_young, "energies": self.energies,
@@ -352,10 +374,11 @@ class ReducedModel:
                                       float(arrays["polynomial_poisson"]))
         error = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                          strict=True))
-        return cls(grasp, arrays["rest"], basis, polynomial, arrays["load"], arrays["mass"],
-                   RayleighDamping(*arrays["damping"]), arrays["control_young"], arrays["poses"],
-                   arrays["training_young"], arrays["energies"], float(arrays["young_spread"]),
-                   float(arrays["extent"]), error)
+        return cls(grasp, arrays["rest"], basis, polynomial, arrays["load"],
+                   arrays["weight_stiffness"], arrays["mass"],
+                   RayleighDamping(*arrays["damping"]), arrays["control_young"],
+                   arrays["poses"], arrays["training_young"], arrays["energies"],
+                   float(arrays["young_spread"]), float(arrays["extent"]), error)
 
 
 @dataclass(frozen=True)
@@ -420,8 +443,11 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                                  settings.field_count)
     flat = basis.columns.reshape(basis.size, -1)
     spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
+    weight = model.weight_stiffness
+    carried = np.zeros((basis.size, basis.size)) if weight is None else flat @ np.array(
+        [weight @ column for column in basis.columns]).reshape(basis.size, -1).T
     return ReducedModel(
-        grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(),
+        grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(), carried,
         reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
         snapshots.young, snapshots.energy, max(spread, 1.0), model.extent)
 

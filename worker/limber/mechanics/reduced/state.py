@@ -57,7 +57,8 @@ class ReducedState:
         coordinates: q, shape [size].
         pose: [m, rad], shape [6].
         young: At the control points [Pa], shape [K].
-        strain_energy: [J].
+        strain_energy: Of the strain since the model's mesh [J].
+        energy: Potential of strain and weight, as in StaticResult [J].
         reaction_force, reaction_torque: Of the gripper on the branch [N, Nm], shape [3]; torque
             about the pose's position.
         novelty: Largest mode coordinate relative to the training's.
@@ -71,6 +72,7 @@ class ReducedState:
     pose: np.ndarray
     young: np.ndarray
     strain_energy: float
+    energy: float
     reaction_force: np.ndarray
     reaction_torque: np.ndarray
     novelty: float
@@ -85,7 +87,7 @@ class ReducedSensitivities:
     Attributes:
         coordinates: Shape [size, K]; displacements by ``ReducedModel.displacement_of``.
         reaction_force, reaction_torque: [N, Nm], shape [3, K]; about the pose's position.
-        strain_energy: [J], shape [K].
+        strain_energy: With that of a carried weight [J], shape [K].
     """
 
     coordinates: np.ndarray

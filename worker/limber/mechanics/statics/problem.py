@@ -107,7 +107,7 @@ def make_result(problem: Problem, displacement: np.ndarray, state: InternalState
     model = problem.model
     positions = model.mesh.nodes + displacement
     out = state.force - load
-    base = np.where(model.fixed[:, None], out, 0.0)
+    base = base_forces(model, out)
     pose, force, torque = None, np.zeros(3), np.zeros(3)
     if problem.grasps:
         poses = [g.pose_of(model.mesh.nodes, displacement) for g in problem.grasps]
@@ -119,8 +119,19 @@ def make_result(problem: Problem, displacement: np.ndarray, state: InternalState
             pose, force, torque = pose[0], force[0], torque[0]
     return StaticResult(
         displacement=displacement, pose=pose, strain_energy=state.strain_energy,
+        energy=state.energy - float((model.weight_force * displacement).sum()),
         reaction_force=force, reaction_torque=torque, base_force=base.sum(axis=0),
         base_torque=np.cross(positions, base).sum(axis=0), min_det_f=state.min_det_f, **found)
+
+
+def base_forces(model: BranchModel, out: np.ndarray) -> np.ndarray:
+    """Return what the base exerts on its nodes [N], 0 elsewhere, shape [node_count, 3].
+
+    Args:
+        out: Internal and inertial force less loads on all nodes [N], shape [node_count, 3].
+    """
+    base = np.where(model.fixed[:, None], out, 0.0)
+    return base if model.hanging is None else base + model.hanging.total.base
 
 
 def grasp_wrench(problem: Problem, grasp: Grasp, positions: np.ndarray, out: np.ndarray,

@@ -47,7 +47,10 @@ class StaticResult:
             limit), ``inverted``, ``unstable``, ``false_equilibrium``.
         displacement: [m], shape [node_count, 3].
         pose: Pose of the grasp in this state [m, rad], shape [6] ([g, 6] for several), or None.
-        strain_energy: [J].
+        strain_energy: Of the strain since the model's mesh [J].
+        energy: Potential of strain and weight above the model's mesh [J]: above the hanging state
+            of a branch that hangs as it was scanned (BranchModel.as_scanned). Its gradient to the
+            pose is what the gripper exerts.
         reaction_force, reaction_torque: What the gripper exerts on the branch [N, Nm], the
             torque about the pose's position; shape [3] ([g, 3] for several grasps).
         base_force, base_torque: What the base exerts on the branch; the torque about the origin.
@@ -65,6 +68,7 @@ class StaticResult:
     displacement: np.ndarray
     pose: np.ndarray | None
     strain_energy: float
+    energy: float
     reaction_force: np.ndarray
     reaction_torque: np.ndarray
     base_force: np.ndarray

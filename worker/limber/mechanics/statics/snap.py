@@ -106,7 +106,7 @@ def pushed_off(model: BranchModel, equations: Equations, state: np.ndarray,
         return state, False
     push = _PUSH * model.extent * mode / np.linalg.norm(mode, axis=1).max()
     sides = [state + push, state - push]
-    potentials = [model.internal(side).strain_energy - float((load * side).sum())
+    potentials = [model.internal(side).energy - float((load * side).sum())
                   for side in sides]
     return sides[int(np.argmin(potentials))], True
 

@@ -96,10 +96,10 @@ def _verified(problem: Problem, result: StaticResult, goal: Target, pose: np.nda
     other = Problem(problem.model, problem.grasps or None, problem.is_held, careful)
     other.single = problem.single
     again = Path(other, problem.displacement_of(None), goal, pose).run(progress)
-    lower = result.strain_energy - again.strain_energy
-    if again.converged and lower > 1e-3 * abs(again.strain_energy):
+    lower = result.energy - again.energy
+    if again.converged and lower > 1e-3 * abs(again.energy):
         return replace(
             result, converged=False, status="false_equilibrium",
-            message=f"energy {result.strain_energy:.6g} J, but {again.strain_energy:.6g} J on the"
+            message=f"energy {result.energy:.6g} J, but {again.energy:.6g} J on the"
                     " way from rest: a false equilibrium")
     return result
