@@ -12,7 +12,8 @@ How far to trust it: :mod:`limber.mechanics.reduced.refresh`.
 
 import copy
 import time
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -333,8 +334,9 @@ class ReducedModel:
         wrench = self.held.by_pose(pose).T @ out[:self.basis.lift_count]
         return wrench[:3], wrench[3:] if len(wrench) == 6 else np.zeros(3)
 
-    def write(self, path: Path) -> None:
-        """Write the model as plain arrays (npz, nothing pickled)."""
+    def write(self, path: Path, beside: Mapping[str, np.ndarray] | None = None) -> None:
+        """Write the model as plain arrays (npz, nothing pickled); ``beside`` goes into the file
+        too, under names that begin with ``snapshot_``, which :meth:`read` leaves alone."""
         arrays = {
             "format": FORMAT, "grasp_nodes": self.grasp.nodes, "grasp_weights": self.grasp.weights,
             "grasp_centre": self.grasp.centre, "grasp_mode": self.grasp.mode, "rest": self.rest,
@@ -348,7 +350,7 @@ class ReducedModel:
             "young_spread": self.young_spread, "extent": self.extent,
             "error_names": list(self.error), "error_values": list(self.error.values())}
         with open(path, "wb") as stream:
-            np.savez(stream, **arrays)
+            np.savez(stream, **arrays, **(beside or {}))
 
     @classmethod
     def read(cls, path: Path) -> "ReducedModel":
@@ -359,8 +361,9 @@ class ReducedModel:
         """
         try:
             with np.load(path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files}
-        except (OSError, ValueError) as error:
+                arrays = {name: data[name] for name in data.files
+                          if not name.startswith("snapshot_")}
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise InputError(f"{path} cannot be read ({error}).",
                              "A reduced model was expected.", "Build it again.") from error
         if int(arrays.get("format", -1)) != FORMAT:
