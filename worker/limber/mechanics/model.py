@@ -22,6 +22,7 @@ from limber.mechanics.elements.forces import (
     strains,
     tangent_times,
 )
+from limber.mechanics.elements.principal import largest_principal_strains
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.hanging import Hanging, carried
 from limber.mechanics.linear.equations import Equations, Viscous
@@ -338,6 +339,16 @@ class BranchModel:
         stretch, tet = largest_stretch(for_kernels(displacement),
                                        layout.mean_gradients, layout.nodes)
         return float(stretch), min(int(tet), self.mesh.tet_count - 1)
+
+    def largest_principal_strains(self, displacement: np.ndarray) -> np.ndarray:
+        """Return the largest principal Green-Lagrange strain of each element, [tet_count].
+
+        Of its mean deformation, as :meth:`largest_stretch`; in a millisecond for thousands.
+        """
+        layout, out = self._data.layout, np.empty(self.mesh.tet_count)
+        largest_principal_strains(for_kernels(displacement), layout.mean_gradients, layout.nodes,
+                                  out)
+        return out
 
     def strain_changes(self, displacement: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the derivative of :meth:`strains` along ``direction`` [m]."""
