@@ -13,30 +13,18 @@ import psutil
 import pytest
 
 from limber.errors import InputError, WorkError
-from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.session.client import InteractiveSession
 from limber.session.frames import FrameReader, FrameWriter
 from limber.store import Branch
 
-SMALL = ("--grasps", "24", "--size", "36", "--fields", "70", "--no-cache")
-
-
-@pytest.fixture(scope="module")
-def branch_folder(tmp_path_factory) -> Path:
-    """A branch folder with a beam of 20 cm."""
-    folder = tmp_path_factory.mktemp("session") / "beam.branch"
-    mesh = straight_beam(0.2, 0.004, 0.003, slice_count=10, young=1e8, grasp_fraction=0.7)
-    branch = Branch.create(folder)
-    with branch.stage("mesh") as stage:
-        mesh.write(stage.path("mesh.vtu"))
-    return folder
+SMALL = {"grasps": 24, "size": 36, "fields": 70, "cache": False}
 
 
 @pytest.fixture(scope="module")
 def session(branch_folder):
     """A session whose reduced model is ready."""
-    with InteractiveSession(branch_folder, mode="pinned", options=SMALL) as running:
+    with InteractiveSession(branch_folder, mode="pinned", **SMALL) as running:
         assert running.wait_for("model", 90) is not None, running.events
         yield running
 
@@ -76,7 +64,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
     """A reader does not take any file for a session's."""
     path = tmp_path / "other"
     path.write_bytes(b"something else" * 20)
-    with pytest.raises(InputError, match="LIMBPOS1"):
+    with pytest.raises(InputError, match="LIMBPOS2"):
         FrameReader(path)
 
 
@@ -113,17 +101,19 @@ def test_a_stiffer_branch_pulls_harder(session):
     pose = moved(session, x=0.02, z=-0.003)
     soft = session.wait(session.move(pose))
     session.set_young(2 * young)
-    time.sleep(0.2)
     stiff = session.wait(session.move(pose))
     session.set_young(young)
     assert stiff.strain_energy == pytest.approx(2 * soft.strain_energy, rel=0.05)
 
 
 def test_what_is_not_understood_is_named_and_survived(session):
-    """A broken command gives a warning; the session goes on."""
-    session._process.stdin.write('{"command": "move", "pose": [1, 2]}\nnonsense\n')
+    """A broken command gets an error with its id; the session goes on."""
+    session._process.stdin.write('{"command": "move", "id": 77, "pose": [1, 2]}\nnonsense\n')
     session._process.stdin.flush()
-    assert session.wait_for("warning", 5, count=2) is not None
+    assert session.wait_for("error", 5, count=2) is not None
+    said = [line for line in session.events if line["event"] == "error"]
+    assert said[0]["id"] == 77 and "pose.2" in said[0]["message"]
+    assert "nonsense" in said[1]["message"]
     assert session.wait(session.move(moved(session, y=0.01))) is not None
 
 
@@ -145,20 +135,28 @@ def test_motion_goes_on_and_comes_to_rest(session):
 def test_a_strange_client_needs_no_limber(branch_folder):
     """A program that knows only JSON and the file's layout gets positions; leaving ends it all."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "limber.session.worker", str(branch_folder), "--full-only"],
+        [sys.executable, "-m", "limber.session.worker", str(branch_folder), "--settings",
+         '{"reduced": false}'],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     hello = json.loads(process.stdout.readline())
     process.stdin.write(json.dumps({"command": "move", "id": 1, "pose": hello["rest_pose"]}) + "\n")
     process.stdin.flush()
     data = np.memmap(hello["positions"], np.uint8, "r")
     end = time.monotonic() + 30
-    while (sequence := int(data[24:32].view("<u8")[0])) == 0 and time.monotonic() < end:
+
+    def numbers():
+        sequence = int(data[40:48].view("<u8")[0])
+        start, slot = data[56:72].view("<u8")
+        at = int(start + sequence % 3 * slot)
+        return at, data[at:at + 256].view("<f8")
+
+    while (frame := numbers())[1][0] != 1 and time.monotonic() < end:
         time.sleep(0.01)
-    start, slot = data[40:56].view("<u8")
-    at = int(start + sequence % 3 * slot) + 128
+    at = frame[0] + 8 * (32 + 8 * 13)
     positions = data[at:at + 12 * hello["vertex_count"]].view("<f4").reshape(-1, 3)
     assert np.ptp(positions[:, 2]) == pytest.approx(0.2, rel=0.02)
-    del data, positions
+    del positions, frame
+    data = None
     process.stdin.close()
     assert process.wait(10) == 0
     process.stdout.close()
@@ -167,7 +165,7 @@ def test_a_strange_client_needs_no_limber(branch_folder):
 
 def test_the_session_dies_alone_and_its_client_says_so(branch_folder):
     """A killed session is an error at the next call, and leaves no file and no trainer."""
-    session = InteractiveSession(branch_folder, options=SMALL)
+    session = InteractiveSession(branch_folder, **SMALL)
     children = psutil.Process(session.process_id).children()
     path = Path(session.hello["positions"])
     os.kill(session.process_id, signal.SIGKILL)

@@ -1,6 +1,5 @@
 """Reduced model and interactive session against the full model (rows of issue 4's table)."""
 
-import argparse
 import json
 import tempfile
 import time
@@ -15,6 +14,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, young_weights
 from limber.mechanics.dynamics.simulate import simulate_dynamics
+from limber.mechanics.reduced.cache import ReducedCache, model_key
 from limber.mechanics.reduced.dynamics import ReducedMotion, simulate_reduced
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
 from limber.mechanics.reduced.training import (
@@ -26,7 +26,8 @@ from limber.mechanics.reduced.training import (
 )
 from limber.progress import SILENT, Progress
 from limber.session.client import InteractiveSession
-from limber.session.trainer import ModelCache, model_key, settings_of
+from limber.session.loading import load_held, reduced_settings
+from limber.session.settings import SessionSettings
 from limber.store import Branch
 
 LENGTH = 0.6
@@ -34,7 +35,7 @@ YOUNG = 5e7
 KNOWN = ReducedSettings(size=62, vibration_count=1, field_count=100)
 CHANGED = ReducedSettings(size=66, vibration_count=0, field_count=110)
 CLAMPED = ReducedSettings(size=90, vibration_count=0, field_count=140)
-SESSION = ("--mode", "pinned", "--grasps", "2", "--size", "62", "--fields", "100")
+SESSION = {"mode": "pinned", "grasps": 2, "size": 62, "fields": 100}
 
 
 @dataclass(frozen=True)
@@ -224,9 +225,8 @@ def run_session(bench: _Bench, reduced: ReducedModel, snapshots: Snapshots,
     """
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as folder:
         path = write_branch(Path(folder) / "bench.branch", bench)
-        _put_in_cache(path, Path(folder), bench, reduced, snapshots)
-        options = [*SESSION, "--cache", folder]
-        with InteractiveSession(path, mode="pinned", options=options) as session:
+        _put_in_cache(path, Path(folder), reduced, snapshots)
+        with InteractiveSession(path, **SESSION, cache_folder=Path(folder)) as session:
             if session.wait_for("model", 120) is None:
                 return f"no model: {session.events[-3:]}", False
             goals = snapshots.poses[np.linspace(0, len(snapshots) - 1, 12).astype(int)]
@@ -261,15 +261,13 @@ def write_branch(path: Path, bench: _Bench) -> Path:
     return path
 
 
-def _put_in_cache(path: Path, cache: Path, bench: _Bench, reduced: ReducedModel,
-                  snapshots: Snapshots) -> None:
+def _put_in_cache(path: Path, cache: Path, reduced: ReducedModel, snapshots: Snapshots) -> None:
     """Let the session find the model that is there already instead of making one."""
-    from limber.session.trainer import session_arguments
-
-    options = session_arguments(argparse.ArgumentParser()).parse_args([str(path), *SESSION])
-    model = BranchModel.from_branch(Branch.open(path))
-    key = model_key(model, Grasp.from_mesh(model.mesh, "pinned"), settings_of(options))
-    ModelCache(cache, key).store(reduced, snapshots)
+    settings = SessionSettings(**SESSION)
+    held = load_held(path, settings)
+    grasp = Grasp.from_mesh(held.model.mesh, "pinned")
+    key = model_key(held.model, grasp, held.weights, held.young, reduced_settings(settings))
+    ReducedCache(cache).store(key, reduced, snapshots)
 
 
 def _follow(session: InteractiveSession, goals: np.ndarray, seconds: float,

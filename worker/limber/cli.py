@@ -39,6 +39,7 @@ COMMANDS = {
     "predict": "Where a branch rests under another load, with its estimated modulus.",
     "energy": "Energy field over grasp poses.",
     "plan": "Paths to a goal: RRT* and deformation-aware D-RRT*, compared.",
+    "session": "A branch held in a process that other programs bend, by JSON lines.",
     "report": "One self-contained HTML page with figures and tables of all results.",
     "scene": "A Blender scene with the branch, its motion and paths.",
     "demo": "The whole pipeline on one branch.",

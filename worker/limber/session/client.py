@@ -13,23 +13,27 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import WorkError
+from limber.errors import InputError, WorkError
 from limber.session.frames import Frame, FrameReader
+from limber.session.protocol import PROTOCOL
+from limber.session.settings import SessionSettings
+from limber.version import VERSION
 
 _GRACE_SECONDS = 3.0
 
 
 class InteractiveSession:
-    """A branch in a process of its own that follows the grasp. ::
+    """A branch in a process of its own that follows what holds it. ::
 
-        with InteractiveSession("apple.branch") as session:
-            session.move(pose)
-            frame = session.latest()
+        with InteractiveSession("apple.branch", mode="pinned") as session:
+            frame = session.wait(session.move(pose))
+            second = session.grab(point=(0.0, 0.1, 0.4))
+            session.move(second["pose"], grasp=second["grasp"])
 
     Args:
         branch_folder: The branch.
-        mode: ``clamped`` or ``pinned``.
-        options: Further options of ``python -m limber.session.worker``.
+        mode: Of the marked grasp, which is held at the start: ``clamped`` or ``pinned``.
+        settings: Further fields of :class:`limber.session.settings.SessionSettings`.
         start_seconds: How long the start may take.
 
     Attributes:
@@ -38,27 +42,29 @@ class InteractiveSession:
         events: Events so far, newest last (at most 1000 are kept).
 
     Raises:
-        WorkError: the session did not start.
+        WorkError: the session did not start, or speaks another protocol.
     """
 
     def __init__(self, branch_folder: str | Path, *, mode: str = "clamped",
-                 options: Sequence[str] = (), start_seconds: float = 60.0):
+                 start_seconds: float = 60.0, **settings: Any):
         self.events: list[dict[str, Any]] = []
         self._said = threading.Condition()
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+        chosen = SessionSettings(mode=mode, **settings)
         self._process = subprocess.Popen(
             [sys.executable, "-m", "limber.session.worker", str(branch_folder),
-             "--mode", mode, *options],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True)
+             "--settings", chosen.model_dump_json()],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors, text=True,
+            encoding="utf-8", errors="replace")
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-        self._moves = 0
+        self._ids = 0
         self._frames: FrameReader | None = None
         hello = self.wait_for("hello", start_seconds)
-        if hello is None:
-            message = self._trouble()
+        trouble = self._trouble() if hello is None else other_protocol(hello)
+        if trouble:
             self.close()
-            raise WorkError(f"The session did not start: {message}")
+            raise WorkError(f"The session did not start: {trouble}")
         self.hello = hello
         self._frames = FrameReader(Path(hello["positions"]))
         self.faces = self._frames.faces
@@ -78,23 +84,75 @@ class InteractiveSession:
     def process_id(self) -> int:
         return self._process.pid
 
-    def move(self, pose: np.ndarray) -> int:
-        """Ask for the grasp at a pose [m, rad]; return the number that the answer will carry.
+    def move(self, pose: np.ndarray, grasp: int | None = None) -> int:
+        """Ask for a grasp (the first, if not named) at a pose [m, rad].
+
+        Returns:
+            The number that the frame which answers will carry.
 
         Raises:
             WorkError: the session has ended.
         """
-        self._moves += 1
-        self._send(command="move", id=self._moves, pose=np.asarray(pose, float).tolist())
-        return self._moves
+        return self._send(command="move", pose=np.asarray(pose, float).tolist(), grasp=grasp)
 
-    def set_young(self, young: np.ndarray) -> None:
-        """Set Young's modulus at the control points [Pa]."""
-        self._send(command="young", young_pa=np.asarray(young, float).tolist())
+    def grab(self, *, vertex: int | None = None, point: Sequence[float] | None = None,
+             mode: str = "pinned", radius: float = 0.01) -> dict[str, Any]:
+        """Hold the branch where it is now; return the reply with ``grasp`` and ``pose``.
 
-    def set_dynamics(self, on: bool) -> None:
-        """Let the branch move in time, or answer with equilibria."""
-        self._send(command="dynamics", on=on)
+        Args:
+            vertex: Of the surface; or ``point`` [m] on the branch as it hung at the start.
+            radius: Of the patch [m].
+
+        Raises:
+            InputError: nothing is there, or the base or another grasp is.
+        """
+        return self.request("grasp", vertex=vertex, mode=mode, radius_m=radius,
+                            point=None if point is None else [float(x) for x in point])
+
+    def release(self, grasp: int | None = None) -> dict[str, Any]:
+        """Let go of a grasp, or of all; return the reply."""
+        return self.request("release", grasp=grasp)
+
+    def set_young(self, young: np.ndarray) -> dict[str, Any]:
+        """Set Young's modulus at the control points [Pa]; return the reply."""
+        return self.request("young", young_pa=np.asarray(young, float).tolist())
+
+    def set_gravity(self, on: bool) -> dict[str, Any]:
+        """Let the branch bear its weight, or not; return the reply."""
+        return self.request("gravity", on=on)
+
+    def set_loads(self, loads: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """Hang forces on the branch, ``{"vertex" or "point", "force_n"}`` each, instead of those
+        before; return the reply."""
+        return self.request("loads", loads=list(loads))
+
+    def set_dynamics(self, on: bool) -> dict[str, Any]:
+        """Let the branch move in time, or answer with equilibria; return the reply."""
+        return self.request("dynamics", on=on)
+
+    def request(self, command: str, seconds: float = 30.0, **fields: Any) -> dict[str, Any]:
+        """Send a command and return its reply.
+
+        Raises:
+            InputError: the session refused it, with its reason.
+            WorkError: the session has ended, or did not reply in time.
+        """
+        number = self._send(command=command, **fields)
+        end = time.monotonic() + seconds
+        with self._said:
+            while True:
+                for line in reversed(self.events):
+                    if line.get("id") == number and line.get("event") == "reply":
+                        return line
+                    if line.get("id") == number and line.get("event") == "error":
+                        raise InputError(line["message"])
+                left = end - time.monotonic()
+                if left <= 0 or not self._listener.is_alive():
+                    break
+                self._said.wait(min(left, 0.2))
+        self._check()
+        raise WorkError(f"The session did not reply to `{command}` within {seconds:g} s.",
+                        "It may still be solving.", "Wait longer, or close it.")
 
     def latest(self) -> Frame | None:
         """Return the newest frame, None before the first.
@@ -155,6 +213,8 @@ class InteractiveSession:
                 content = json.loads(line)
             except json.JSONDecodeError:
                 continue  # a native library's own words
+            if not isinstance(content, dict):
+                continue
             with self._said:
                 self.events.append(content)
                 del self.events[:-1000]
@@ -162,13 +222,17 @@ class InteractiveSession:
         with self._said:
             self._said.notify_all()
 
-    def _send(self, **command: Any) -> None:
+    def _send(self, **command: Any) -> int:
         self._check()
+        self._ids += 1
+        line = {"id": self._ids} | {name: value for name, value in command.items()
+                                    if value is not None}
         try:
-            self._process.stdin.write(json.dumps(command) + "\n")
+            self._process.stdin.write(json.dumps(line) + "\n")
             self._process.stdin.flush()
         except (OSError, ValueError) as error:
             raise WorkError(f"The session has ended: {self._trouble()}") from error
+        return self._ids
 
     def _check(self) -> None:
         if self._frames is None and hasattr(self, "hello"):
@@ -179,10 +243,19 @@ class InteractiveSession:
                 f" {self._trouble()}", "", "Close it and start a new one.")
 
     def _trouble(self) -> str:
-        said = [line["message"] for line in self.events if line.get("event") == "error"]
+        said = [line["message"] for line in self.events if line.get("event") == "failed"]
         if said:
             return said[-1]
         if self._errors.closed:
             return "no message"
         self._errors.seek(0)
         return " | ".join(self._errors.read().strip().splitlines()[-4:]) or "no message"
+
+
+def other_protocol(hello: dict[str, Any]) -> str:
+    """Return what is wrong where a session speaks another protocol than this client, or nothing."""
+    theirs = hello.get("protocol")
+    if theirs == PROTOCOL:
+        return ""
+    return (f"it speaks protocol {theirs} (Limber {hello.get('limber', 'of an older version')}),"
+            f" this client {PROTOCOL} (Limber {VERSION}). Install one version of Limber for both.")

@@ -1,0 +1,53 @@
+"""Writes a session's events in a thread of its own: a client that does not read stops no frames."""
+
+import json
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from limber.session.protocol import finite
+
+_WAITING_LIMIT = 1000
+
+
+class Events:
+    """JSON lines on standard output; what nobody reads is dropped.
+
+    Args:
+        gone: Called once when the reader has gone.
+    """
+
+    def __init__(self, gone: Callable[[], None] = lambda: None):
+        self._gone = gone
+        self._lines: queue.Queue[str | None] = queue.Queue(maxsize=_WAITING_LIMIT)
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
+
+    def say(self, **line: Any) -> None:
+        """Write one event."""
+        try:
+            self._lines.put_nowait(json.dumps(finite(line), default=str))
+        except queue.Full:
+            return  # nobody reads
+
+    def close(self) -> None:
+        """Say that the session has ended, and write what waits, for a second at most."""
+        self.say(event="closed")
+        try:
+            self._lines.put(None, timeout=1.0)
+        except queue.Full:
+            return
+        self._thread.join(1.0)
+
+    def _write(self) -> None:
+        while (line := self._lines.get()) is not None:
+            try:
+                print(line, flush=True)
+            except (OSError, ValueError):
+                # What Python still holds for it would fail once more, at the very end.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                self._gone()
+                return

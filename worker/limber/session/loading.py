@@ -1,0 +1,30 @@
+"""The branch a session starts from, and what its reduced model is made of."""
+
+from pathlib import Path
+
+import numpy as np
+
+from limber.mechanics.model import BranchModel
+from limber.mechanics.reduced.state import ReducedSettings
+from limber.mechanics.reduced.training import TrainingSettings
+from limber.session.held import HeldBranch
+from limber.session.settings import SessionSettings
+from limber.store import Branch
+
+
+def reduced_settings(settings: SessionSettings) -> ReducedSettings:
+    """Return what the reduced model is made of."""
+    training = TrainingSettings(grasp_count=settings.grasps, young_spread=settings.young_spread)
+    return ReducedSettings(size=settings.size, field_count=settings.fields, training=training,
+                           vibration_count=1 if settings.young_spread == 1 else 0)
+
+
+def load_held(folder: Path, settings: SessionSettings) -> HeldBranch:
+    """Return the branch of a folder as it hangs, nothing held yet.
+
+    Raises:
+        BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
+    """
+    gravity = {} if settings.gravity else {"gravity": None}
+    model = BranchModel.from_branch(Branch.open(folder), **gravity)
+    return HeldBranch(model, np.zeros_like(model.mesh.nodes))

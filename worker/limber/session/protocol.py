@@ -1,0 +1,210 @@
+"""What a client may say to a session, checked before anything acts on it.
+
+One JSON object a line, UTF-8, at most ``LINE_LIMIT`` bytes. Every command may carry an ``id``, that
+its reply carries again. Whatever is wrong with a line is said in an ``error`` reply; nothing that a
+client sends ends the session but ``close`` and the end of the input.
+"""
+
+import json
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from limber.errors import InputError
+
+PROTOCOL = 2
+"""Of commands, events and the frames' file; a client of another one is told so."""
+LINE_LIMIT = 1 << 20
+"""Longest line [bytes]; what is longer is dropped up to its end, and said."""
+GRASP_LIMIT = 8
+"""Most grasps at once."""
+_FAR = 1e3
+"""Farthest that any coordinate lies from 0 [m]: beyond, a unit is wrong."""
+_LARGEST_ID = 2**53
+"""An id travels as a float64 with the frames."""
+
+_Coordinate = Annotated[float, Field(ge=-_FAR, le=_FAR)]
+_Component = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Vector = tuple[_Coordinate, _Coordinate, _Coordinate]
+_Pose = tuple[_Coordinate, _Coordinate, _Coordinate, _Component, _Component, _Component]
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    id: int = Field(0, ge=0, le=_LARGEST_ID)
+
+
+class _OnBranch(BaseModel):
+    """A place on the branch: a vertex of the surface, or a point of the hanging branch [m]."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    vertex: int | None = Field(None, ge=0)
+    point: _Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_place(self) -> "_OnBranch":
+        if (self.vertex is None) == (self.point is None):
+            raise ValueError("a place is one of `vertex` and `point`")
+        return self
+
+
+class Hello(_Command):
+    """The client's version of the protocol."""
+
+    command: Literal["hello"]
+    protocol: int
+
+
+class Grab(_Command, _OnBranch):
+    """Hold the branch at a place, where that is now."""
+
+    command: Literal["grasp"]
+    mode: Literal["clamped", "pinned"] = "pinned"
+    radius_m: float = Field(0.01, ge=0, le=_FAR)
+
+
+class Release(_Command):
+    """Let go of a grasp, or of all."""
+
+    command: Literal["release"]
+    grasp: int | None = None
+
+
+class Move(_Command):
+    """Bring a grasp (the first, if not named) to a pose [m, rad]."""
+
+    command: Literal["move"]
+    pose: _Pose
+    grasp: int | None = None
+
+
+class Gravity(_Command):
+    """Let the branch bear its weight, or not."""
+
+    command: Literal["gravity"]
+    on: bool
+
+
+class Dynamics(_Command):
+    """Let the branch move in time, or answer with equilibria."""
+
+    command: Literal["dynamics"]
+    on: bool
+
+
+class Young(_Command):
+    """Young's modulus at the control points [Pa]."""
+
+    command: Literal["young"]
+    young_pa: list[Annotated[float, Field(gt=0, le=1e15)]] = Field(max_length=10_000)
+
+
+class Load(_OnBranch):
+    """A dead load [N] at a place."""
+
+    force_n: tuple[_Component, _Component, _Component]
+
+
+class Loads(_Command):
+    """Forces that hang on the branch, instead of those before: a fruit, a weight, wind."""
+
+    command: Literal["loads"]
+    loads: list[Load] = Field(max_length=1000)
+
+
+class Status(_Command):
+    """Ask for grasps, gravity and who answers."""
+
+    command: Literal["status"]
+
+
+class Close(_Command):
+    """End the session."""
+
+    command: Literal["close"]
+
+
+Command = (Hello | Grab | Release | Move | Gravity | Dynamics | Young | Loads | Status | Close)
+_COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="command")])
+
+
+class NotUnderstood(InputError):
+    """A line that is no command; ``reply_id`` is that of the command, where it can be told."""
+
+    def __init__(self, seen: str, why: str = "", fix: str = "", *, reply_id: int = 0):
+        super().__init__(seen, why, fix)
+        self.reply_id = reply_id
+
+
+def parse_command(line: bytes) -> Command:
+    """Return the command of one line.
+
+    Raises:
+        NotUnderstood: it is none, with what is wrong and the names of the commands there are.
+    """
+    try:
+        return _COMMANDS.validate_json(line, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise NotUnderstood(
+            f"Not understood: {line[:200].decode(errors='replace').strip()}",
+            f"{place + ': ' if place else ''}{first['msg']}.", "",
+            reply_id=_id_of(line)) from None
+
+
+def _id_of(line: bytes) -> int:
+    """Return the id of a command that is wrong elsewhere, 0 if it has none."""
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError):
+        return 0
+    found = content.get("id") if isinstance(content, dict) else None
+    good = isinstance(found, int) and not isinstance(found, bool) and 0 <= found <= _LARGEST_ID
+    return found if good else 0
+
+
+class Lines:
+    """Cuts a stream of bytes into lines, in bounded memory.
+
+    ``feed`` gives the whole lines that a piece completes, None for one that was too long.
+    """
+
+    def __init__(self, limit: int = LINE_LIMIT):
+        self._limit = limit
+        self._part = bytearray()
+        self._is_dropping = False
+
+    def feed(self, piece: bytes) -> Iterator[bytes | None]:
+        """Take what was read; yield each line that ends in it, without its end."""
+        *ended, rest = piece.split(b"\n")
+        for end in ended:
+            line = None if self._is_dropping or len(self._part) + len(end) > self._limit else (
+                bytes(self._part) + end)
+            self._part.clear()
+            self._is_dropping = False
+            yield line
+        if self._is_dropping or len(self._part) + len(rest) > self._limit:
+            self._part.clear()
+            self._is_dropping = True
+        else:
+            self._part += rest
+
+
+def finite(value: Any) -> Any:
+    """Return a value as JSON takes it: arrays as lists, what is not finite as None."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {name: finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
