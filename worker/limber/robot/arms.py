@@ -8,6 +8,7 @@ own pose before a motion (:mod:`limber.robot.guard`), never taken as equal.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -43,7 +44,7 @@ class Arm:
     payload: float
     endless_wrist: bool = False
 
-    @property
+    @cached_property
     def table(self) -> np.ndarray:
         """The Denavit-Hartenberg table: d [m], a [m] and twist [rad] a joint, shape [6, 3]."""
         return np.column_stack([self.d, self.a, _TWIST])
@@ -53,7 +54,7 @@ class Arm:
         """Greatest distance of the wrist's centre from the shoulder [m]."""
         return abs(self.a[1]) + abs(self.a[2]) + abs(self.d[4])
 
-    @property
+    @cached_property
     def joint_limits(self) -> np.ndarray:
         """Least and greatest joint angles [rad], shape [6, 2]: one turn each way."""
         limits = np.tile([-2 * math.pi, 2 * math.pi], (6, 1))

@@ -1,0 +1,72 @@
+"""A virtual controller stepped by hand, and one in a process with the real client on it."""
+
+import numpy as np
+import pytest
+
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.launch import VirtualRobot
+
+
+class Registers:
+    """Writes commands into a controller's registers as ur-rtde does, and steps it."""
+
+    def __init__(self, controller: Controller, script: str = "def rtde_control():\nend\n"):
+        self.controller = controller
+        controller.load_script(script)
+        controller.step()
+
+    def write(self, command: int, *numbers: float, background: bool = False) -> None:
+        values = {f"input_double_register_{k}": float(x) for k, x in enumerate(numbers)}
+        self.controller.write_inputs({**values, "input_int_register_1": int(background)})
+        self.controller.write_inputs({"input_int_register_0": command})
+
+    def run(self, command: int, *numbers: float, background: bool = False,
+            most_seconds: float = 20.0) -> list[np.ndarray]:
+        """Do a command; returns the tool's poses at every step until the script says done."""
+        self.write(command, *numbers, background=background)
+        poses = [self.controller.pose]
+        for _ in range(int(most_seconds / self.controller.seconds)):
+            self.controller.step()
+            poses.append(self.controller.pose)
+            if self.controller.outputs_int[0] == 2:
+                break
+        else:
+            raise AssertionError("the command did not end")
+        self.controller.write_inputs({"input_int_register_0": 0})
+        self.controller.step()
+        return poses
+
+    def wait(self, seconds: float) -> np.ndarray:
+        """Step on; returns the tool's poses, shape [n, 6]."""
+        poses = []
+        for _ in range(round(seconds / self.controller.seconds)):
+            self.controller.step()
+            poses.append(self.controller.pose)
+        return np.array(poses)
+
+
+@pytest.fixture
+def registers():
+    """A UR5e that runs the control script, at its home pose."""
+    return Registers(Controller("ur5e", seed=3))
+
+
+@pytest.fixture(params=["ur5", "ur5e"])
+def robot(request, worker_address):
+    """A virtual robot of each series in a process of its own."""
+    with VirtualRobot(request.param, worker_address) as robot:
+        yield robot
+
+
+@pytest.fixture
+def e_series(worker_address):
+    """A virtual UR5e in a process of its own."""
+    with VirtualRobot("ur5e", worker_address) as robot:
+        yield robot
+
+
+@pytest.fixture
+def worker_address(worker_id) -> str:
+    """A loopback address of this test process: the client knows no other ports."""
+    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 0
+    return f"127.0.0.{11 + number}"

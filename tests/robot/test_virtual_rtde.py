@@ -1,0 +1,242 @@
+"""The wire: RTDE frames as the maker's guide has them, and the real client on all ports."""
+
+import asyncio
+import socket
+import struct
+import time
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError, WorkError
+from limber.robot.virtual import rtde
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.dashboard import answer
+from limber.robot.virtual.launch import VirtualRobot
+from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, Server, _RtdeConnection
+
+
+class Writer:
+    """Keeps what a connection sends."""
+
+    def __init__(self):
+        self.sent = bytearray()
+
+    def is_closing(self) -> bool:
+        return False
+
+    def write(self, data: bytes) -> None:
+        self.sent += data
+
+
+@pytest.fixture
+def connection():
+    server = Server(Controller("ur5e"), "127.0.0.1")
+    return _RtdeConnection(server, Writer())
+
+
+def replies(connection) -> list[tuple[int, bytes]]:
+    return rtde.split_frames(connection.writer.sent)
+
+
+def test_only_protocol_version_2_is_spoken(connection):
+    for version in (1, 2, 3):
+        connection.take(rtde.VERSION_REQUEST, struct.pack(">H", version))
+    assert replies(connection) == [(ord("V"), b"\0"), (ord("V"), b"\1"), (ord("V"), b"\0")]
+
+
+def test_unknown_outputs_are_named_and_refused(connection):
+    body = struct.pack(">d", 500.0) + b"timestamp,wrong_name"
+    connection.take(rtde.OUTPUT_SETUP, body)
+    connection.take(rtde.START, b"")
+    assert replies(connection) == [(ord("O"), b"\0DOUBLE,NOT_FOUND"), (ord("S"), b"\0")]
+
+
+def test_names_of_later_versions_are_not_found():
+    assert rtde.output_types(["ft_raw_wrench"], (5, 8)) == ["NOT_FOUND"]
+    assert rtde.output_types(["ft_raw_wrench"], (5, 9)) == ["VECTOR6D"]
+    assert rtde.output_types(["ft_raw_wrench"], (3, 15)) == ["NOT_FOUND"]
+
+
+def test_an_input_register_has_one_writer(connection):
+    other = _RtdeConnection(connection._server, Writer())
+    connection.take(rtde.INPUT_SETUP, b"input_int_register_0")
+    other.take(rtde.INPUT_SETUP, b"input_int_register_0,speed_slider_mask")
+    assert replies(connection) == [(ord("I"), b"\1INT32")]
+    assert replies(other) == [(ord("I"), b"\0IN_USE,UINT32")]
+    connection.release()
+    other.take(rtde.INPUT_SETUP, b"input_int_register_0")
+    assert replies(other) == [(ord("I"), b"\1INT32")]
+
+
+def test_data_goes_both_ways_and_short_packages_give_what_is_whole(connection):
+    connection.take(rtde.INPUT_SETUP, b"input_int_register_0,input_double_register_0")
+    connection.take(rtde.DATA, b"\1" + struct.pack(">id", 7, 0.5))
+    controller = connection._server.controller
+    assert controller.inputs == {"input_int_register_0": 7, "input_double_register_0": 0.5}
+    connection.take(rtde.DATA, b"\1" + struct.pack(">i", 8))
+    assert controller.inputs["input_int_register_0"] == 8
+    recipe = rtde.Recipe.of(1, ["timestamp", "actual_q", "robot_mode"], rtde.OUTPUT_TYPES)
+    (command, body), = rtde.split_frames(bytearray(recipe.packed(controller.outputs())))
+    assert command == rtde.DATA and body[0] == 1
+    values = recipe.unpacked(body[1:])
+    assert values["robot_mode"] == 7 and values["actual_q"] == pytest.approx(controller.joints)
+
+
+def test_frames_come_whole_however_the_bytes_are_cut():
+    data = rtde.frame(ord("U"), b"abc") + rtde.frame(ord("S"), b"")
+    buffer, found = bytearray(), []
+    for byte in data:
+        buffer.append(byte)
+        found += rtde.split_frames(buffer)
+    assert found == [(ord("U"), b"abc"), (ord("S"), b"")]
+    with pytest.raises(ValueError, match="0 bytes"):
+        rtde.split_frames(bytearray(b"\0\0U"))
+
+
+def test_dashboard_refuses_changes_in_local_control():
+    controller = Controller("ur5e")
+    assert answer(controller, "is in remote control\n") == "true"
+    controller.set_remote(False)
+    assert answer(controller, "is in remote control\n") == "false"
+    assert "not allowed" in answer(controller, "power off\n")
+    assert answer(controller, "robotmode\n") == "Robotmode: RUNNING"
+    controller.load_script("def rtde_control():\nend\n")
+    assert answer(controller, "running\n") == "Program running: false"
+
+
+def test_it_listens_on_loopback_only():
+    with pytest.raises(InputError, match="outside"):
+        Server(Controller("ur5e"), "0.0.0.0")
+
+
+def test_a_taken_port_is_told(worker_address):
+    with socket.create_server((worker_address, RTDE_PORT)):
+        with pytest.raises(WorkError, match="30004"):
+            asyncio.run(Server(Controller("ur5e"), worker_address).open())
+
+
+def test_a_second_robot_on_the_same_address_is_refused(e_series):
+    with pytest.raises(WorkError, match="cannot be opened"):
+        VirtualRobot("ur5e", e_series.address)
+
+
+rtde_control = pytest.importorskip("rtde_control")
+
+
+def test_the_real_client_moves_it(robot):
+    """ur-rtde connects, moves in every way, stops, asks and sets; its answers are true."""
+    import dashboard_client
+    import rtde_io
+    import rtde_receive
+
+    receive = rtde_receive.RTDEReceiveInterface(robot.address)
+    control = rtde_control.RTDEControlInterface(robot.address)
+    try:
+        start = np.array(receive.getActualTCPPose())
+
+        def off(*offset: float) -> list[float]:
+            return list(start + np.array(offset))
+
+        def error(*offset: float) -> float:
+            time.sleep(0.03)
+            return np.abs(np.array(receive.getActualTCPPose()) - off(*offset)).max()
+        here = (0.0,) * 6
+        assert control.moveL(off(0, 0.03, 0, 0, 0, 0), 0.2, 1.0)
+        assert error(0, 0.03, 0, 0, 0, 0) < 1e-8
+        joints = np.array(receive.getActualQ())
+        assert control.moveJ(list(joints + [0.1, 0, 0, 0, 0, 0]), 2.0, 4.0)
+        time.sleep(0.05)
+        assert np.abs(receive.getActualQ() - joints - [0.1, 0, 0, 0, 0, 0]).max() < 1e-8
+        assert control.moveJ_IK(off(*here), 2.0, 4.0) and error(*here) < 1e-8
+        path = [off(0, 0.01 * k, 0.01 * (k % 2), 0, 0, 0) + [0.1, 1.0, 0.002 if k < 3 else 0.0]
+                for k in range(1, 4)]
+        assert control.moveL(path) and error(0, 0.03, 0.01, 0, 0, 0) < 1e-5
+        assert control.moveL(off(*here), 0.05, 0.5, True)
+        time.sleep(0.2)
+        control.stopL(2.0, True)
+        time.sleep(0.2)
+        assert 0.005 < error(*here) < 0.031 and not np.any(receive.getActualQd())
+        now = np.array(receive.getActualTCPPose())
+        for k in range(50):
+            assert control.servoL(list(now + [0, 0.0004 * k, 0, 0, 0, 0]), 0.1, 0.1, 0.008, 0.05,
+                                  600)
+            time.sleep(0.008)
+        assert control.servoStop(10.0)
+        time.sleep(0.1)
+        assert receive.getActualTCPPose()[1] - now[1] == pytest.approx(0.0196, abs=0.006)
+        assert control.speedL([0, -0.05, 0, 0, 0, 0], 1.0, 0)
+        time.sleep(0.3)
+        assert receive.getActualTCPSpeed()[1] == pytest.approx(-0.05, abs=1e-3)
+        assert control.speedStop(10.0)
+        assert control.setPayload(0.7, [0, 0, 0.05]) and control.setTcp([0, 0, 0.1, 0, 0, 0])
+        assert control.getTCPOffset() == pytest.approx([0, 0, 0.1, 0, 0, 0])
+        assert control.zeroFtSensor() and control.isSteady()
+        assert robot.state["payload"] == 0.7
+
+        io = rtde_io.RTDEIOInterface(robot.address)
+        assert io.setSpeedSlider(0.5) and io.setStandardDigitalOut(2, True)
+        time.sleep(0.1)
+        assert receive.getTargetSpeedFraction() == 0.5
+        assert receive.getActualDigitalOutputBits() == 4
+        dashboard = dashboard_client.DashboardClient(robot.address)
+        dashboard.connect()
+        assert dashboard.running() and dashboard.robotmode() == "Robotmode: RUNNING"
+        dashboard.stop()
+        time.sleep(0.1)
+        assert not control.moveL(off(*here), 0.1, 0.5)
+        assert robot.state["program"] == "STOPPED"
+    finally:
+        control.disconnect()
+        receive.disconnect()
+
+
+def test_watchdog_and_protective_stop_with_the_real_client(e_series):
+    import rtde_receive
+
+    receive = rtde_receive.RTDEReceiveInterface(e_series.address)
+    control = rtde_control.RTDEControlInterface(e_series.address)
+    try:
+        start = receive.getActualTCPPose()
+        away = [start[0], start[1] + 0.2, *start[2:]]
+        assert control.moveL(away, 0.05, 0.5, True)
+        time.sleep(0.2)
+        e_series.ask("protective_stop")
+        time.sleep(0.2)
+        assert receive.isProtectiveStopped() and not np.any(receive.getActualQd())
+        assert not control.moveL(start, 0.1, 0.5)
+        e_series.ask("unlock")
+        assert control.reuploadScript()
+        time.sleep(0.2)
+        assert control.setWatchdog(10.0)
+        for _ in range(10):
+            assert control.kickWatchdog()
+            time.sleep(0.02)
+        assert e_series.state["program"] == "PLAYING"
+        time.sleep(0.25)
+        assert e_series.state["program"] == "STOPPED"
+    finally:
+        control.disconnect()
+        receive.disconnect()
+
+
+def test_the_ft300_stream_is_what_robotiq_sends(worker_address):
+    with (VirtualRobot("ur5", worker_address, ["--ft300"]) as robot,
+          socket.create_connection((worker_address, FT300_PORT), 5.0) as stream):
+        robot.ask("added_wrench", wrench=[0, 0, 40.0, 0, 0, 1.0])
+        time.sleep(0.1)
+        stream.recv(65536)
+        text = stream.recv(4096).decode()
+        time.sleep(0.2)
+        text += stream.recv(65536).decode()
+    messages = [m.split(")")[0] for m in text.split("(")[1:-1]]
+    rows = np.array([[float(part) for part in m.split(",")] for m in messages])
+    assert rows.shape[1] == 6 and 5 < len(rows) < 40
+    assert rows[:, 2].mean() == pytest.approx(40.0, abs=10.0)
+
+
+def test_the_process_ends_with_its_parents_pipe(worker_address):
+    robot = VirtualRobot("ur5e", worker_address)
+    robot.process.stdin.close()
+    assert robot.process.wait(5.0) == 0
+    robot.close()

@@ -1,0 +1,362 @@
+"""The virtual controller: its arm, safety and program states, step by step.
+
+It knows nothing of sockets: :mod:`limber.robot.virtual.server` brings it what clients send and
+takes away what they ask for. One call of :meth:`Controller.step` is one step of its control loop.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.robot.arms import Arm, arm_named
+from limber.robot.kinematics import matrices
+from limber.robot.virtual.kernels import crossed, tool_state, weight_wrench
+from limber.robot.virtual.motion import STOP_DECELERATION, Braking, Motion, Unreachable
+from limber.robot.virtual.program import ControlProgram
+from limber.robot.virtual.sensor import (
+    CB3_ESTIMATE,
+    E_SERIES,
+    FT300,
+    ForceSensor,
+)
+
+HOME = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
+
+
+class SafetyMode(IntEnum):
+    """As in RTDE's ``safety_mode``."""
+
+    NORMAL = 1
+    PROTECTIVE_STOP = 3
+    ROBOT_EMERGENCY_STOP = 7
+
+
+class RuntimeState(IntEnum):
+    """As in RTDE's ``runtime_state``."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
+
+
+class RobotMode(IntEnum):
+    """As in RTDE's ``robot_mode``."""
+
+    POWER_OFF = 3
+    IDLE = 5
+    RUNNING = 7
+
+
+class Load(Protocol):
+    """What the gripper holds: gives the wrench on the tool at a pose of the flange."""
+
+    def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
+        """Return force and torque of the load on the flange, flange frame, shape [6]."""
+        ...
+
+
+class Nothing:
+    """The gripper is empty."""
+
+    def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
+        return np.zeros(6)
+
+
+@dataclass
+class SensorFault:
+    """Faults of the force readings, for tests.
+
+    Attributes:
+        added: Wrench added to what the sensor reports, flange frame [N, N m].
+        frozen: Repeats the last reading.
+        nan: Reports no numbers.
+    """
+
+    added: np.ndarray = field(default_factory=lambda: np.zeros(6))
+    frozen: bool = False
+    nan: bool = False
+
+
+class Controller:
+    """A controller with its arm.
+
+    Args:
+        model: Name of the arm.
+        joints: Where it stands [rad], shape [6].
+        mass, centre: Of what really hangs at the flange [kg], [m].
+        seed: Of the sensors' noise.
+        load: What the gripper holds.
+    """
+
+    def __init__(self, model: str, *, joints: np.ndarray | None = None, mass: float = 0.0,
+                 centre: tuple[float, float, float] = (0.0, 0.0, 0.0), seed: int = 0,
+                 load: Load | None = None, ft300: bool = False):
+        self.arm: Arm = arm_named(model)
+        self.version = (3, 15, 8, 106339) if self.arm.series == "cb3" else (5, 11, 6, 1010327)
+        self.seconds = 1.0 / self.arm.rate
+        self.joints = np.array(HOME if joints is None else joints, float)
+        if self.joints.shape != (6,) or not np.isfinite(self.joints).all():
+            raise InputError(f"Joint angles {joints}.", "Six finite numbers [rad] are needed.",
+                             "Give one angle a joint.")
+        self.speeds = np.zeros(6)
+        self.tool = np.eye(4)
+        self.tool_offset = np.zeros(6)
+        self.mass, self.centre = mass, np.asarray(centre, float)
+        self.payload, self.payload_centre = 0.0, np.zeros(3)
+        rng = np.random.default_rng(seed)
+        self.sensor = ForceSensor(CB3_ESTIMATE if self.arm.series == "cb3" else E_SERIES, rng)
+        self.ft300 = ForceSensor(FT300, rng) if ft300 else None
+        self.ft300_reading = np.zeros(6)
+        self.load: Load = load or Nothing()
+        self.fault = SensorFault()
+        self.step_count, self.clock_offset = 0, 0.0
+        self.robot_mode, self.safety_mode = RobotMode.RUNNING, SafetyMode.NORMAL
+        self.remote = True
+        self.slider = 1.0
+        self.program: ControlProgram | None = None
+        self.paused = False
+        self.motion: Motion | None = None
+        self.watchdog: tuple[float, int] | None = None
+        self.inputs: dict[str, Any] = {}
+        self.outputs_int = [0] * 48
+        self.outputs_double = [0.0] * 48
+        self.digital_outputs = 0
+        self.analog_outputs = [0.0, 0.0]
+        self.history: deque[np.ndarray] = deque(maxlen=100)
+        self.log: deque[str] = deque(maxlen=200)
+        self._reading = np.zeros(6)
+        self._target = np.zeros(6)
+        self._update_tool()
+
+    # Time
+
+    @property
+    def clock(self) -> float:
+        """Seconds since the controller was started, as it reports them."""
+        return self.step_count * self.seconds + self.clock_offset
+
+    def step(self) -> None:
+        """Advance by one step."""
+        self.step_count += 1
+        self._check_watchdog()
+        if self.program is not None and not self.paused:
+            self.program.step(self)
+        self._move()
+        self._feel()
+        self.history.append(self.joints.copy())
+
+    def _move(self) -> None:
+        before = self.speeds
+        if self.motion is None or self.motion.finished:
+            self.speeds = np.zeros(6)
+        else:
+            try:
+                self.joints, self.speeds = self.motion.step(
+                    self.joints, self.speeds, self.seconds, self.slider)
+            except Unreachable as reason:
+                self.protective_stop(str(reason))
+            if np.any(np.abs(self.speeds) > 1.05 * np.asarray(self.arm.joint_speed)):
+                self.protective_stop("joint speed over its limit")
+        self.accelerations = (self.speeds - before) / self.seconds
+        limits = self.arm.joint_limits
+        if np.any(self.joints < limits[:, 0]) or np.any(self.joints > limits[:, 1]):
+            self.joints = np.clip(self.joints, limits[:, 0], limits[:, 1])
+            self.protective_stop("joint limit")
+        self._update_tool()
+
+    def _update_tool(self) -> None:
+        self.pose, self.tool_speed, self.flange = tool_state(
+            self.arm.table, self.joints, self.speeds, self.tool)
+
+    def _feel(self) -> None:
+        rotation = self.flange[:3, :3]
+        held = self.load.wrench(self.flange, self.seconds)
+        weight = weight_wrench(self.mass, self.centre, rotation)
+        supposed = weight_wrench(self.payload, self.payload_centre, rotation)
+        fault = self.fault
+        if not fault.frozen:
+            reading = self.sensor.read(held + weight - supposed, self.seconds) + fault.added
+            # Reported in the base's axes, the torque about the tool's centre.
+            torque = reading[3:] - crossed(self.tool[:3, 3], reading[:3])
+            self._reading = np.concatenate((rotation @ reading[:3], rotation @ torque))
+            if self.ft300 is not None:
+                # The FT300 knows no payload.
+                self.ft300_reading = self.ft300.read(held + weight, self.seconds) + fault.added
+        if fault.nan:
+            self._reading = np.full(6, np.nan)
+            self.ft300_reading = np.full(6, np.nan)
+
+    # Safety
+
+    def protective_stop(self, reason: str) -> None:
+        """Stop the arm and pause the program, as on a collision."""
+        if self.safety_mode == SafetyMode.NORMAL:
+            self.say(f"protective stop: {reason}")
+            self.safety_mode = SafetyMode.PROTECTIVE_STOP
+            self.paused = self.program is not None
+            self._brake()
+
+    def emergency_stop(self) -> None:
+        """Press the button: the arm stops, the program ends, power goes off."""
+        self.say("emergency stop")
+        self.safety_mode = SafetyMode.ROBOT_EMERGENCY_STOP
+        self.stop_program("emergency stop")
+        self._brake()
+        self.robot_mode = RobotMode.POWER_OFF
+
+    def unlock(self) -> bool:
+        """Release a protective stop; the program stays paused until it is played."""
+        if self.safety_mode != SafetyMode.PROTECTIVE_STOP or np.any(self.speeds):
+            return False
+        self.safety_mode = SafetyMode.NORMAL
+        self.motion = None
+        return True
+
+    def reset_emergency(self) -> None:
+        """Turn the button back and switch the arm on again."""
+        self.safety_mode, self.robot_mode, self.motion = SafetyMode.NORMAL, RobotMode.RUNNING, None
+
+    def set_remote(self, remote: bool) -> None:
+        """Switch between remote and local control; a running program ends in local control."""
+        self.remote = remote
+        if not remote:
+            self.stop_program("local control")
+
+    def _brake(self) -> None:
+        self.motion = Braking(self.speeds, STOP_DECELERATION)
+
+    # Programs
+
+    @property
+    def runtime_state(self) -> RuntimeState:
+        if self.program is None:
+            return RuntimeState.STOPPED
+        return RuntimeState.PAUSED if self.paused else RuntimeState.PLAYING
+
+    @property
+    def can_move(self) -> bool:
+        """Whether programs may run at all."""
+        return self.safety_mode == SafetyMode.NORMAL and self.robot_mode == RobotMode.RUNNING
+
+    def load_script(self, text: str) -> None:
+        """Run an uploaded script, ending the one that runs; refused in local control."""
+        if not self.remote:
+            self.say("script refused: not in remote control")
+            return
+        if not self.can_move:
+            self.say("script refused: robot is stopped")
+            return
+        self.stop_program("another script")
+        self.watchdog = None
+        self.outputs_int = [0] * 48
+        self.program, self.paused = ControlProgram(text), False
+
+    def stop_program(self, reason: str) -> None:
+        """End the program and brake the arm."""
+        if self.program is not None:
+            self.say(f"program stopped: {reason}")
+            self.program = None
+            self.paused = False
+            self.watchdog = None
+            self._brake()
+
+    def pause_program(self) -> None:
+        """Hold the program and brake the arm; playing it goes on with the next command."""
+        self.paused = True
+        self._brake()
+
+    def set_tool(self, offset: np.ndarray) -> None:
+        """Set the tool's pose in the flange's frame [m, rad]."""
+        self.tool_offset, self.tool = np.asarray(offset, float), matrices(offset)
+        self._update_tool()
+
+    def say(self, text: str) -> None:
+        """Write to the controller's log."""
+        self.log.append(f"{self.clock:.3f} {text}")
+
+    # What clients write
+
+    def write_inputs(self, values: dict[str, Any]) -> None:
+        """Take values that a client sent."""
+        self.inputs.update(values)
+        if {"input_int_register_0", "input_int_register_24"} & set(values) and self.watchdog:
+            self.watchdog = (self.watchdog[0], self.step_count)
+        if self.program is not None and not self.paused and self.program.is_control_script:
+            self.program.written(self)
+        if values.get("speed_slider_mask"):
+            self.slider = float(np.clip(values.get("speed_slider_fraction", self.slider), 0.0, 1.0))
+        self._write_digital(values, "standard_digital_output", 0)
+        self._write_digital(values, "configurable_digital_output", 8)
+        self._write_digital(values, "tool_digital_output", 16)
+        for k in range(2):
+            if values.get("standard_analog_output_mask", 0) >> k & 1:
+                self.analog_outputs[k] = float(values.get(f"standard_analog_output_{k}", 0.0))
+
+    def _write_digital(self, values: dict[str, Any], name: str, first: int) -> None:
+        mask = int(values.get(f"{name}_mask", 0)) << first
+        wanted = int(values.get(name, 0)) << first
+        self.digital_outputs = self.digital_outputs & ~mask | wanted & mask
+
+    def _check_watchdog(self) -> None:
+        """End a program whose client no longer writes: after the asked time, at least a step."""
+        if self.watchdog is None or self.paused:
+            return
+        longest, last = self.watchdog
+        if (self.step_count - last) * self.seconds > max(longest, self.seconds):
+            self.stop_program(f"watchdog: no input for {1000 * longest:.0f} ms")
+
+    # What clients read
+
+    def outputs(self) -> dict[str, Any]:
+        """Return every RTDE output by name."""
+        moving = self.motion is not None and not self.motion.finished
+        scaling = self.slider if moving else 1.0
+        protective = self.safety_mode == SafetyMode.PROTECTIVE_STOP
+        emergency = self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP
+        normal = self.safety_mode == SafetyMode.NORMAL
+        values: dict[str, Any] = dict(_STEADY)
+        values.update(
+            timestamp=self.clock, target_q=self.joints, actual_q=self.joints,
+            target_qd=self.speeds, actual_qd=self.speeds, target_qdd=self.accelerations,
+            actual_TCP_pose=self.pose, target_TCP_pose=self.pose,
+            actual_TCP_speed=self.tool_speed, target_TCP_speed=self.tool_speed,
+            actual_TCP_force=self._reading, ft_raw_wrench=self._reading,
+            tcp_force_scalar=float(np.linalg.norm(self._reading[:3])),
+            speed_scaling=scaling, target_speed_fraction=self.slider,
+            robot_mode=int(self.robot_mode), safety_mode=int(self.safety_mode),
+            safety_status=int(self.safety_mode), runtime_state=int(self.runtime_state),
+            robot_status_bits=int(self.robot_mode == RobotMode.RUNNING)
+            | (self.runtime_state == RuntimeState.PLAYING) << 1,
+            safety_status_bits=int(normal) | protective << 2 | emergency << 6 | emergency << 7
+            | (not normal) << 10,
+            actual_digital_output_bits=self.digital_outputs,
+            standard_analog_output0=self.analog_outputs[0],
+            standard_analog_output1=self.analog_outputs[1],
+            payload=self.payload, payload_cog=self.payload_centre, tcp_offset=self.tool_offset)
+        values.update(zip(_INT_NAMES, self.outputs_int, strict=True))
+        values.update(zip(_DOUBLE_NAMES, self.outputs_double, strict=True))
+        return values
+
+    accelerations = np.zeros(6)
+
+
+def _steady() -> dict[str, Any]:
+    """Outputs that this controller does not model: plausible constants."""
+    from limber.robot.virtual.rtde import OUTPUT_TYPES
+
+    fill = {"VECTOR6D": (0.0,) * 6, "VECTOR3D": (0.0,) * 3, "VECTOR6INT32": (253,) * 6,
+            "DOUBLE": 0.0, "BOOL": False}
+    values = {name: fill.get(kind, 0) for name, kind in OUTPUT_TYPES.items()}
+    return values | {"actual_main_voltage": 48.0, "actual_robot_voltage": 48.0,
+                     "joint_temperatures": (25.0,) * 6, "actual_joint_voltage": (48.0,) * 6}
+
+
+_STEADY = _steady()
+_INT_NAMES = [f"output_int_register_{k}" for k in range(48)]
+_DOUBLE_NAMES = [f"output_double_register_{k}" for k in range(48)]
+
+

@@ -1,0 +1,242 @@
+"""The virtual robot as a process: its main function, and a handle for programs and tests.
+
+The handle talks with the process in JSON lines over its standard input and output; the process
+ends when its input does, so it never outlives who started it.
+"""
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from limber.errors import LimberError, WorkError
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.motion import Servo, SpeedMotion, Waypoint, line_move
+from limber.robot.virtual.server import Server, new_loop
+
+_START_SECONDS = 60.0
+
+
+class VirtualRobot:
+    """A virtual robot in a process of its own; a context manager.
+
+    Args:
+        model: Name of the arm.
+        address: Loopback address to serve on.
+        options: Further options of ``python -m limber.robot.virtual``.
+    """
+
+    def __init__(self, model: str = "ur5e", address: str = "127.0.0.1",
+                 options: Sequence[str] = ()):
+        self.address = address
+        command = [sys.executable, "-m", "limber.robot.virtual", "--model", model,
+                   "--address", address, *map(str, options)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                        text=True, encoding="utf-8")
+        self._answers: list[dict[str, Any]] = []
+        self._news = threading.Condition()
+        self._reader = threading.Thread(target=self._read, name="virtual robot", daemon=True)
+        self._reader.start()
+        try:
+            started = self._answer(_START_SECONDS)
+        except WorkError:
+            self.close()
+            raise
+        if "error" in started:
+            self.close()
+            raise WorkError(started["error"])
+
+    def __enter__(self) -> "VirtualRobot":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def ask(self, action: str, **values: Any) -> dict[str, Any]:
+        """Do ``action`` of :data:`ACTIONS` in the robot; returns its state after it.
+
+        Raises:
+            WorkError: the process does not answer, or refuses.
+        """
+        assert self.process.stdin is not None
+        try:
+            self.process.stdin.write(json.dumps({"action": action, **values}) + "\n")
+            self.process.stdin.flush()
+        except OSError as error:
+            raise WorkError(f"The virtual robot is gone ({error}).") from error
+        state = self._answer(10.0)
+        if "error" in state:
+            raise WorkError(state["error"])
+        return state
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What the controller says of itself."""
+        return self.ask("state")
+
+    def kill(self) -> None:
+        """End the process at once, as a power failure would."""
+        self.process.kill()
+        self.process.wait()
+
+    def close(self) -> None:
+        """End the process."""
+        if self.process.stdin is not None and not self.process.stdin.closed:
+            try:
+                self.process.stdin.close()
+            except OSError:
+                # It was killed with a line on the way.
+                self.process.kill()
+        try:
+            self.process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self._reader.join(5.0)
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+    def _read(self) -> None:
+        for line in self.process.stdout or ():
+            try:
+                content = json.loads(line)
+            except json.JSONDecodeError:
+                # Native libraries print lines of their own.
+                continue
+            with self._news:
+                self._answers.append(content)
+                self._news.notify_all()
+        with self._news:
+            self._answers.append({"error": "The virtual robot's process has ended."})
+            self._news.notify_all()
+
+    def _answer(self, seconds: float) -> dict[str, Any]:
+        with self._news:
+            if not self._news.wait_for(lambda: self._answers, seconds):
+                raise WorkError("The virtual robot does not answer.",
+                                f"{seconds:.0f} s have passed.", "See what it printed.")
+            return self._answers.pop(0)
+
+
+def serve(controller: Controller, address: str, *, control: bool = False,
+          seconds: float | None = None, say: Callable[[str], None] = lambda line: None) -> Server:
+    """Serve ``controller`` until interrupted, its input ends (``control``) or ``seconds`` passed.
+
+    Raises:
+        WorkError: a port is taken.
+    """
+    _warm_up(controller)
+    loop = new_loop()
+    asyncio.set_event_loop(loop)
+    server = Server(controller, address)
+    try:
+        loop.run_until_complete(_serve(server, control, seconds, say))
+    finally:
+        loop.run_until_complete(server.close())
+        loop.close()
+    return server
+
+
+def _warm_up(controller: Controller) -> None:
+    """Compile what motions need before the clock runs: a compiler would stop it for seconds."""
+    slow = Waypoint("line", controller.pose, True, 0.1, 0.1)
+    line_move(controller.arm, controller.joints, controller.pose, [slow], controller.tool)
+    Servo().step(controller.joints, controller.speeds, controller.seconds, 1.0)
+    SpeedMotion(controller.arm, controller.tool).step(controller.joints, controller.speeds,
+                                                      controller.seconds, 1.0)
+
+
+async def _serve(server: Server, control: bool, seconds: float | None,
+                 say: Callable[[str], None]) -> None:
+    try:
+        await server.open()
+    except LimberError as error:
+        if control:
+            print(json.dumps({"error": str(error)}), flush=True)
+        raise
+    stepping = asyncio.create_task(server.run())
+    ended = asyncio.Event()
+    if control:
+        loop = asyncio.get_running_loop()
+        threading.Thread(target=_read_control, args=(server, loop, ended), daemon=True).start()
+        print(json.dumps({"ready": True, **state_of(server)}), flush=True)
+    say(f"{server.controller.arm.name} {'.'.join(map(str, server.controller.version[:3]))} "
+        f"serves on {server.address}")
+    waiting = asyncio.create_task(ended.wait())
+    done, _ = await asyncio.wait({stepping, waiting}, timeout=seconds,
+                                 return_when=asyncio.FIRST_COMPLETED)
+    waiting.cancel()
+    stepping.cancel()
+    if stepping in done:
+        stepping.result()
+
+
+def _read_control(server: Server, loop: asyncio.AbstractEventLoop, ended: asyncio.Event) -> None:
+    for line in sys.stdin:
+        order = json.loads(line)
+        loop.call_soon_threadsafe(_obey, server, order)
+    loop.call_soon_threadsafe(ended.set)
+
+
+def _obey(server: Server, order: dict[str, Any]) -> None:
+    name = order.pop("action")
+    try:
+        if name not in ACTIONS:
+            raise WorkError(f"Action {name!r} is unknown.", "", f"Known: {', '.join(ACTIONS)}.")
+        ACTIONS[name](server, **order)
+        reply = state_of(server)
+    except (LimberError, TypeError, ValueError) as error:
+        reply = {"error": str(error)}
+    print(json.dumps(reply), flush=True)
+
+
+def state_of(server: Server) -> dict[str, Any]:
+    """Return the true state of the controller, as plain data."""
+    controller = server.controller
+    return {"clock": controller.clock, "joints": controller.joints.tolist(),
+            "speeds": controller.speeds.tolist(), "pose": controller.pose.tolist(),
+            "tool_speed": controller.tool_speed.tolist(), "safety": controller.safety_mode.name,
+            "mode": controller.robot_mode.name, "program": controller.runtime_state.name,
+            "remote": controller.remote, "slider": controller.slider,
+            "payload": controller.payload, "outputs": controller.digital_outputs,
+            "lost_seconds": server.lost_seconds, "log": list(controller.log)[-20:],
+            "wall": time.time()}
+
+
+def _set_force(server: Server, wrench: Sequence[float]) -> None:
+    server.controller.fault.added = np.asarray(wrench, float).reshape(6)
+
+
+def _set(target: str, name: str) -> Callable:
+    def action(server: Server, value: Any = True) -> None:
+        setattr({"server": server, "controller": server.controller,
+                 "fault": server.controller.fault}[target], name, value)
+    return action
+
+
+
+
+ACTIONS: dict[str, Callable[..., Any]] = {
+    "state": lambda server: None,
+    "cut": lambda server: server.cut(),
+    "silent": _set("server", "silent"),
+    "delay": _set("server", "delay"),
+    "frozen_sensor": _set("fault", "frozen"),
+    "sensor_nan": _set("fault", "nan"),
+    "added_wrench": _set_force,
+    "clock_jump": _set("controller", "clock_offset"),
+    "slider": _set("controller", "slider"),
+    "protective_stop": lambda server: server.controller.protective_stop("test"),
+    "unlock": lambda server: server.controller.unlock(),
+    "emergency_stop": lambda server: server.controller.emergency_stop(),
+    "reset_emergency": lambda server: server.controller.reset_emergency(),
+    "local": lambda server: server.controller.set_remote(False),
+    "remote": lambda server: server.controller.set_remote(True),
+    "stop_program": lambda server: server.controller.stop_program("test"),
+}

@@ -1,0 +1,149 @@
+"""The real-time data exchange (RTDE) protocol, version 2, as a controller speaks it.
+
+Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". A frame is its size (two bytes,
+big-endian, itself and the command counted), a command byte and a body.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+VERSION_REQUEST, CONTROL_VERSION = ord("V"), ord("v")
+TEXT_MESSAGE, DATA = ord("M"), ord("U")
+OUTPUT_SETUP, INPUT_SETUP = ord("O"), ord("I")
+START, PAUSE = ord("S"), ord("P")
+
+_FORMATS = {"DOUBLE": "d", "UINT8": "B", "BOOL": "?", "UINT32": "I", "INT32": "i", "UINT64": "Q",
+            "VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i", "VECTOR6UINT32": "6I"}
+_COUNTS = {"VECTOR3D": 3, "VECTOR6D": 6, "VECTOR6INT32": 6, "VECTOR6UINT32": 6}
+
+_BY_TYPE = {
+    "DOUBLE": "timestamp actual_execution_time speed_scaling target_speed_fraction actual_momentum "
+              "actual_main_voltage actual_robot_voltage actual_robot_current "
+              "standard_analog_input0 standard_analog_input1 standard_analog_output0 "
+              "standard_analog_output1 io_current tool_analog_input0 tool_analog_input1 "
+              "tool_output_current tool_temperature tcp_force_scalar payload "
+              "joint_position_deviation_ratio collision_detection_ratio",
+    "VECTOR6D": "target_q target_qd target_qdd target_current target_moment actual_q actual_qd "
+                "actual_current actual_current_window joint_control_output actual_TCP_pose "
+                "actual_TCP_speed actual_TCP_force target_TCP_pose target_TCP_speed "
+                "joint_temperatures actual_joint_voltage ft_raw_wrench payload_inertia tcp_offset",
+    "VECTOR3D": "actual_tool_accelerometer elbow_position elbow_velocity payload_cog",
+    "VECTOR6INT32": "joint_mode",
+    "INT32": "robot_mode safety_mode safety_status tool_output_mode time_scale_source "
+             "script_control_line",
+    "UINT32": "runtime_state robot_status_bits safety_status_bits analog_io_types tool_mode "
+              "tool_output_voltage input_bit_registers0_to_31 input_bit_registers32_to_63 "
+              "output_bit_registers0_to_31 output_bit_registers32_to_63",
+    "UINT64": "actual_digital_input_bits actual_digital_output_bits",
+    "UINT8": "tool_digital_output0_mode tool_digital_output1_mode",
+}
+OUTPUT_TYPES: dict[str, str] = {name: kind for kind, names in _BY_TYPE.items()
+                                for name in names.split()}
+OUTPUT_TYPES |= {f"output_int_register_{n}": "INT32" for n in range(48)}
+OUTPUT_TYPES |= {f"output_double_register_{n}": "DOUBLE" for n in range(48)}
+OUTPUT_TYPES |= {f"output_bit_register_{n}": "BOOL" for n in range(64, 128)}
+
+INPUT_TYPES: dict[str, str] = {
+    "speed_slider_mask": "UINT32", "speed_slider_fraction": "DOUBLE",
+    "standard_digital_output_mask": "UINT8", "standard_digital_output": "UINT8",
+    "configurable_digital_output_mask": "UINT8", "configurable_digital_output": "UINT8",
+    "tool_digital_output_mask": "UINT8", "tool_digital_output": "UINT8",
+    "standard_analog_output_mask": "UINT8", "standard_analog_output_type": "UINT8",
+    "standard_analog_output_0": "DOUBLE", "standard_analog_output_1": "DOUBLE",
+    "input_bit_registers0_to_31": "UINT32", "input_bit_registers32_to_63": "UINT32",
+    "external_force_torque": "VECTOR6D"}
+INPUT_TYPES |= {f"input_int_register_{n}": "INT32" for n in range(48)}
+INPUT_TYPES |= {f"input_double_register_{n}": "DOUBLE" for n in range(48)}
+INPUT_TYPES |= {f"input_bit_register_{n}": "BOOL" for n in range(64, 128)}
+
+# First version of the e-Series and of CB3 that knows a name; later names are NOT_FOUND before it.
+_SINCE = {"ft_raw_wrench": ((5, 9), None), "payload": ((5, 11), (3, 15)),
+          "payload_cog": ((5, 11), (3, 15)), "payload_inertia": ((5, 11), (3, 15)),
+          "script_control_line": ((5, 9), (3, 14)), "tcp_offset": ((5, 23), None),
+          "collision_detection_ratio": ((5, 15), None), "time_scale_source": ((5, 17), None),
+          "joint_position_deviation_ratio": ((5, 15), None),
+          "actual_current_window": ((5, 17), None)}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A list of names that travel together, in order."""
+
+    number: int
+    names: tuple[str, ...]
+    types: tuple[str, ...]
+    layout: struct.Struct = field(compare=False)
+
+    @classmethod
+    def of(cls, number: int, names: Sequence[str], types: Mapping[str, str]) -> "Recipe":
+        kinds = tuple(types[name] for name in names)
+        return cls(number, tuple(names), kinds,
+                   struct.Struct(">" + "".join(_FORMATS[kind] for kind in kinds)))
+
+    def packed(self, values: Mapping[str, Any]) -> bytes:
+        """Return a data frame with the recipe's values; vectors are sequences."""
+        flat: list[Any] = []
+        for name, kind in zip(self.names, self.types, strict=True):
+            value = values[name]
+            if kind in _COUNTS:
+                flat.extend(value)
+            else:
+                flat.append(value)
+        return frame(DATA, bytes([self.number]) + self.layout.pack(*flat))
+
+    def unpacked(self, body: bytes) -> dict[str, Any]:
+        """Return the values of a data frame's body (without its recipe number).
+
+        A shorter body gives the values that are whole: ur-rtde sends some commands through a
+        recipe that has more fields than the command has arguments.
+        """
+        values, place = {}, 0
+        for name, kind in zip(self.names, self.types, strict=True):
+            part = struct.Struct(">" + _FORMATS[kind])
+            if place + part.size > len(body):
+                break
+            numbers = part.unpack_from(body, place)
+            values[name] = numbers if kind in _COUNTS else numbers[0]
+            place += part.size
+        return values
+
+
+def frame(command: int, body: bytes) -> bytes:
+    """Return a frame."""
+    return struct.pack(">HB", len(body) + 3, command) + body
+
+
+def split_frames(data: bytearray) -> list[tuple[int, bytes]]:
+    """Take the whole frames off the front of ``data``: command and body of each.
+
+    Raises:
+        ValueError: a size that cannot be; the other side does not speak RTDE.
+    """
+    frames = []
+    while len(data) >= 3:
+        size, command = struct.unpack_from(">HB", data)
+        if size < 3:
+            raise ValueError(f"a frame of {size} bytes")
+        if len(data) < size:
+            break
+        frames.append((command, bytes(data[3:size])))
+        del data[:size]
+    return frames
+
+
+def output_types(names: Sequence[str], version: tuple[int, ...]) -> list[str]:
+    """Return the type of each output name, ``NOT_FOUND`` where this version has none."""
+    def kind(name: str) -> str:
+        e_series, cb3 = _SINCE.get(name, ((5, 0), (3, 0)))
+        first = cb3 if version[0] == 3 else e_series
+        known = first is not None and version[:2] >= first
+        return OUTPUT_TYPES.get(name, "NOT_FOUND") if known else "NOT_FOUND"
+    return [kind(name) for name in names]
+
+
+def input_types(names: Sequence[str], taken: Mapping[str, object], owner: object) -> list[str]:
+    """Return the type of each input name; ``IN_USE`` where another connection writes it."""
+    return [INPUT_TYPES.get(name, "NOT_FOUND") if taken.get(name, owner) is owner else "IN_USE"
+            for name in names]

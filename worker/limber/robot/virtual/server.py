@@ -1,0 +1,267 @@
+"""The virtual controller's ports: RTDE 30004, scripts 30003, dashboard 29999, FT300 63351.
+
+One asyncio loop steps the controller by the wall clock and serves all connections. It waits by
+``select``, whose time-out has microseconds; ``epoll`` would round every 2 ms step up by one.
+"""
+
+import asyncio
+import selectors
+import struct
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from limber.errors import InputError, WorkError
+from limber.robot.virtual import rtde
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.dashboard import GREETING, answer
+
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, FT300_PORT = 30004, 30003, 29999, 63351
+
+# A process that was held up catches up at most this much; beyond it the controller lost time.
+_MOST_CATCH_UP = 0.25
+_SENDS_BEHIND = 1 << 20  # bytes a client may leave unread before it is cut off
+
+
+class Server:
+    """Serves one controller on a loopback address.
+
+    Attributes:
+        delay: Seconds by which every message is late, each way (a bad cable).
+        silent: Ports accept and read, but answer nothing.
+    """
+
+    def __init__(self, controller: Controller, address: str):
+        if not address.startswith("127.") and address not in ("localhost", "::1"):
+            raise InputError(f"Address {address}.", "The virtual robot obeys whoever connects: it "
+                             "must not be reached from outside.", "Use 127.0.0.1 or 127.0.0.x.")
+        self.controller = controller
+        self.address = address
+        self.delay = 0.0
+        self.silent = False
+        self.lost_seconds = 0.0
+        self._servers: list[asyncio.Server] = []
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._streams: list[_RtdeConnection] = []
+        self.owners: dict[str, object] = {}
+
+    async def open(self) -> None:
+        """Open the ports.
+
+        Raises:
+            WorkError: one is taken.
+        """
+        ports: dict[int, Callable[[Any, Any], Awaitable[None]]] = {
+            RTDE_PORT: self._serve_rtde, SCRIPT_PORT: self._serve_scripts,
+            DASHBOARD_PORT: self._serve_dashboard}
+        if self.controller.ft300 is not None:
+            ports[FT300_PORT] = self._serve_ft300
+        try:
+            for port, serve in ports.items():
+                self._servers.append(await asyncio.start_server(
+                    self._guarded(serve), self.address, port))
+        except OSError as error:
+            await self.close()
+            raise WorkError(f"Port {port} of {self.address} cannot be opened ({error}).",
+                            "Another virtual robot or program has it; the client library knows no "
+                            "other port.", "End that program, or give --address 127.0.0.2 "
+                            "(Linux, Windows).") from error
+
+    async def close(self) -> None:
+        """Close ports and connections."""
+        for server in self._servers:
+            server.close()
+        self.cut()
+        self._servers = []
+
+    def cut(self) -> None:
+        """Cut every connection, without a word."""
+        for writer in list(self._writers):
+            writer.transport.abort()
+
+    async def run(self) -> None:
+        """Step the controller by the wall clock until cancelled."""
+        step = self.controller.seconds
+        due = time.perf_counter() + step
+        while True:
+            wait = due - time.perf_counter()
+            if wait > 0:
+                await asyncio.sleep(wait)
+            elif -wait > _MOST_CATCH_UP:
+                self.lost_seconds -= wait
+                due = time.perf_counter()
+            else:
+                await asyncio.sleep(0)
+            self.controller.step()
+            self._publish()
+            due += step
+
+    def later(self, action: Callable[[], None]) -> None:
+        """Do ``action`` now, or after the delay."""
+        if self.delay > 0:
+            asyncio.get_running_loop().call_later(self.delay, action)
+        else:
+            action()
+
+    def send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
+        """Send, late where there is a delay, never where silent."""
+        if self.silent:
+            return
+        self.later(lambda: None if writer.is_closing() else writer.write(data))
+
+    def _publish(self) -> None:
+        values = None
+        for stream in self._streams:
+            if stream.is_due(self.controller):
+                values = values or self.controller.outputs()
+                if stream.writer.transport.get_write_buffer_size() > _SENDS_BEHIND:
+                    stream.writer.transport.abort()
+                    continue
+                self.send(stream.writer, stream.output.packed(values))
+
+    def _guarded(self, serve: Callable[[Any, Any], Awaitable[None]]) -> Callable:
+        async def body(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            self._writers.add(writer)
+            try:
+                await serve(reader, writer)
+            except (ConnectionError, asyncio.IncompleteReadError):
+                # The client is gone; that is its right.
+                self.controller.say("a connection was closed")
+            finally:
+                self._writers.discard(writer)
+                writer.transport.abort()
+        return body
+
+    async def _serve_rtde(self, reader: asyncio.StreamReader,
+                          writer: asyncio.StreamWriter) -> None:
+        stream = _RtdeConnection(self, writer)
+        self._streams.append(stream)
+        data = bytearray()
+        try:
+            while chunk := await reader.read(65536):
+                data += chunk
+                for command, body in rtde.split_frames(data):
+                    self.later(lambda command=command, body=body: stream.take(command, body))
+        except ValueError as error:
+            self.controller.say(f"RTDE connection dropped: {error}")
+        finally:
+            self._streams.remove(stream)
+            stream.release()
+
+    async def _serve_scripts(self, reader: asyncio.StreamReader,
+                             writer: asyncio.StreamWriter) -> None:
+        text = ""
+        while chunk := await reader.read(65536):
+            text += chunk.decode("utf-8", "replace")
+            # A script is whole when a line holds nothing but `end`, from its first column.
+            while (stop := _end_of_script(text)) is not None:
+                script, text = text[:stop], text[stop:]
+                self.later(lambda script=script: self.controller.load_script(script))
+
+    async def _serve_dashboard(self, reader: asyncio.StreamReader,
+                               writer: asyncio.StreamWriter) -> None:
+        self.send(writer, f"{GREETING}\n".encode())
+        while line := await reader.readline():
+            text = line.decode("utf-8", "replace")
+
+            def reply(text: str = text) -> None:
+                self.send(writer, f"{answer(self.controller, text)}\n".encode())
+            self.later(reply)
+
+    async def _serve_ft300(self, _reader: asyncio.StreamReader,
+                           writer: asyncio.StreamWriter) -> None:
+        while not writer.is_closing():
+            fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
+            self.send(writer, f"( {fields} )".encode())
+            await asyncio.sleep(0.01)
+
+
+class _RtdeConnection:
+    """One client of the RTDE port: its recipes and whether data flows."""
+
+    def __init__(self, server: Server, writer: asyncio.StreamWriter):
+        self.writer = writer
+        self._server = server
+        self.output: rtde.Recipe | None = None
+        self._inputs: dict[int, rtde.Recipe] = {}
+        self._every, self._started, self._last = 1, False, 0
+
+    def is_due(self, controller: Controller) -> bool:
+        return (self._started and self.output is not None
+                and controller.step_count % self._every == 0)
+
+    def release(self) -> None:
+        """Give back the input registers that this client wrote."""
+        owners = self._server.owners
+        for name in [name for name, owner in owners.items() if owner is self]:
+            del owners[name]
+
+    def take(self, command: int, body: bytes) -> None:
+        """Answer one frame."""
+        if command == rtde.DATA:
+            self._take_data(body)
+            return
+        reply = self._reply(command, body)
+        if reply is not None:
+            self._server.send(self.writer, rtde.frame(command, reply))
+
+    def _reply(self, command: int, body: bytes) -> bytes | None:
+        controller = self._server.controller
+        if command == rtde.VERSION_REQUEST:
+            wanted = struct.unpack(">H", body[:2])[0] if len(body) >= 2 else 0
+            return bytes([wanted == 2])
+        if command == rtde.CONTROL_VERSION:
+            return struct.pack(">4I", *controller.version)
+        if command == rtde.OUTPUT_SETUP:
+            return self._set_output(body)
+        if command == rtde.INPUT_SETUP:
+            return self._set_input(body)
+        if command in (rtde.START, rtde.PAUSE):
+            can = command == rtde.PAUSE or self.output is not None
+            self._started = command == rtde.START and can
+            return bytes([can])
+        controller.say(f"unknown RTDE command {command}")
+        return None
+
+    def _set_output(self, body: bytes) -> bytes:
+        controller = self._server.controller
+        if len(body) < 8:
+            return b"\0"
+        frequency = struct.unpack(">d", body[:8])[0]
+        names = [name for name in body[8:].decode("ascii", "replace").split(",") if name]
+        types = rtde.output_types(names, controller.version)
+        if "NOT_FOUND" not in types and names and 0 < frequency <= controller.arm.rate:
+            self._every = max(1, round(controller.arm.rate / frequency))
+            self.output = rtde.Recipe.of(1, names, rtde.OUTPUT_TYPES)
+            return b"\1" + ",".join(types).encode()
+        return b"\0" + ",".join(types).encode()
+
+    def _set_input(self, body: bytes) -> bytes:
+        names = [name for name in body.decode("ascii", "replace").split(",") if name]
+        owners = self._server.owners
+        types = rtde.input_types(names, owners, self)
+        if {"NOT_FOUND", "IN_USE"} & set(types) or not names:
+            return b"\0" + ",".join(types).encode()
+        number = len(self._inputs) + 1
+        self._inputs[number] = rtde.Recipe.of(number, names, rtde.INPUT_TYPES)
+        owners.update(dict.fromkeys(names, self))
+        return bytes([number]) + ",".join(types).encode()
+
+    def _take_data(self, body: bytes) -> None:
+        recipe = self._inputs.get(body[0]) if body else None
+        if recipe is not None:
+            self._server.controller.write_inputs(recipe.unpacked(body[1:]))
+
+
+def new_loop() -> asyncio.AbstractEventLoop:
+    """Return a loop whose sleeps have microseconds."""
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+
+
+def _end_of_script(text: str) -> int | None:
+    place = 0
+    for line in text.splitlines(keepends=True):
+        place += len(line)
+        if line.rstrip("\r\n") == "end" and line.endswith("\n"):
+            return place
+    return None
