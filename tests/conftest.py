@@ -82,7 +82,8 @@ def plain_pull() -> Pull:
 @pytest.fixture(scope="session")
 def branch_template(tmp_path_factory, small, small_bench):
     """A branch folder as reconstruct leaves it, with one virtual pull of 12 frames."""
-    from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+    from limber.estimation.virtual_pull import VirtualPullSettings
+    from limber.stages.virtual_pull import virtual_pull
     from limber.store import Branch
 
     folder = tmp_path_factory.mktemp("branches") / "small.branch"

@@ -39,7 +39,7 @@ def test_result_is_the_last_json_line(capfd):
     def function(run, **_options):
         """Probe."""
         run.progress(0.5, "half", count=2)
-        run.warn("careful")
+        run.progress.warn("careful")
         return {"tet_count": 12}
     code, lines = invoke(function, ["--json", "--progress", "json"], capfd)
     assert code == 0

@@ -4,20 +4,20 @@ import json
 
 import pytest
 
-from limber.estimation.preparation import subject_of
 from limber.estimation.settings import EstimateSettings
 from limber.mechanics.statics.solve import solve_static
+from limber.stages.loading import load_subject
 from limber.store import Branch
 
 
 def test_left_out_twigs_weigh_on_the_branch_that_is_fitted(branch_folder):
     """Twigs that the mesh leaves out hang on the model of a pull that gravity bends."""
     branch = Branch.open(branch_folder)
-    bare = subject_of(branch, EstimateSettings()).model
+    bare = load_subject(branch, EstimateSettings()).model
     with branch.stage("mesh") as stage:
         stage.path("point_masses.json").write_text(json.dumps(
             [{"mass_kg": 0.02, "centre_m": [0.1, 0, 0.2], "attached_m": [0, 0, 0.2]}]))
-    loaded = subject_of(branch, EstimateSettings()).model
+    loaded = load_subject(branch, EstimateSettings()).model
     stiff = {"young": 1e12, "gravity": (0.0, 0.0, -9.80665)}
     base = [solve_static(model.with_parameters(**stiff)).require().base_force[2]
             for model in (bare, loaded)]

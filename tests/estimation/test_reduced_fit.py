@@ -8,10 +8,11 @@ from tests.subjects.paper_branches import Bench, measured
 
 from limber.errors import InputError
 from limber.estimation import reduced_fit
-from limber.estimation.fit import estimate, fit_pulls
+from limber.estimation.fit import fit_pulls
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.reduced_fit import CorrectedForward, Reduction
 from limber.estimation.settings import EstimateSettings
+from limber.stages.estimate import estimate
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=16)
 REDUCED = SETTINGS.model_copy(update={"forward": "reduced"})

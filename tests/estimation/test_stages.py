@@ -7,14 +7,14 @@ import pytest
 
 from limber.cli import call
 from limber.errors import Cancelled, InputError
-from limber.estimation.figures import report_figures
-from limber.estimation.fit import EVALUATIONS, estimate
-from limber.estimation.online.follow import follow
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+from limber.estimation.virtual_pull import VirtualPullSettings
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.progress import Progress
 from limber.recordings.recording import read_pull
+from limber.report.estimate_figures import report_figures
+from limber.stages.estimate import EVALUATIONS, estimate, follow
+from limber.stages.virtual_pull import virtual_pull
 from limber.store import Branch
 
 QUICK = EstimateSettings(key_frames=6)
@@ -60,7 +60,7 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
     stored = json.loads(branch.path("estimate.json").read_text())
     assert stored["truth"]["young_pa"] == TRUTH.tolist()
     assert len(stored["history"]) == stored["forward_count"]
-    captions = [caption for figure, caption in report_figures(branch, stored)
+    captions = [caption for figure, caption in report_figures(stored)
                 if figure.axes and figure.axes[0].has_data()]
     assert len(captions) == 6
     parts = stored["young_deviation"]
@@ -91,7 +91,7 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
     assert kept["stopped"] and not kept["converged"]
     assert np.array_equal(TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"], before)
     warnings: list[str] = []
-    result = estimate(branch_folder, QUICK, warn=warnings.append)
+    result = estimate(branch_folder, QUICK, progress=Progress(on_warning=warnings.append))
     assert any("Resumed" in warning for warning in warnings)
     assert result["converged"] and not result["stopped"]
 

@@ -9,16 +9,20 @@ from scipy.spatial import cKDTree
 
 from limber.cli import call
 from limber.errors import Cancelled, InputError
-from limber.geometry.batch import reconstruct_folder
 from limber.geometry.cloud.files import read_points
-from limber.geometry.generated import generate_branch, write_generated
-from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
-from limber.geometry.reconstruct import ReconstructSettings, reconstruct
+from limber.geometry.generated import generate_branch
+from limber.geometry.mesh_surface import MeshSurfaceSettings
+from limber.geometry.reconstruct import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics import BranchModel, solve_static
-from limber.mechanics.simulate import SimulateSettings, simulate
+from limber.mechanics import solve_static
+from limber.mechanics.simulate import SimulateSettings
 from limber.progress import Progress
+from limber.stages.generate import write_generated
+from limber.stages.loading import load_model
+from limber.stages.mesh import mesh_surface
+from limber.stages.reconstruct import reconstruct, reconstruct_folder
+from limber.stages.simulate import simulate
 from limber.store import Branch
 
 KEYS = ("point_count", "node_count", "branch_count", "length_m", "radius_min_m", "radius_max_m",
@@ -120,7 +124,7 @@ def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
     place = tmp_path / "w.branch"
     result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.1))
     assert result["left_out_twigs"] == 2 and result["branch_count"] == full["branch_count"]
-    model = BranchModel.from_branch(Branch.open(place))
+    model = load_model(Branch.open(place))
     weight = np.linalg.norm(solve_static(model).require().base_force)
     mass = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
     assert weight == pytest.approx(9.80665 * mass, rel=0.01)
@@ -140,7 +144,7 @@ def test_twigs_that_are_meshed_again_weigh_once(generated, tmp_path):
     assert Branch.open(place).has("point_masses.json")
     reconstruct(folder / "cloud.ply", place)
     assert not Branch.open(place).has("point_masses.json")
-    assert not BranchModel.from_branch(Branch.open(place)).point_masses
+    assert not load_model(Branch.open(place)).point_masses
 
 
 def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):
@@ -164,7 +168,7 @@ def test_batch_goes_on_after_a_bad_scan(generated, tmp_path):
     (scans / "a_bad.xyz").write_text("1 2 three\n")
     (scans / "b_good.ply").write_bytes((folder / "cloud.ply").read_bytes())
     told = []
-    result = reconstruct_folder(scans, tmp_path / "out", warn=told.append)
+    result = reconstruct_folder(scans, tmp_path / "out", progress=Progress(on_warning=told.append))
     assert result["done_count"] == 1 and list(result["failed"]) == ["a_bad.xyz"]
     assert Branch.open(tmp_path / "out" / "b_good.branch").has("mesh.vtu")
 

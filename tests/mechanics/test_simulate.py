@@ -12,9 +12,12 @@ from limber.cli import call
 from limber.errors import ConvergenceError, InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics import BranchModel, solve_static
+from limber.mechanics import solve_static
 from limber.mechanics.frames import read_pc2
-from limber.mechanics.simulate import SimulateSettings, simulate
+from limber.mechanics.simulate import SimulateSettings
+from limber.progress import Progress
+from limber.stages.loading import load_model
+from limber.stages.simulate import simulate
 from limber.store import Branch
 
 KEYS = {"converged", "frame_count", "energy_j", "grasp_force_n", "tip_displacement_m",
@@ -99,8 +102,8 @@ def test_left_out_twigs_hang_on_the_branch(tmp_path):
         straight_beam(0.3, 0.006, 0.004).write(stage.path("mesh.vtu"))
         stage.path("point_masses.json").write_text(json.dumps(
             [{"mass_kg": 0.25, "centre_m": [0.1, 0, 0.2], "attached_m": [0, 0, 0.2]}]))
-    model = BranchModel.from_branch(branch)
-    bare = BranchModel.from_branch(branch, point_masses=())
+    model = load_model(branch)
+    bare = load_model(branch, point_masses=())
     weights = [solve_static(m).require().base_force[2] for m in (model, bare)]
     assert weights[0] - weights[1] == pytest.approx(0.25 * 9.80665, rel=1e-6)
 
@@ -180,7 +183,7 @@ def test_load_in_wrong_units_warns(folder):
     said = []
     settings = SimulateSettings(kind="static", grasp_force=(0, 0, 150000.0), frame_rate=2,
                                 gravity=False)
-    simulate(folder, settings, warn=said.append)
+    simulate(folder, settings, progress=Progress(on_warning=said.append))
     assert any("units" in message and "at (" in message for message in said)
 
 

@@ -12,8 +12,8 @@ from limber.mechanics import Grasp
 from limber.planning.compare import PlanSettings
 from limber.planning.field import GraspSamples, fit_field
 from limber.planning.grasp_model import GraspModel, Reach
-from limber.planning.plan import plan_branch_motion
-from limber.planning.sampling import EnergySettings, sample_energy_field
+from limber.stages.energy import EnergySettings, sample_energy_field
+from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
 
 STIFFNESS = np.array([8.0, 8.0, 30.0])  # [N/m] soft to the sides, stiff along the branch
@@ -108,5 +108,5 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
         small_mesh.write(stage.path("mesh.vtu"))
         small_skeleton.write_swc(stage.path("skeleton.swc"))
     sample_energy_field(folder, EnergySettings(samples=60, workers=1))
-    plan_branch_motion(folder, PlanSettings(iterations=800, start_seed=3), name="there", workers=1)
+    plan_paths(folder, PlanSettings(iterations=800, start_seed=3), name="there", workers=1)
     return folder

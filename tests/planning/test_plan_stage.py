@@ -12,12 +12,12 @@ from limber.errors import BranchFolderError, Cancelled, ConvergenceError, InputE
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.compare import PlanSettings
 from limber.planning.field import EnergyField
-from limber.planning.figures import report_figures
 from limber.planning.goals import default_goal
-from limber.planning.plan import plan_branch_motion
 from limber.planning.resolve import resolve_path
-from limber.planning.sampling import EnergySettings, sample_energy_field
 from limber.progress import Progress
+from limber.report.plan_figures import report_figures
+from limber.stages.energy import EnergySettings, sample_energy_field
+from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
 
 ENERGY = EnergySettings(samples=60, workers=1)
@@ -94,7 +94,7 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
     field = EnergyField.read(branch.path("energy.npz"))
     assert field.energy(field.rest)[0] < 1e-3 * field.samples.energies.max()
     sample_energy_field(copied, ENERGY)
-    plan_branch_motion(copied, PlanSettings(iterations=800, start_seed=3), name="there")
+    plan_paths(copied, PlanSettings(iterations=800, start_seed=3), name="there")
     again = Branch.open(copied)
     assert (again.manifest.stages["plan:there"].finished,
             again.digest("plans/there.json")) == before
@@ -103,7 +103,7 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
 def test_same_seed_same_plan(copied):
     """Run again by force, the planner's path is the same to the bit."""
     before = read_plan(copied)
-    plan_branch_motion(copied, PlanSettings(iterations=800, start_seed=3), name="there",
+    plan_paths(copied, PlanSettings(iterations=800, start_seed=3), name="there",
                        workers=1, force=True)
     after = read_plan(copied)
     for key in ("baseline", "plan"):
@@ -119,24 +119,24 @@ def test_other_modulus_makes_the_field_stale(copied):
         mesh.with_data(cell_data={"young": 2 * mesh.cell_data["young"]}).write(
             stage.path("mesh.vtu"))
     with pytest.raises(BranchFolderError, match="limber energy"):
-        plan_branch_motion(copied, PlanSettings(**QUICK), name="other")
+        plan_paths(copied, PlanSettings(**QUICK), name="other")
 
 
 def test_refusals_leave_the_folder_as_it_was(copied):
     """Goals out of reach, over a limit, doubled, or a cancel: an error each, no file changed."""
     before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
     with pytest.raises(NoPathError, match="misses it by"):
-        plan_branch_motion(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
+        plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
     with pytest.raises(NoPathError, match="max-force"):
-        plan_branch_motion(copied, PlanSettings(max_force=0.01), name="bad")
+        plan_paths(copied, PlanSettings(max_force=0.01), name="bad")
     with pytest.raises(InputError, match="tip-goal"):
-        plan_branch_motion(copied, PlanSettings(goal=(0, 0, 1), tip_goal=(0, 0, 1)), name="bad")
+        plan_paths(copied, PlanSettings(goal=(0, 0, 1), tip_goal=(0, 0, 1)), name="bad")
     with pytest.raises(InputError, match="outside the sampled region"):
-        plan_branch_motion(copied, PlanSettings(start=(1.0, 1.0, 1.0)), name="bad")
+        plan_paths(copied, PlanSettings(start=(1.0, 1.0, 1.0)), name="bad")
     progress = Progress(lambda fraction, _message, _numbers:
                         progress.cancel() if fraction > 0.05 else None)
     with pytest.raises(Cancelled):
-        plan_branch_motion(copied, PlanSettings(**QUICK), name="bad", progress=progress)
+        plan_paths(copied, PlanSettings(**QUICK), name="bad", progress=progress)
     assert sorted(p.name for p in copied.rglob("*") if p.name != ".lock") == before
 
 
@@ -146,7 +146,7 @@ def test_limit_holds_on_the_full_model(copied):
     energies = plan["baseline"]["energies_j"]
     ends = max(energies[0], energies[-1])
     cap = max(0.5 * (ends + plan["baseline"]["peak_energy_j"]), 1.02 * ends)
-    capped = plan_branch_motion(copied, PlanSettings(max_energy=cap, **QUICK), name="capped",
+    capped = plan_paths(copied, PlanSettings(max_energy=cap, **QUICK), name="capped",
                                 workers=1)
     assert capped["baseline"]["peak_energy_j"] < 1.1 * cap
     assert capped["plan"]["peak_energy_j"] < 1.1 * cap
@@ -156,7 +156,7 @@ def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within twice the tolerance."""
     field = EnergyField.read(copied / "energy.npz")
     wanted = field.tip(np.array(default_goal(field, 0.01).position))[0]
-    done = plan_branch_motion(copied, PlanSettings(tip_goal=tuple(wanted), iterations=500),
+    done = plan_paths(copied, PlanSettings(tip_goal=tuple(wanted), iterations=500),
                               name="tip", workers=1)
     assert np.linalg.norm(np.array(done["plan"]["tip_end_m"]) - wanted) < 0.02
 

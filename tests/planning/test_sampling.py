@@ -8,9 +8,10 @@ import pytest
 from limber.errors import Cancelled, WorkError
 from limber.mechanics import Grasp, solve_static
 from limber.planning.chart import Chart
-from limber.planning.grasp_model import Reach, read_grasp_model
+from limber.planning.grasp_model import Reach
 from limber.planning.sampling import sample_branch, sample_positions, without_taut
 from limber.progress import Progress
+from limber.stages.loading import load_grasp_model
 from limber.store import Branch
 
 REACH = Reach(np.zeros(3), 0.4, 0.38, np.array([0.0, 0.0, 0.6]))
@@ -138,7 +139,7 @@ def test_weight_leaves_the_scan_as_the_rest_state(planned_branch, small_mesh):
 
     Energy counts from there, so it is zero at rest though the strain energy is not.
     """
-    model = read_grasp_model(Branch.open(planned_branch), gravity=True)
+    model = load_grasp_model(Branch.open(planned_branch), gravity=True)
     hanging = model.mesh.nodes + model.rest.displacement
     assert np.abs(hanging - small_mesh.nodes).max() < 1e-4
     assert np.abs(model.rest.displacement).max() > 1e-3, "the weight must matter here"

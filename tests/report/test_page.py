@@ -4,8 +4,8 @@ import pytest
 
 from limber.errors import BranchFolderError, InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.report.page import write_report
 from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
+from limber.stages.report import write_report
 from limber.store import Branch
 
 

@@ -6,10 +6,11 @@ import struct
 import numpy as np
 import pytest
 
+from limber.alignment import Alignment
 from limber.errors import BranchFolderError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.scene.data import at_nodes, scene_data
-from limber.store import Alignment, Branch
+from limber.store import Branch
 
 
 @pytest.fixture()

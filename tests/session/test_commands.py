@@ -18,6 +18,7 @@ from limber.session import client
 from limber.session.client import InteractiveSession
 from limber.session.frames import MAGIC, FrameReader, FrameWriter, HeldAt, Status
 from limber.session.protocol import PROTOCOL
+from limber.stages.loading import load_model
 from limber.store import Branch
 
 
@@ -30,7 +31,7 @@ def session(branch_folder):
 
 @pytest.fixture(scope="module")
 def model(branch_folder) -> BranchModel:
-    return BranchModel.from_branch(Branch.open(branch_folder))
+    return load_model(Branch.open(branch_folder))
 
 
 def settled(session, number: int):

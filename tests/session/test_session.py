@@ -13,9 +13,10 @@ import psutil
 import pytest
 
 from limber.errors import InputError, WorkError
-from limber.mechanics import BranchModel, Grasp, solve_static
+from limber.mechanics import Grasp, solve_static
 from limber.session.client import InteractiveSession
 from limber.session.frames import FrameReader, FrameWriter
+from limber.stages.loading import load_model
 from limber.store import Branch
 
 SMALL = {"grasps": 24, "size": 36, "fields": 70, "cache": False}
@@ -72,7 +73,7 @@ def test_answers_agree_with_the_full_model(session, branch_folder):
     """A session's energy, force and surface are the full model's."""
     pose = moved(session, x=0.03, y=0.01, z=-0.006)
     frame = session.wait(session.move(pose))
-    model = BranchModel.from_branch(Branch.open(branch_folder))
+    model = load_model(Branch.open(branch_folder))
     full = solve_static(model, grasp=Grasp.from_mesh(model.mesh, "pinned"), pose=pose).require()
     assert frame.is_converged and frame.is_reduced
     assert frame.strain_energy == pytest.approx(full.strain_energy, rel=0.02)

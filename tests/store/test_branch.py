@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from limber.alignment import Alignment
 from limber.errors import BranchFolderError, InputError
-from limber.store import FORMAT_VERSION, Alignment, Branch, plain, write_atomically
+from limber.files import write_atomically
+from limber.plain import plain
+from limber.store import FORMAT_VERSION, Branch
 
 
 @pytest.fixture

@@ -18,12 +18,14 @@ import numpy as np
 
 from benchmarks.table import Row
 from limber.errors import LimberError
-from limber.estimation.fit import estimate
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
-from limber.geometry.generated import generate_branch, write_generated
-from limber.geometry.reconstruct import reconstruct
+from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.geometry.generated import generate_branch
 from limber.progress import Progress
+from limber.stages.estimate import estimate
+from limber.stages.generate import write_generated
+from limber.stages.reconstruct import reconstruct
+from limber.stages.virtual_pull import virtual_pull
 from limber.store import Branch
 
 FIRST_SEED = 8100

@@ -349,7 +349,7 @@ def _against_qsm(folder: Path) -> list[Row]:
 
 def _in_file_frame(folder: Path, skeleton: Skeleton) -> Skeleton:
     """Return a branch folder's skeleton in its scan file's axes, origin and unit."""
-    from limber.store import Alignment
+    from limber.alignment import Alignment
 
     manifest = json.loads((folder / "branch.json").read_text())
     return skeleton.moved(Alignment.model_validate(manifest["alignment"]).undo(skeleton.nodes))

@@ -21,6 +21,7 @@ from limber.errors import WorkError
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.marks import mark
 from limber.mechanics import Grasp, solve_static, young_weights
+from limber.plain import plain
 from limber.planning.compare import PlanSettings, plan_pair, random_start
 from limber.planning.field import EnergyField, error_measures, fit_field
 from limber.planning.goals import GraspGoal, default_goal
@@ -35,7 +36,6 @@ from limber.planning.sampling import (
     without_taut,
 )
 from limber.progress import Progress
-from limber.store import plain
 
 _PAPER_SAVED, _PAPER_ADDED = 35.69, 8.10  # percent, means over the paper's three branches
 

@@ -8,8 +8,8 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from limber.plain import plain
 from limber.progress import BarSink, Progress
-from limber.store import plain
 
 NAMES = ("geometry", "mechanics", "estimation", "planning")
 

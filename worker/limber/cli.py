@@ -18,11 +18,12 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import click
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
-from limber.errors import InputError, LimberError
-from limber.progress import BarSink, JsonSink, Progress
-from limber.store import plain
+from limber.errors import LimberError
+from limber.plain import plain
+from limber.progress import BarSink, JsonSink, Progress, Sink
+from limber.settings import checked_settings
 from limber.terminal import result_lines, table_lines
 from limber.version import VERSION
 
@@ -90,17 +91,16 @@ def main() -> None:
 class Run:
     """What a command's function gets besides its options.
 
-    ``progress`` to report to, ``say`` to print a line on standard error, ``show`` a table there,
-    ``warn`` for warnings.
+    ``progress`` to report and warn to, ``say`` to print a line on standard error, ``show`` a
+    table there. ``warnings`` are kept for the JSON result.
     """
 
-    def __init__(self, progress: Progress, say: Callable[[str], None]):
-        self.progress = progress
+    def __init__(self, sink: Sink | None, say: Callable[[str], None]):
+        self.progress = Progress(sink, self._warned)
         self.say = say
         self.warnings: list[str] = []
 
-    def warn(self, message: str) -> None:
-        """Tell the user something that does not stop the work; kept for the JSON result."""
+    def _warned(self, message: str) -> None:
         self.warnings.append(message)
         self.say(f"warning: {message}")
 
@@ -150,18 +150,6 @@ def settings_options(model: type[BaseModel]) -> Callable[[Callable], Callable]:
     return wrap
 
 
-def checked_settings(model: type[BaseModel], values: dict[str, Any]) -> BaseModel:
-    """Return ``model(**values)``; a refused value becomes an :class:`InputError` that names it."""
-    try:
-        return model(**values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = "--" + str(first["loc"][0] if first["loc"] else "settings").replace("_", "-")
-        raise InputError(f"{place} {first.get('input')!r}: {first['msg']}.",
-                         "It is outside what the stage can work with.",
-                         "See the option's help for its range.") from error
-
-
 def run(arguments: list[str] | None = None) -> None:
     """Entry point of the command ``limber``; does not return."""
     sys.exit(call(arguments))
@@ -192,15 +180,15 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
         progress_style = "bar" if sys.stderr.isatty() else "none"
     outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
     result: dict[str, Any] = {}
-    state = Run(Progress(), functools.partial(click.echo, err=True))
+    state = Run(JsonSink() if progress_style == "json" else None,
+                functools.partial(click.echo, err=True))
     code = 0
     try:
         if progress_style == "bar":
             with BarSink(name) as bar:
-                state.progress, state.say = Progress(bar), bar.say
+                state = Run(bar, bar.say)
                 result = function(state, **options)
         else:
-            state.progress = Progress(JsonSink() if progress_style == "json" else None)
             result = function(state, **options)
     except LimberError as error:
         code = error.exit_code

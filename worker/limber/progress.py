@@ -1,4 +1,4 @@
-"""Progress and cancelling of long work, the same for a terminal, a parent process and a test.
+"""What long work tells: how far it is, and warnings; the same for a terminal and a test.
 
 A long function takes ``progress: Progress = SILENT`` and calls it as it goes::
 
@@ -6,6 +6,7 @@ A long function takes ``progress: Progress = SILENT`` and calls it as it goes::
 
 A call raises :class:`limber.errors.Cancelled` once the work has been cancelled, so every call
 is also a place where the work can stop. ``progress.part(0.2, 0.6)`` is a view for a sub-task.
+What the user should know though the work goes on is told with ``progress.warn(message)``.
 """
 
 import json
@@ -21,11 +22,18 @@ Sink = Callable[[float, str, dict[str, Any]], None]
 
 
 class Progress:
-    """Reports a fraction of done work to a sink; raises ``Cancelled`` after :meth:`cancel`."""
+    """Passes what work tells to whom it concerns; raises ``Cancelled`` after :meth:`cancel`.
 
-    def __init__(self, sink: Sink | None = None, *, _span: tuple[float, float] = (0.0, 1.0),
+    Args:
+        sink: Gets fraction, message and numbers.
+        on_warning: Gets each warning.
+    """
+
+    def __init__(self, sink: Sink | None = None, on_warning: Callable[[str], None] | None = None,
+                 *, _span: tuple[float, float] = (0.0, 1.0),
                  _stop: threading.Event | None = None):
         self._sink = sink
+        self._on_warning = on_warning
         self._span = _span
         self._stop = _stop or threading.Event()
 
@@ -38,11 +46,30 @@ class Progress:
             clipped = min(max(float(fraction), 0.0), 1.0)
             self._sink(start + (stop - start) * clipped, message, numbers)
 
+    def warn(self, message: str) -> None:
+        """Tell the user something that does not stop the work."""
+        if self._on_warning is not None:
+            self._on_warning(message)
+
     def part(self, start: float, stop: float) -> "Progress":
         """Return a progress whose 0..1 is ``start..stop`` of this one."""
         low, high = self._span
         span = (low + (high - low) * start, low + (high - low) * stop)
-        return Progress(self._sink, _span=span, _stop=self._stop)
+        return Progress(self._sink, self._on_warning, _span=span, _stop=self._stop)
+
+    def named(self, name: str) -> "Progress":
+        """Return the same progress, its warnings beginning with ``name``."""
+        return self._with_warnings(lambda message: self.warn(f"{name}: {message}"))
+
+    def keeping(self, warnings: list[str]) -> "Progress":
+        """Return the same progress, each of its warnings also appended to ``warnings``."""
+        def keep(message: str) -> None:
+            warnings.append(message)
+            self.warn(message)
+        return self._with_warnings(keep)
+
+    def _with_warnings(self, on_warning: Callable[[str], None]) -> "Progress":
+        return Progress(self._sink, on_warning, _span=self._span, _stop=self._stop)
 
     def cancel(self) -> None:
         """Make the next report, from any thread, raise ``Cancelled``."""

@@ -8,9 +8,10 @@ import trimesh
 
 from limber.cli import call
 from limber.errors import InputError
-from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
+from limber.geometry.mesh_surface import MeshSurfaceSettings
 from limber.geometry.surface.input import usable_surface
 from limber.geometry.surface.surface import Surface
+from limber.stages.mesh import mesh_surface
 
 FILE = Path("bar.stl")
 

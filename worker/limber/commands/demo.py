@@ -42,7 +42,7 @@ class _Demo:
         self.results[name] = result
         self.run.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
         for warning in result.get("warnings", []):
-            self.run.warn(f"{name}: {warning}")
+            self.run.progress.warn(f"{name}: {warning}")
 
 
 @stage_command("demo")

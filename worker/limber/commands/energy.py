@@ -6,7 +6,7 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.planning.sampling import EnergySettings, sample_energy_field
+from limber.stages.energy import EnergySettings, sample_energy_field
 
 
 @stage_command("energy")
@@ -16,5 +16,4 @@ from limber.planning.sampling import EnergySettings, sample_energy_field
 def command(run: Run, branch_folder: Path, force: bool, settings: EnergySettings,
             ) -> dict[str, Any]:
     """Energy field over grasp poses: solve sampled poses, fit radial basis functions."""
-    return sample_energy_field(branch_folder, settings, force=force, progress=run.progress,
-                               warn=run.warn)
+    return sample_energy_field(branch_folder, settings, force=force, progress=run.progress)

@@ -6,10 +6,10 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.estimation.fit import estimate
 from limber.estimation.settings import EstimateSettings
+from limber.plain import plain
 from limber.report.tables import held_out_rows, modulus_rows
-from limber.store import plain
+from limber.stages.estimate import estimate, follow
 
 
 @stage_command("estimate")
@@ -24,13 +24,9 @@ def command(run: Run, branch_folder: Path, force: bool, is_online: bool, pace: f
             settings: EstimateSettings) -> dict[str, Any]:
     """Young's modulus along the branch with its uncertainty, from recorded or virtual pulls."""
     if is_online:
-        from limber.estimation.online.follow import follow
-
-        result = plain(follow(branch_folder, settings, pace=pace, progress=run.progress,
-                              warn=run.warn))
+        result = plain(follow(branch_folder, settings, pace=pace, progress=run.progress))
     else:
-        result = plain(estimate(branch_folder, settings, force=force, progress=run.progress,
-                                warn=run.warn))
+        result = plain(estimate(branch_folder, settings, force=force, progress=run.progress))
     run.show("Young's modulus", modulus_rows(result, None))
     if held_out := held_out_rows(result):
         run.show("Pulls foretold by a fit that did not see them: RMS errors", held_out)

@@ -6,7 +6,8 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.geometry.generated import BranchSpec, generate_branch, write_generated
+from limber.geometry.generated import BranchSpec
+from limber.stages.generate import generate
 
 
 @stage_command("generate")
@@ -19,5 +20,4 @@ def command(run: Run, folder: Path, seed: int, settings: BranchSpec) -> dict[str
     Writes cloud.ply, and the truth: truth_skeleton.swc, truth_surface.ply and truth.json.
     `limber reconstruct FOLDER/cloud.ply` takes the truth along.
     """
-    run.progress(0.1, "generating")
-    return write_generated(generate_branch(seed, **settings.model_dump()), folder)
+    return generate(folder, settings, seed=seed, progress=run.progress)

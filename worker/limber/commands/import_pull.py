@@ -6,7 +6,8 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.recordings.importing import ImportSettings, import_pull
+from limber.recordings.importing import ImportSettings
+from limber.stages.import_pull import import_pull
 
 
 @stage_command("import-pull")
@@ -20,4 +21,4 @@ def command(run: Run, branch_folder: Path, source: Path, name: str, force: bool,
     """Bring SOURCE (marker CSV, C3D, folder of PLY or RGB-D, force table) into the branch folder.
     """
     return import_pull(branch_folder, source, name, settings, force=force,
-                       progress=run.progress, warn=run.warn)
+                       progress=run.progress)

@@ -6,7 +6,8 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
+from limber.geometry.mesh_surface import MeshSurfaceSettings
+from limber.stages.mesh import mesh_surface
 
 
 @stage_command("mesh")
@@ -18,5 +19,4 @@ from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_surface
 def command(run: Run, surface: Path, folder: Path, force: bool,
             settings: MeshSurfaceSettings) -> dict[str, Any]:
     """Closed surface (STL, PLY, OBJ) to tetrahedra."""
-    return mesh_surface(surface, folder, settings, force=force, progress=run.progress,
-                        warn=run.warn)
+    return mesh_surface(surface, folder, settings, force=force, progress=run.progress)

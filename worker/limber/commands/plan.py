@@ -1,17 +1,15 @@
 """``limber plan``: RRT* and D-RRT* to a goal, compared on the full model."""
 
-import re
 from pathlib import Path
 from typing import Any
 
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.errors import InputError
+from limber.plain import plain
 from limber.planning.compare import PlanSettings
-from limber.planning.plan import plan_branch_motion
 from limber.report.tables import comparison_rows
-from limber.store import plain
+from limber.stages.plan import plan
 
 
 @stage_command("plan")
@@ -22,11 +20,6 @@ from limber.store import plain
 def command(run: Run, branch_folder: Path, name: str, force: bool, settings: PlanSettings,
             ) -> dict[str, Any]:
     """Paths to a goal: RRT* and deformation-aware D-RRT*, compared on the full model."""
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith("-baseline"):
-        raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names, and -baseline is the other path's.",
-                         "Use letters, digits, dash, dot and underscore.")
-    result = plan_branch_motion(branch_folder, settings, name=name, force=force,
-                                progress=run.progress, warn=run.warn)
+    result = plan(branch_folder, settings, name=name, force=force, progress=run.progress)
     run.show("Both paths, on the full model", comparison_rows(plain(result)))
     return result

@@ -6,7 +6,8 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.estimation.predict import PredictSettings, predict
+from limber.estimation.predict import PredictSettings
+from limber.stages.predict import predict
 
 
 @stage_command("predict")

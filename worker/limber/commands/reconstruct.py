@@ -6,8 +6,8 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.geometry.batch import reconstruct_folder
-from limber.geometry.reconstruct import ReconstructSettings, reconstruct
+from limber.geometry.reconstruct import ReconstructSettings
+from limber.stages.reconstruct import reconstruct, reconstruct_folder
 
 
 @stage_command("reconstruct")
@@ -31,8 +31,7 @@ def command(run: Run, cloud: Path, folder: Path, skeleton_path: Path | None,
     output folder, and a bad one does not stop the others.
     """
     if cloud.is_dir():
-        return reconstruct_folder(cloud, folder, settings, force=force, progress=run.progress,
-                                  warn=run.warn)
+        return reconstruct_folder(cloud, folder, settings, force=force, progress=run.progress)
     return reconstruct(cloud, folder, settings, skeleton_path=skeleton_path,
                        camera_path=camera_path, mask_path=mask_path, force=force,
-                       progress=run.progress, warn=run.warn)
+                       progress=run.progress)

@@ -14,6 +14,6 @@ from limber.cli import Run, stage_command
               help="A PNG to open the page with, such as the render of `limber scene`.")
 def command(run: Run, branch_folder: Path, picture: Path | None) -> dict[str, Any]:
     """One self-contained HTML page with figures and tables of all results."""
-    from limber.report.page import write_report
+    from limber.stages.report import write_report
 
     return write_report(branch_folder, picture=picture, progress=run.progress)

@@ -7,9 +7,10 @@ import numpy as np
 
 from limber.cli import Run, settings_options, stage_command
 from limber.mechanics.pose_table import PoseTable
-from limber.mechanics.simulate import SimulateSettings, simulate
+from limber.mechanics.simulate import SimulateSettings
 from limber.recordings.recording import POSE_COLUMNS
 from limber.recordings.tables import read_table, robot_stream, time_column, with_columns
+from limber.stages.simulate import simulate
 
 
 @stage_command("simulate")
@@ -22,7 +23,7 @@ from limber.recordings.tables import read_table, robot_stream, time_column, with
 def command(run: Run, branch_folder: Path, force: bool, along: Path | None,
             settings: SimulateSettings) -> dict:
     """Pull a branch by a pose or a force; writes motion, energy and forces."""
-    return simulate(branch_folder, settings, force=force, progress=run.progress, warn=run.warn,
+    return simulate(branch_folder, settings, force=force, progress=run.progress,
                     along=_poses(along, settings.duration, run) if along else None)
 
 
@@ -32,7 +33,7 @@ def _poses(path: Path, duration: float, run: Run) -> PoseTable:
     rate = None if timed else max(len(table.values) - 1, 1) / duration
     stream = robot_stream(path, rate_hz=rate)
     for message in stream.warnings:
-        run.warn(message)
+        run.progress.warn(message)
     poses = with_columns(stream, POSE_COLUMNS).values
     if np.isnan(poses[:, 3:]).all():
         poses[:, 3:] = 0.0  # a table of positions alone

@@ -6,7 +6,8 @@ from typing import Any
 import click
 
 from limber.cli import Run, settings_options, stage_command
-from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
+from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.stages.virtual_pull import virtual_pull
 
 
 @stage_command("virtual-pull")
@@ -17,5 +18,4 @@ from limber.estimation.virtual_pull import VirtualPullSettings, virtual_pull
 def command(run: Run, branch_folder: Path, name: str, force: bool,
             settings: VirtualPullSettings) -> dict[str, Any]:
     """Simulate a pull with a known Young's modulus and sensor noise, on a finer mesh."""
-    return virtual_pull(branch_folder, name, settings, force=force, progress=run.progress,
-                        warn=run.warn)
+    return virtual_pull(branch_folder, name, settings, force=force, progress=run.progress)

@@ -1,6 +1,5 @@
-"""The stage ``estimate``: Young's modulus along a branch from its pulls."""
+"""Young's modulus along a branch from its pulls: fit, judgement and what it is sure of."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled, LimberError
+from limber.errors import Cancelled
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward
 from limber.estimation.identifiability import (
@@ -29,27 +28,19 @@ from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import (
     Subject,
     forwards_of,
-    pull_names,
-    pulls_digest,
-    read_pulls,
     require_scale_in_principle,
-    subject_of,
 )
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.shape_error import shape_error
 from limber.estimation.start import scaled_start
 from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
-from limber.geometry.cloud.cloud import read_cloud
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import force_unit_suspicion
 from limber.recordings.grasping import grasp_on
 from limber.recordings.points import point_operator
-from limber.recordings.recording import GraspEntry
-from limber.store import Branch, plain
+from limber.recordings.recording import GraspEntry, Pull
 
-EVALUATIONS = ".estimate-evaluations.jsonl"
-"""Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
 MISFIT_FACTOR = 4.0
 """Mean squared residual over the expected one from which model and pull do not belong together:
 twice the stated noise. Of 10 branches reconstructed from scans, all sound ones stayed under 1.3,
@@ -93,81 +84,28 @@ class Estimate:
         return self.objective.space.unpack(self.fit.evaluation.free)
 
 
-def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
-             progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
-             ) -> dict[str, Any]:
-    """Estimate Young's modulus from the pulls of a branch folder.
+def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
+               log: EvaluationLog, cache: Path | None = None, digest: str = "",
+               progress: Progress = SILENT) -> Estimate:
+    """Estimate Young's modulus of a branch from its pulls.
 
-    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. Stopped by Ctrl-C it keeps the
-    best so far in ``estimate.json`` (``converged`` is then false); run again, it resumes.
-
-    Returns:
-        DESIGN's keys and ``warnings``.
+    Args:
+        log: Remembers evaluations; what a stopped run left there is taken over.
+        cache, digest: As for :func:`fit_pulls`.
 
     Raises:
-        InputError: no pulls, or pulls that cannot tell Young's modulus.
+        InputError: pulls that cannot tell Young's modulus.
         WorkError: the simulation finds no equilibrium.
-        Cancelled: after the best so far was kept.
+        Cancelled: stopped before the first step.
     """
-    branch = Branch.open(branch_folder)
-    names = pull_names(branch, settings)
-    subject = subject_of(branch, settings)
-    digests = {"mesh geometry": subject.mesh.geometry_digest(),
-               "pulls": pulls_digest(branch, names)}
-    if not force and branch.is_current("estimate", settings, digests=digests):
-        stored = branch.manifest.stages["estimate"].result
-        if not stored.get("stopped"):
-            return stored
-    messages: list[str] = []
-
-    def tell(message: str) -> None:
-        messages.append(message)
-        warn(message)
-
-    pulls = read_pulls(branch, names, subject, settings, tell, progress.part(0.0, 0.2))
-    forwards = forwards_of(pulls, subject, settings, tell)
-    log_path = branch.folder / EVALUATIONS
-    if force:
-        log_path.unlink(missing_ok=True)
-    log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
+    forwards = forwards_of(pulls, subject, settings, progress.warn)
     if log.resumed_count:
-        tell(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
+        progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
     sigma = [pull.entry.sensor.force_sigma_n for pull in pulls]
     objective = Objective(forwards, ParameterSpace.separate(subject.start, _extra(settings)),
-                          log=log, force_sigma=sigma, progress=progress.part(0.2, 0.9),
+                          log=log, force_sigma=sigma, progress=progress,
                           expected_count=20 if settings.method == "gauss-newton" else 200)
-    found = fit_pulls(objective, subject.start, settings, tell, cache=branch.folder,
-                      digest=json.dumps(digests, sort_keys=True))
-    found.warnings = messages
-    if not found.stopped:
-        found.model_error = _model_error(branch, subject, found, pulls[0].entry.grasp, settings,
-                                         progress.part(0.9, 0.98))
-        _tell_largest_part(_deviations(found), tell)
-        if settings.hold_out:
-            _score_others(branch, names, subject, found, settings, tell)
-    result = _summary(found, settings)
-    earlier = branch.manifest.stages.get("estimate")
-    if found.stopped and earlier is not None and not earlier.result.get("stopped"):
-        raise Cancelled("The estimate was stopped.",
-                        "The finished estimate of an earlier run is kept.",
-                        "Run it again when there is time for it.")
-    with branch.stage("estimate", settings, digests=digests) as stage:
-        full = result | _details(found, subject, pulls)
-        stage.path("estimate.json").write_text(
-            json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        if not found.stopped:
-            subject.mesh.with_data(cell_data={
-                "young": subject.weights @ found.values.young,
-                "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
-                "density": np.full(subject.mesh.tet_count, found.values.density),
-            }).write(stage.path("mesh.vtu"))
-        stage.result.update(result)
-    if found.stopped:
-        raise Cancelled("The estimate was stopped.",
-                        f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
-                        "estimate.json, not in the mesh.", "Run it again to resume.")
-    log.forget()
-    return stage.result
+    return fit_pulls(objective, subject.start, settings, progress.warn, cache=cache, digest=digest)
 
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
@@ -382,46 +320,48 @@ def _score(forward: Forward, distance: float, force: float, *, in_fit: bool) -> 
             "relative_force": force / peak if peak > 0 else np.nan}
 
 
-def _score_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
-                  settings: EstimateSettings, tell: Callable[[str], None]) -> None:
-    """Score the branch's pulls that this estimate was not asked to use."""
-    others = [name for name in branch.names("pulls")
-              if name not in names and branch.has(f"pulls/{name}/pull.toml")]
-    for name in others:
-        try:
-            pull = read_pulls(branch, [name], subject, settings, lambda _message: None)
-            forward = forwards_of(pull, subject, settings, lambda _message: None)
-        except LimberError as error:
-            tell(f"{name}, which the estimate did not use, could not be scored: {error}")
-            continue
-        alone = Objective(forward, found.objective.space,
-                          force_sigma=[pull[0].entry.sensor.force_sigma_n])
-        distance, force = held_out(alone, found.fit.evaluation.free, 0)
-        found.held_out[name] = _score(forward[0], distance, force, in_fit=False)
+def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSettings) -> None:
+    """Score a pull that the estimate was not asked to use; enters ``found.held_out``.
+
+    Raises:
+        LimberError: it has nothing that could be compared.
+    """
+    forward = forwards_of([pull], subject, settings, lambda _message: None)
+    alone = Objective(forward, found.objective.space,
+                      force_sigma=[pull.entry.sensor.force_sigma_n])
+    distance, force = held_out(alone, found.fit.evaluation.free, 0)
+    found.held_out[pull.name] = _score(forward[0], distance, force, in_fit=False)
 
 
-def _model_error(branch: Branch, subject: Subject, found: Estimate, grasp: GraspEntry,
-                 settings: EstimateSettings, progress: Progress) -> ModelError:
-    error = _geometry_error(branch, subject, found, settings, progress)
-    if not settings.mesh_check:
-        return error
-    progress(1.0, "how much the mesh is too stiff")
-    inside = point_operator(subject.mesh, subject.control_points)
-    model = subject.model.with_parameters(poisson=found.values.poisson)
-    return replace(error, mesh=mesh_error(model, grasp_on(subject.mesh, grasp), inside,
-                                          subject.weights, found.values.young))
+def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,
+                *, axes: Path | None, cloud: np.ndarray | None,
+                progress: Progress = SILENT) -> None:
+    """Find what residuals cannot show of an estimate: errors of the branch's shape and mesh.
+
+    Args:
+        axes: The table of cylinders that were fitted to the scan, or None.
+        cloud: The scan's points [m], shape [n, 3], or None.
+    """
+    error = _geometry_error(subject, found, settings, axes, cloud, progress)
+    if settings.mesh_check:
+        progress(1.0, "how much the mesh is too stiff")
+        inside = point_operator(subject.mesh, subject.control_points)
+        model = subject.model.with_parameters(poisson=found.values.poisson)
+        error = replace(error, mesh=mesh_error(model, grasp_on(subject.mesh, grasp), inside,
+                                               subject.weights, found.values.young))
+    found.model_error = error
+    _tell_largest_part(_deviations(found), progress.warn)
 
 
-def _geometry_error(branch: Branch, subject: Subject, found: Estimate,
-                    settings: EstimateSettings, progress: Progress) -> ModelError:
+def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
+                    axes: Path | None, cloud: np.ndarray | None, progress: Progress) -> ModelError:
     """From the scan's axis and radii; none for a skeleton that was not fitted to a scan."""
-    if not branch.has("skeleton.csv"):
+    if axes is None:
         return ModelError()
-    radii = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
-    if radii is None or not branch.has("cloud.ply"):
+    radii = geometry_error(axes, subject.mesh, subject.weights)
+    if radii is None or cloud is None:
         return ModelError(radii)
-    drawn = shape_error(found.fit.evaluation, found.objective, subject,
-                        read_cloud(branch.path("cloud.ply")).points, settings.shapes,
+    drawn = shape_error(found.fit.evaluation, found.objective, subject, cloud, settings.shapes,
                         progress=progress)
     return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
 
@@ -449,7 +389,8 @@ def _tell_largest_part(deviations: dict[str, Any], tell: Callable[[str], None]) 
          f"({each}). {ADVICE[largest]}")
 
 
-def _summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
+def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
+    """Return the stage's result: DESIGN's keys and more."""
     values, sure = found.values, found.uncertainty
     return {
         "method": settings.method, "young_pa": values.young,
@@ -474,9 +415,10 @@ def _reduced_error(found: Estimate) -> dict[str, Any]:
     return {"reduced_error_m": position, "reduced_error_force_share": force}
 
 
-def _details(found: Estimate, subject: Subject, pulls: list[Any]) -> dict[str, Any]:
+def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, Any]:
+    """Return what ``estimate.json`` has beside the summary."""
     evaluation, objective = found.fit.evaluation, found.objective
-    details: dict[str, Any] = {
+    told: dict[str, Any] = {
         "control_points_m": subject.control_points,
         "fractions": _fractions(subject), "parameters": objective.space.names,
         "groups": objective.space.groups, "links": objective.space.links,
@@ -492,13 +434,13 @@ def _details(found: Estimate, subject: Subject, pulls: list[Any]) -> dict[str, A
                     for number, entry in enumerate(objective.log.entries)],
         "pulls": [_pull_details(number, objective, evaluation)
                   for number in range(len(objective.forwards))]}
-    first = details["pulls"][0]
-    details |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
+    first = told["pulls"][0]
+    told |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
                 "simulated_m": first["simulated_m"]}
     truth = next((pull.entry.truth for pull in pulls if pull.entry.truth), None)
     if truth:
-        details["truth"] = truth
-    return details
+        told["truth"] = truth
+    return told
 
 
 def _pull_details(number: int, objective: Objective, evaluation: Evaluation) -> dict[str, Any]:

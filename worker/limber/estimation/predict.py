@@ -1,8 +1,6 @@
 """What a branch of an estimated modulus does under another load: where its points come to rest."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,12 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from limber.errors import InputError, WorkError
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.preparation import subject_of
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.preparation import Subject
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
-from limber.recordings.recording import PullEntry, read_entry
-from limber.store import Branch, plain
+from limber.recordings.recording import PullEntry
 
 
 class PredictSettings(BaseModel):
@@ -32,9 +28,26 @@ class PredictSettings(BaseModel):
         None, description="A steady force in any direction, branch frame [N].")
 
 
-def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progress = SILENT,
-            ) -> dict[str, Any]:
+def require_one_load(settings: PredictSettings) -> None:
+    """Refuse no load, or two.
+
+    Raises:
+        InputError: there is not one.
+    """
+    if (settings.weight is None) == (settings.load is None):
+        raise InputError("One load is needed.", "It is what differs from the recording.",
+                         "Give --weight NEWTONS or --load X Y Z.")
+
+
+def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down: np.ndarray,
+                 settings: PredictSettings, progress: Progress = SILENT) -> dict[str, Any]:
     """Simulate the branch at rest under another load than the recorded one.
+
+    Args:
+        known: Content of ``estimate.json``.
+        subject: The branch that was estimated.
+        entry: The pull whose points and grasp are taken.
+        down: Direction of gravity, unit vector [3].
 
     Returns:
         ``load_n`` [3], ``points_m`` and ``displacement_m`` [m][3] of the pull's points,
@@ -44,18 +57,10 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
         ``grasp_displacement_m`` [3], ``young_pa``.
 
     Raises:
-        InputError: no load, nothing estimated yet, or no such pull.
         WorkError: the branch finds no equilibrium under the load.
     """
-    if (settings.weight is None) == (settings.load is None):
-        raise InputError("One load is needed.", "It is what differs from the recording.",
-                         "Give --weight NEWTONS or --load X Y Z.")
-    branch = Branch.open(branch_folder)
-    known = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
-    entry = _entry(branch, settings.pull)
-    down = np.array(branch.gravity) / np.linalg.norm(branch.gravity)
     load = np.array(settings.load) if settings.load else settings.weight * down
-    forward, values = _forward(branch, known, entry, load)
+    forward, values = _forward(known, subject, entry, load)
     progress(0.1, "finding the branch's rest under the load")
     space = _space(known, values)
     found = forward.simulate(values, space.extra, True)
@@ -66,26 +71,15 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
     drop, sigma, drop_sigma = _uncertain(moved, found.d_positions[0], down, space, known)
     grasp = forward.grasp
     held = grasp.weights @ forward.displacements()[0][grasp.nodes]
-    return plain({
+    return {
         "load_n": load, "points_m": forward.rest_points, "displacement_m": moved,
         "displacement_sigma_m": sigma, "drops_m": moved @ down, "drop_m": drop,
         "drop_interval_m": [drop - 1.96 * drop_sigma, drop + 1.96 * drop_sigma],
-        "grasp_displacement_m": held, "young_pa": values.young})
+        "grasp_displacement_m": held, "young_pa": values.young}
 
 
-def _entry(branch: Branch, name: str | None) -> PullEntry:
-    names = [pull for pull in branch.names("pulls") if branch.has(f"pulls/{pull}/pull.toml")]
-    if not names or (name is not None and name not in names):
-        raise InputError(f"{branch.folder} has no pull {name or ''}.",
-                         f"It has {', '.join(names)}." if names else "It has none.",
-                         "Bring one in with `limber import-pull`.")
-    return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
-
-
-def _forward(branch: Branch, known: dict[str, Any], entry: PullEntry, load: np.ndarray,
+def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np.ndarray,
              ) -> tuple[QuasiStaticForward, Values]:
-    settings = EstimateSettings(fractions=tuple(known["fractions"]))
-    subject = subject_of(branch, settings)
     values = Values(np.array(known["young_pa"]), float(known["poisson"]),
                     float(known.get("density", subject.start.density)))
     points = np.array(subject.control_points if entry.rest_points_m is None

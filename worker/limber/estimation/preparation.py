@@ -1,6 +1,5 @@
-"""From a branch folder and its pulls to what an optimiser needs."""
+"""From a branch and its pulls to what an optimiser needs."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +15,11 @@ from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import BranchModel, point_masses
+from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames, frames_of
-from limber.recordings.checks import clean
-from limber.recordings.recording import Pull, PullEntry, read_pull
-from limber.store import Branch
+from limber.recordings.recording import Pull, PullEntry
 
 Warn = Callable[[str], None]
 
@@ -48,10 +45,13 @@ class Subject:
     start: Values
 
 
-def subject_of(branch: Branch, settings: EstimateSettings) -> Subject:
-    """Read mesh and skeleton; the start is uniform."""
-    mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
-    skeleton = Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
+def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
+               settings: EstimateSettings) -> Subject:
+    """Return the branch of a mesh, its axes and the masses that hang on it; the start is uniform.
+
+    Raises:
+        InputError: a modulus of the mesh, to start from, is not positive.
+    """
     points = control_points(skeleton, settings.fractions)
     wrong = np.flatnonzero(~(mesh.cell_data["young"] > 0))
     if len(wrong) and settings.young is None:
@@ -65,53 +65,10 @@ def subject_of(branch: Branch, settings: EstimateSettings) -> Subject:
     damping = RayleighDamping()
     # Twigs that the mesh leaves out weigh on it in pulls that gravity bends.
     model = BranchModel(mesh, young=young, poisson=poisson, density=density, gravity=None,
-                        point_masses=point_masses(branch))
+                        point_masses=masses)
     start = Values(np.full(len(points), young), poisson, density,
                    (damping.mass, damping.stiffness))
     return Subject(mesh, skeleton, points, young_weights(mesh, points), model, start)
-
-
-def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
-    """Return the pulls to use, checked.
-
-    Raises:
-        InputError: there are none, or one that was asked for is missing.
-    """
-    known = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
-    missing = [name for name in settings.pull if name not in known]
-    if missing or not known:
-        raise InputError(
-            f"{branch.folder} has no pull {', '.join(missing)}." if missing
-            else f"{branch.folder} has no pulls.",
-            f"It has {', '.join(known)}." if known else "There is nothing to estimate from.",
-            "Bring one in with `limber import-pull`, or simulate one with `limber virtual-pull`.")
-    return list(settings.pull) or known
-
-
-def pulls_digest(branch: Branch, names: list[str]) -> str:
-    """Return a sha256 of all files of these pulls."""
-    joined = hashlib.sha256()
-    for file in sorted(branch.manifest.files):
-        if any(file.startswith(f"pulls/{name}/") for name in names):
-            joined.update(f"{file} {branch.digest(file)}\n".encode())
-    return joined.hexdigest()
-
-
-def read_pulls(branch: Branch, names: list[str], subject: Subject, settings: EstimateSettings,
-               warn: Warn, progress: Progress = SILENT) -> list[Pull]:
-    """Read and clean pulls; find control points in their images where there are no markers."""
-    pulls = []
-    for number, name in enumerate(names):
-        folder = branch.path(f"pulls/{name}")
-        pull = read_pull(folder)
-        if pull.entry.observation in ("clouds", "depth"):
-            pull = _observed(folder, pull, subject, settings,
-                             progress.part(number / len(names), (number + 1) / len(names)))
-        pull = clean(pull)
-        for message in pull.warnings:
-            warn(message)
-        pulls.append(pull)
-    return pulls
 
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings, warn: Warn,
@@ -170,8 +127,9 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
                               key_count=settings.key_frames)
 
 
-def _observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSettings,
-              progress: Progress) -> Pull:
+def observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSettings,
+             progress: Progress = SILENT) -> Pull:
+    """Return a pull of images with the control points that are found in them."""
     from limber.perception.observe import observe
 
     observations, warnings = observe(folder, pull, subject.skeleton, settings.fractions,

@@ -5,17 +5,18 @@ where the branch was generated. What is known of it goes into ``pull.toml`` unde
 that an estimate can be scored; nothing that estimates reads it.
 """
 
-import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.estimation.gripper_path import MotionWanted, moved
-from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import base_nodes
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -35,13 +36,10 @@ from limber.recordings.recording import (
     Pull,
     PullEntry,
     SensorEntry,
-    write_pull,
 )
-from limber.store import Branch
 
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
-GRAVITY = (0.0, 0.0, -9.80665)
 
 
 class VirtualPullSettings(BaseModel):
@@ -126,67 +124,25 @@ class TrueBranch:
     gravity: tuple[float, float, float] = GRAVITY
 
 
-def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
-                 force: bool = False, progress: Progress = SILENT,
-                 warn: Any = lambda text: None) -> dict[str, Any]:
-    """Simulate a pull of a branch and write it as ``pulls/NAME``.
-
-    Returns:
-        ``pull``, ``young_true_pa``, ``control_points_m``, ``frame_count``, ``tet_count`` of the
-        truth's mesh, ``peak_force_n``, ``travel_m``.
+def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
+                fractions: tuple[float, ...] = FRACTIONS,
+                young: Sequence[float] = DEFAULT_YOUNG_PA,
+                gravity: tuple[float, float, float] = GRAVITY) -> TrueBranch:
+    """Return the branch of true axes, on a mesh of its own; the settings' moduli come first.
 
     Raises:
-        InputError: the branch has no skeleton, or the settings do not fit it.
-        WorkError: the branch cannot be pulled like that.
+        InputError: not one modulus a control point.
     """
-    branch = Branch.open(branch_folder)
-    branch.require("skeleton.swc", "reconstruct")
-    key = f"pull:{name}"
-    reads = [file for file in ("skeleton.swc", "truth/skeleton.swc", "truth/truth.json")
-             if branch.has(file)]
-    if not force and branch.is_current(key, settings, reads=reads):
-        return branch.manifest.stages[key].result
-    progress(0.02, "meshing the true branch")
-    truth = true_branch(branch, settings)
-    with branch.stage(key, settings, reads=reads) as stage:
-        prefix = f"pulls/{name}/"
-        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
-            stage.remove(old)
-        folder = stage.path(prefix + "pull.toml").parent
-        pull, displacements = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
-        write_pull(folder, pull)
-        if settings.camera:
-            write_depth_frames(folder, truth, pull, displacements, settings)
-        reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
-        stage.result.update({
-            "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
-            "fractions": truth.fractions, "frame_count": len(pull.times),
-            "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
-            "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
-    return stage.result
-
-
-def true_branch(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
-    """Return the truth of a branch folder: that of its generator, or its own skeleton's."""
-    fractions, young, where = (0.2, 0.4, 0.6, 0.8), np.array(DEFAULT_YOUNG_PA), "skeleton.swc"
-    if branch.has("truth/truth.json"):
-        known = json.loads(branch.path("truth/truth.json").read_text(encoding="utf-8"))
-        fractions, young = tuple(known["fractions"]), np.array(known["young_pa"], float)
-        where = "truth/skeleton.swc"
     if settings.young:
-        young = np.array(settings.young)
+        young = settings.young
         if len(young) != len(fractions):
             raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
                              "Each control point needs one.", "Give --young A,B,C,D.")
-    skeleton = Skeleton.read_swc(branch.path(where))
     # Reconstructed branches have sections four radii apart, of six sides.
     meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3))
     mesh = meshed.mesh.with_data(point_data={"fixed": base_nodes(meshed.mesh, skeleton)})
-    made = branch.manifest.stages.get("reconstruct")
-    # An upright turn of the scan turns gravity with it.
-    gravity = tuple((made.result.get("gravity_m_s2") if made else None) or GRAVITY)
-    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions, young,
-                      gravity)
+    return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
+                      np.array(young, float), gravity)
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,

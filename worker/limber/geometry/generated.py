@@ -1,21 +1,18 @@
 """Generated branches: true axes, radii and Young's modulus, and a scan of them with faults."""
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
-from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.sweep import frames, tangents
-from limber.store import file_digest, plain, write_atomically
+from limber.settings import checked_settings
 
 _STEP = 0.004  # [m] between nodes of the true axes
 
@@ -74,7 +71,6 @@ def generate_branch(seed: int, **spec: object) -> GeneratedBranch:
         seed: Seed of all that is random.
         spec: Fields of :class:`BranchSpec`.
     """
-    from limber.cli import checked_settings
     from limber.geometry.surface.tubes import branch_surface
 
     wanted = checked_settings(BranchSpec, spec)
@@ -245,28 +241,3 @@ def _seen_from_one_side(points: np.ndarray, normals: np.ndarray, spec: BranchSpe
     nearest = np.full(which.max() + 1, -np.inf)
     np.maximum.at(nearest, which.ravel(), depth)
     return (normals @ view > 0.1) & (depth > nearest[which.ravel()] - spec.radius_root)
-
-
-def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
-    """Write the scan and the truth: ``cloud.ply``, ``truth_skeleton.swc``, ``truth_surface.ply``
-    and ``truth.json``; returns what was written.
-
-    Raises:
-        InputError: the folder cannot be written to.
-    """
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        branch.cloud.write_ply(folder / "cloud.ply")
-        branch.skeleton.write_swc(folder / "truth_skeleton.swc")
-        branch.surface.write_ply(folder / "truth_surface.ply")
-        write_atomically(folder / "truth.json", json.dumps(plain({
-            "seed": branch.seed, "spec": branch.spec, "young_pa": branch.young,
-            "control_points_m": branch.control_points, "fractions": branch.fractions,
-            "cloud_sha256": file_digest(folder / "cloud.ply")}), indent=1) + "\n")
-    except OSError as error:
-        raise InputError(f"{folder} cannot be written to ({error.strerror}).",
-                         "The scan and its truth go there.", "Choose another folder.") from error
-    return {"cloud": str(folder / "cloud.ply"), "point_count": len(branch.cloud),
-            "branch_count": branch.skeleton.branch_count, "length_m": branch.skeleton.length,
-            "young_pa": branch.young, "surface_volume_m3": branch.surface.volume}

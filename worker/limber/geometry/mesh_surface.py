@@ -1,27 +1,24 @@
-"""The stage `mesh`: a closed surface of any slender body becomes a branch folder."""
+"""From the closed surface of any slender body to tetrahedra with axis, base and grasp."""
 
-from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from limber.alignment import Alignment
 from limber.errors import InputError, MeshingError
-from limber.geometry.reconstruct import peak_memory_mb, require_file
+from limber.geometry.reconstruct import gravity_after, peak_memory_mb
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.upright import shortest_turn
-from limber.geometry.surface.input import usable_surface
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.marks import GRASP_FRACTION, mark
 from limber.geometry.tets.quality import measure_quality
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
 from limber.progress import SILENT, Progress
-from limber.store import Alignment, Branch, file_digest
-
-GRAVITY = 9.80665  # [m/s^2]
 
 
 class MeshSurfaceSettings(BaseModel):
@@ -47,73 +44,61 @@ class MeshSurfaceSettings(BaseModel):
         GRASP_FRACTION, gt=0, le=1, description="Where the body is held, along its axis.")
 
 
-def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None = None, *,
-                 force: bool = False, progress: Progress = SILENT,
-                 warn: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Fill a closed surface with tetrahedra and mark base, control points and grasp.
+@dataclass(frozen=True)
+class MeshedBody:
+    """A solid in its own frame, filled with tetrahedra.
 
-    Args:
-        path: STL, PLY, OBJ or OFF.
-        folder: The branch folder to make or renew.
-        settings: How.
-        force: Run even if nothing has changed.
-        progress: Called as it goes.
-        warn: Gets each thing that the user should know.
+    Attributes:
+        alignment: From the file's coordinates to the body's.
+        skeleton: Its axis.
+        surface: Closed.
+        mesh: Marked with material, base, control points and grasp.
+        numbers: The stage's result.
+    """
+
+    alignment: Alignment
+    skeleton: Skeleton
+    surface: Surface
+    mesh: TetMesh
+    numbers: dict[str, Any]
+
+
+def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
+              progress: Progress = SILENT) -> MeshedBody:
+    """Fill a closed surface [m] with tetrahedra and mark base, control points and grasp.
 
     Raises:
-        InputError: the surface cannot be read or is not that of one solid:
-            :func:`limber.geometry.surface.input.usable_surface`.
-        MeshingError: fTetWild failed.
+        InputError: it has no long axis. MeshingError: fTetWild failed.
     """
-    settings = settings or MeshSurfaceSettings()
     scale = UNIT_METRES[settings.unit]
-    surface, warnings = usable_surface(
-        Surface.read(require_file(path, "A surface"), scale=scale), path)
-    branch = Branch.create(folder)
-    digests = {"surface": file_digest(path)}
-    if not force and branch.is_current("mesh", settings, digests=digests):
-        return branch.manifest.stages["mesh"].result
-    for text in warnings:
-        warn(text)
-    with branch.stage("mesh", settings, digests=digests) as stage:
-        skeleton = section_axis(
-            surface, None if settings.root is None else np.array(settings.root) * scale)
-        alignment, surface, skeleton = _aligned(surface, skeleton, scale, settings)
-        thick = float(np.median(skeleton.radius))
-        limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
-                              mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
-        try:
-            mesh, cached = tetrahedralise(
-                surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
-                settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
-        except MeshingError as error:  # there are no axes to sweep along here
-            raise MeshingError(
-                error.seen, error.why, "Raise --mesh-time-limit or --mesh-memory-limit-mb, lower "
-                "--elements-across, or simplify the surface.") from error
-        mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
-                    density=settings.density, fractions=FRACTIONS,
-                    grasp_fraction=settings.grasp_fraction)
-        stage.manifest.alignment = alignment
-        stage.manifest.source = {"file": Path(path).name, "unit": settings.unit,
-                                 "sha256": digests["surface"]}
-        skeleton.write_swc(stage.path("skeleton.swc"))
-        surface.write_ply(stage.path("surface.ply"))
-        mesh.write(stage.path("mesh.vtu"))
-        stage.remove("point_masses.json")  # of an earlier scan in this folder
-        up = np.array(settings.up) / np.linalg.norm(settings.up)
-        quality = measure_quality(mesh, surface.volume, skeleton, surface)
-        stage.result.update({
-            "point_count": len(surface.vertices), "node_count": skeleton.node_count,
-            "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,
-            "radius_min_m": float(skeleton.radius.min()),
-            "radius_max_m": float(skeleton.radius.max()), "clamped_radius_count": 0,
-            "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
-            "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count,
-            "mesher": "ftetwild (cached)" if cached else "ftetwild", "watertight": True,
-            "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb(),
-            "gravity_m_s2": -GRAVITY * np.array(alignment.rotation) @ up, "warnings": warnings})
-        progress(1.0, "meshed", tets=mesh.tet_count)
-    return branch.manifest.stages["mesh"].result
+    skeleton = section_axis(
+        surface, None if settings.root is None else np.array(settings.root) * scale)
+    alignment, surface, skeleton = _aligned(surface, skeleton, scale, settings)
+    thick = float(np.median(skeleton.radius))
+    limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
+                          mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
+    try:
+        mesh, cached = tetrahedralise(
+            surface, edge_length=2 * thick / settings.elements_across, epsilon=0.02 * thick,
+            settings=limits, stop_energy=10.0, progress=progress.part(0.1, 0.9))
+    except MeshingError as error:  # there are no axes to sweep along here
+        raise MeshingError(
+            error.seen, error.why, "Raise --mesh-time-limit or --mesh-memory-limit-mb, lower "
+            "--elements-across, or simplify the surface.") from error
+    mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
+                density=settings.density, fractions=FRACTIONS,
+                grasp_fraction=settings.grasp_fraction)
+    quality = measure_quality(mesh, surface.volume, skeleton, surface)
+    return MeshedBody(alignment, skeleton, surface, mesh, {
+        "point_count": len(surface.vertices), "node_count": skeleton.node_count,
+        "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,
+        "radius_min_m": float(skeleton.radius.min()),
+        "radius_max_m": float(skeleton.radius.max()), "clamped_radius_count": 0,
+        "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
+        "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count,
+        "mesher": "ftetwild (cached)" if cached else "ftetwild", "watertight": True,
+        "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb(),
+        "gravity_m_s2": gravity_after(alignment, settings.up)})
 
 
 def section_axis(surface: Surface, root: np.ndarray | None, count: int = 24) -> Skeleton:

@@ -1,22 +1,19 @@
-"""The stage `reconstruct`: a scan becomes a branch folder with skeleton, surface and mesh."""
+"""From a scan to tetrahedra: skeleton, surface and mesh of a branch, in its own frame."""
 
-import json
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
 
+from limber.alignment import Alignment
+from limber.constants import STANDARD_GRAVITY
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.depth_files import read_depth
-from limber.geometry.cloud.files import read_points
 from limber.geometry.cloud.preparation import PreparationSettings, Prepared, prepare
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.control_points import FRACTIONS
-from limber.geometry.skeleton.files import UNIT_METRES, read_skeleton, write_cylinders
+from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import CLAMPED, INTERPOLATED, Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
@@ -26,11 +23,9 @@ from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.marks import GRASP_FRACTION, mark
 from limber.geometry.tets.quality import measure_quality
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshResult, MeshSettings, mesh_branch
 from limber.progress import SILENT, Progress
-from limber.store import Alignment, Branch, file_digest
-
-GRAVITY = 9.80665  # [m/s^2]
 
 
 class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
@@ -54,104 +49,103 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
         GRASP_FRACTION, gt=0, le=1, description="Where the branch is held, along its main path.")
 
 
-def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
-                skeleton_path: Path | None = None, camera_path: Path | None = None,
-                mask_path: Path | None = None, force: bool = False,
-                progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
-                ) -> dict[str, Any]:
-    """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+@dataclass(frozen=True)
+class MeshedBranch:
+    """Surface and tetrahedra of an aligned skeleton.
+
+    Attributes:
+        skeleton: All of it, with the twigs that the mesh leaves out.
+        surface: Closed.
+        mesh: Marked with material, base, control points and grasp.
+        masses: Twigs left out, see :func:`leave_out_twigs`.
+        numbers: The stage's result as far as it is about them.
+    """
+
+    skeleton: Skeleton
+    surface: Surface
+    mesh: TetMesh
+    masses: list[dict[str, Any]]
+    numbers: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """What a scan became.
+
+    Attributes:
+        alignment: From the scan's coordinates to the branch's.
+        cloud: The prepared scan in the branch's frame.
+        meshed: Skeleton, surface and tetrahedra.
+        gravity: [m/s^2] in the branch's frame, shape [3].
+        numbers: The stage's result.
+    """
+
+    alignment: Alignment
+    cloud: Cloud
+    meshed: MeshedBranch
+    gravity: np.ndarray
+    numbers: dict[str, Any]
+
+
+def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleton | None = None,
+                      eye: np.ndarray | None = None, progress: Progress = SILENT,
+                      ) -> Reconstruction:
+    """Make skeleton, surface and tetrahedra of a scan.
 
     Args:
-        cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
-        folder: The branch folder to make or renew.
+        raw: The scan, in the file's unit.
         settings: How.
-        camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
-        mask_path: The depth image's mask of the branch.
-        skeleton_path: The user's own skeleton in the scan's coordinates and unit (SWC or
-            cylinder CSV), instead of ours.
-        force: Run even if nothing has changed.
-        progress: Called as it goes.
-        warn: Gets each thing that the user should know.
-
-    Returns:
-        The stage's result (DESIGN's keys and more).
+        own: The user's own skeleton in the scan's frame [m], instead of ours.
+        eye: Where the depth camera stood [m], shape [3], if the scan is its image.
+        progress: Called as it goes; gets what the user should know.
 
     Raises:
-        InputError: the scan, the skeleton or the folder cannot be used.
-        WorkError: the work failed; the folder is as it was.
+        InputError: the scan or the skeleton cannot be used. WorkError: the work failed.
     """
-    settings = settings or ReconstructSettings()
-    raw = read_points(cloud_path) if camera_path is None else read_depth(
-        cloud_path, camera_path, mask_path)
-    branch = Branch.create(folder)
-    digests = {"cloud": file_digest(cloud_path)}
-    for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
-        if path is not None:
-            digests[name] = file_digest(require_file(path, f"A {name} file"))
-    if not force and branch.is_current("reconstruct", settings, digests=digests):
-        return branch.manifest.stages["reconstruct"].result
-    warnings: list[str] = []
-
-    def tell(text: str) -> None:
-        warnings.append(text)
-        warn(text)
-
-    with branch.stage("reconstruct", settings, digests=digests) as stage:
-        prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=_eye(camera_path))
-        for text in prepared.warnings:
-            tell(text)
-        found = _skeleton(prepared, settings, skeleton_path, progress.part(0.02, 0.55))
-        if prepared.view is not None and skeleton_path is None:
-            found, text = seen_skeleton(found, prepared, settings.silhouette_reach)
-            if text:
-                tell(text)
-        alignment, cloud, found = _aligned(prepared, found, settings)
-        skeleton = found.skeleton
-        for text in found.warnings:
-            tell(text)
-        stage.manifest.alignment = alignment
-        stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
-                                 "sha256": digests["cloud"]}
-        up = np.array(settings.up) / np.linalg.norm(settings.up)
-        gravity = -GRAVITY * np.array(alignment.rotation) @ up
-        result = write_geometry(stage, skeleton, settings, tell, progress.part(0.55, 0.98))
-        cloud.write_ply(stage.path("cloud.ply"))
-        if _copy_truth(Path(cloud_path), stage, alignment):
-            stage.manifest.source["truth"] = "truth/truth.json"
-        stage.result.update(result | found.report() | {
-            "point_count": len(cloud), "dropped_points": prepared.counts,
-            "gravity_m_s2": gravity, "warnings": warnings})
-        progress(1.0, "reconstructed")
-    return branch.manifest.stages["reconstruct"].result
+    prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=eye)
+    for text in prepared.warnings:
+        progress.warn(text)
+    found = _skeleton(prepared, settings, own, progress.part(0.02, 0.55))
+    if prepared.view is not None and own is None:
+        found, text = seen_skeleton(found, prepared, settings.silhouette_reach)
+        if text:
+            progress.warn(text)
+    alignment, cloud, found = _aligned(prepared, found, settings)
+    for text in found.warnings:
+        progress.warn(text)
+    meshed = mesh_skeleton(found.skeleton, settings, progress.part(0.55, 0.98))
+    gravity = gravity_after(alignment, settings.up)
+    numbers = meshed.numbers | found.report() | {
+        "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity}
+    return Reconstruction(alignment, cloud, meshed, gravity, numbers)
 
 
-def write_geometry(stage: Any, skeleton: Skeleton, settings: ReconstructSettings,
-                   warn: Callable[[str], None], progress: Progress) -> dict[str, Any]:
-    """Write skeleton, surface and mesh of an aligned skeleton; return their numbers."""
+def gravity_after(alignment: Alignment, up: tuple[float, float, float]) -> np.ndarray:
+    """Return gravity [m/s^2] in the branch's frame, of a file in whose axes ``up`` is up."""
+    unit = np.array(up) / np.linalg.norm(up)
+    return -STANDARD_GRAVITY * np.array(alignment.rotation) @ unit
+
+
+def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
+                  progress: Progress = SILENT) -> MeshedBranch:
+    """Make surface and mesh of an aligned skeleton."""
     kept, masses = leave_out_twigs(skeleton, settings)
     surface, check, sharp = smooth_forks(branch_surface(kept), kept)
     check.require()
     for text in sharp:
-        warn(text)
+        progress.warn(text)
     progress(0.1, "surface", faces=len(surface.faces))
     meshed = mesh_branch(kept, settings, progress=progress.part(0.1, 0.9))
     for text in meshed.warnings:
-        warn(text)
+        progress.warn(text)
     masses += [twig_mass(kept, run, settings.density) for run in meshed.left_out]
     mesh = mark(meshed.mesh, kept, young=settings.young, poisson=settings.poisson,
                 density=settings.density, fractions=FRACTIONS,
                 grasp_fraction=settings.grasp_fraction)
-    skeleton.write_swc(stage.path("skeleton.swc"))
-    write_cylinders(skeleton, stage.path("skeleton.csv"))
-    surface.write_ply(stage.path("surface.ply"))
-    mesh.write(stage.path("mesh.vtu"))
-    if masses:
-        stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n")
-    else:
-        stage.remove("point_masses.json")  # of an earlier run: its twigs are in the mesh now
     progress(1.0, "mesh", tets=mesh.tet_count)
-    return _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
+    numbers = _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
         "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses)}
+    return MeshedBranch(skeleton, surface, mesh, masses, numbers)
 
 
 def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed: MeshResult,
@@ -246,26 +240,15 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
                    pruned=found.pruned + len(dropped)), text
 
 
-def _eye(camera_path: Path | None) -> np.ndarray | None:
-    """Where the depth image's camera stood [m], shape [3]."""
-    if camera_path is None:
-        return None
-    from limber.perception.camera import read_camera
-
-    return read_camera(camera_path).origin
-
-
-def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: Path | None,
+def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
               progress: Progress) -> SkeletonResult:
-    scale = UNIT_METRES[settings.unit]
-    if skeleton_path is not None:
+    if own is not None:
         from limber.geometry.skeleton.skeletonise import given_skeleton
 
-        own = read_skeleton(skeleton_path, scale=scale)
         if (own.radius <= 0).any():
             raise InputError(
-                f"{int((own.radius <= 0).sum())} of {own.node_count} nodes of {skeleton_path} have "
-                "radius 0.", "A branch has a thickness.",
+                f"{int((own.radius <= 0).sum())} of {own.node_count} nodes of the given skeleton "
+                "have radius 0.", "A branch has a thickness.",
                 "Give each node its radius, or reconstruct from the cloud instead.")
         size = np.linalg.norm(np.ptp(own.nodes, axis=0))
         extent = np.linalg.norm(np.ptp(prepared.cloud.points, axis=0))
@@ -275,6 +258,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, skeleton_path: 
                 "They do not belong together, or are in different units.",
                 "Give the skeleton in the cloud's coordinates and unit (--unit is for both).")
         return given_skeleton(own.moved(own.nodes - prepared.origin), prepared.cloud.points)
+    scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
                        progress=progress)
@@ -295,37 +279,3 @@ def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSet
                           origin=tuple((prepared.origin + root).tolist()),
                           rotation=tuple(map(tuple, rotation.tolist())))
     return alignment, cloud, found.moved(lambda points: (points - root) @ rotation.T)
-
-
-def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
-    """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
-    source = cloud_path.parent / "truth.json"
-    skeleton_path = cloud_path.parent / "truth_skeleton.swc"
-    if not (source.is_file() and skeleton_path.is_file()):
-        return False
-    truth = json.loads(source.read_text(encoding="utf-8"))
-    if truth.get("cloud_sha256") != file_digest(cloud_path):
-        return False
-    skeleton = Skeleton.read_swc(skeleton_path)
-    skeleton.moved(alignment.apply(skeleton.nodes)).write_swc(stage.path("truth/skeleton.swc"))
-    truth["control_points_m"] = alignment.apply(np.array(truth["control_points_m"])).tolist()
-    stage.path("truth/truth.json").write_text(json.dumps(truth, indent=1) + "\n")
-    surface_path = cloud_path.parent / "truth_surface.ply"
-    if surface_path.is_file():
-        surface = Surface.read(surface_path)
-        Surface(alignment.apply(surface.vertices), surface.faces).write_ply(
-            stage.path("truth/surface.ply"))
-    else:
-        stage.remove("truth/surface.ply")
-    return True
-
-
-def require_file(path: Path, what: str) -> Path:
-    """Return ``path`` if it is a file.
-
-    Raises:
-        InputError: it is not.
-    """
-    if not Path(path).is_file():
-        raise InputError(f"There is no file {path}.", f"{what} was expected.", "Check the path.")
-    return Path(path)

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
+from limber.files import write_atomically
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import strain_state
-from limber.store import write_atomically
 
 _PC2_HEADER = struct.Struct("<12siiffi")
 

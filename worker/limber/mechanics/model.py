@@ -1,7 +1,6 @@
 """The branch model: a mesh with its material, loads and constraints, ready for the solvers."""
 
 import copy
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,6 +9,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from limber.compiled import for_kernels
+from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements import shapes as elements
@@ -34,7 +34,6 @@ from limber.mechanics.materials import (
     lame,
     per_tet,
 )
-from limber.store import GRAVITY, Branch
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
@@ -51,14 +50,6 @@ class PointMass:
 
     position: tuple[float, float, float]
     mass: float
-
-
-def point_masses(branch: Branch) -> tuple[PointMass, ...]:
-    """Return the twigs that a folder's mesh leaves out, as masses where they were attached."""
-    if not branch.has("point_masses.json"):
-        return ()
-    masses = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
-    return tuple(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses)
 
 
 @dataclass(frozen=True)
@@ -157,27 +148,6 @@ class BranchModel:
         self.point_masses = tuple(point_masses)
         self.hanging: Hanging | None = None
         self._set(young, poisson, density)
-
-    @classmethod
-    def from_branch(cls, branch: Branch, **overrides: object) -> "BranchModel":
-        """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for the class.
-
-        Gravity acts as it did on the scan, which the upright turn has turned with the branch;
-        twigs that the mesh leaves out hang on it as masses.
-
-        Raises:
-            BranchFolderError: there is no mesh. InputError: it lacks material data.
-        """
-        mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
-        values = {}
-        for name in ("young", "poisson", "density"):
-            value = overrides.pop(name, None)
-            if value is None and name not in mesh.cell_data:
-                raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
-                                 "The material is not known.", "Reconstruct again.")
-            values[name] = mesh.cell_data[name] if value is None else value
-        known = {"gravity": branch.gravity, "point_masses": point_masses(branch)}
-        return cls(mesh, **values, **{**known, **overrides})
 
     @property
     def mesh(self) -> TetMesh:

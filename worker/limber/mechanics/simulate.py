@@ -1,8 +1,6 @@
-"""The stage `simulate`: pull a branch by a pose or a force, in balance or in time."""
+"""A pull as settings describe it: the loaded branch, the grasp and where it goes."""
 
-import json
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -11,18 +9,13 @@ from limber.errors import ConvergenceError, InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.dynamics.pull import Motion, Pull, dynamic_motion, static_motion
 from limber.mechanics.dynamics.simulate import NewmarkSettings
-from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.strain import strain_state
 from limber.progress import SILENT, Progress
-from limber.store import Branch, write_atomically
-
-STAGE = "simulate"
 
 Point = tuple[float, float, float]
 PointLoad = tuple[float, float, float, float, float, float]
@@ -86,58 +79,6 @@ class SimulateSettings(BaseModel):
     vtu: bool = Field(False, description="Also write a VTU series that ParaView opens.")
 
 
-def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
-             along: PoseTable | None = None, force: bool = False, progress: Progress = SILENT,
-             warn: Any = lambda _message: None) -> dict[str, Any]:
-    """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
-
-    Args:
-        branch_folder: With a mesh.
-        settings: How to pull.
-        along: The grasp's way instead of a motion of the settings.
-
-    Returns:
-        The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
-        ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
-
-    Raises:
-        InputError: options that do not fit. ConvergenceError: the branch could not follow; the
-            frames up to there are written.
-    """
-    branch = Branch.open(branch_folder)
-    branch.require("mesh.vtu", "reconstruct")
-    moves = settings.move is not None or settings.turn is not None
-    if (settings.grasp_force is not None) + moves + (along is not None) > 1:
-        raise InputError("More than one of a motion, a way and a force were given.",
-                         "A grasp follows poses or takes a force.",
-                         "Give --move and --turn, --along, or --grasp-force.")
-    digests = {"along": along.digest()} if along else {}
-    stored = branch.manifest.stages.get(STAGE)
-    if not force and stored and stored.result.get("converged") and branch.is_current(
-            STAGE, settings, reads=["mesh.vtu"], digests=digests):
-        return stored.result
-    pull = _pull(branch, settings, along, progress.part(0.0, 0.2), warn)
-    ahead = progress.part(0.2, 0.9)
-    if settings.kind == "static":
-        motion = static_motion(pull, ahead)
-    else:
-        motion = dynamic_motion(pull, NewmarkSettings(
-            settings.newmark_beta, settings.newmark_gamma, max_step=settings.step), ahead)
-    for message in motion.warnings:
-        warn(message)
-    with branch.stage(STAGE, settings, reads=["mesh.vtu"], digests=digests) as stage:
-        result = _write(stage, pull.model, settings, motion)
-        stage.result.update(result)
-    progress(1.0, "done")
-    if not motion.converged:
-        raise ConvergenceError(
-            f"The branch could not follow: {motion.message}",
-            f"{result['frame_count']} frames up to the last good state are in"
-            f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
-            "Pull less far, or check units and Young's modulus.")
-    return result
-
-
 def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
     """Return the force across the branch that would bend it by a fifth of its reach [N], shape [3].
 
@@ -153,11 +94,19 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
     return _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
 
 
-def _pull(branch: Branch, settings: SimulateSettings, along: PoseTable | None,
-          progress: Progress, warn: Any) -> Pull:
-    progress(0.0, "preparing")
-    model, scan = _model(branch, settings, progress, warn)
+def pull_of(model: BranchModel, scan: TetMesh, settings: SimulateSettings,
+            along: PoseTable | None = None) -> Pull:
+    """Return the pull that settings ask for.
 
+    Args:
+        model: At its rest shape.
+        scan: The mesh as scanned: places are given on it.
+        settings: How to pull.
+        along: The grasp's way instead of a motion of the settings.
+
+    Raises:
+        InputError: options that do not fit. ConvergenceError: the branch finds no rest.
+    """
     def patch(point: Point, mode: str) -> Grasp:
         # Places are given on the scan; the model's rest shape is that before it sagged.
         nodes = Grasp.at(scan, np.array(point), settings.grasp_radius, mode).nodes
@@ -183,22 +132,39 @@ def _pull(branch: Branch, settings: SimulateSettings, along: PoseTable | None,
                 _way(start.pose[0], changes, settings.grasp_mode), force, loads, times, part)
 
 
-def _model(branch: Branch, settings: SimulateSettings, progress: Progress,
-           warn: Any) -> tuple[BranchModel, TetMesh]:
-    """Return the model at its rest shape with all that hangs on it, and the mesh as scanned."""
-    model = BranchModel.from_branch(
-        branch, young=settings.young, material=settings.material,
-        gravity=branch.gravity if settings.gravity else None, lumped_mass=settings.lumped_mass,
-        damping=RayleighDamping(settings.damping_mass, settings.damping_stiffness))
+def loaded_model(model: BranchModel, settings: SimulateSettings,
+                 progress: Progress = SILENT) -> BranchModel:
+    """Return the model of a scan at its rest shape with all that hangs on it."""
     scan = model.mesh
     if settings.gravity and settings.rest_shape:
         try:
             model = model.with_rest_nodes(unloaded_rest_shape(model, progress=progress).nodes)
         except ConvergenceError as error:
-            warn(f"{error} The scan is taken as the shape without load.")
+            progress.warn(f"{error} The scan is taken as the shape without load.")
     added = [PointMass(tuple(model.mesh.nodes[Grasp.at(scan, np.array(place[:3]), 0.0).nodes[0]]),
                        place[3]) for place in settings.mass_at]
-    return model.with_point_masses(added), scan
+    return model.with_point_masses(added)
+
+
+def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> None:
+    """Refuse more than one of a motion, a way and a force.
+
+    Raises:
+        InputError: there are more.
+    """
+    moves = settings.move is not None or settings.turn is not None
+    if (settings.grasp_force is not None) + moves + (along is not None) > 1:
+        raise InputError("More than one of a motion, a way and a force were given.",
+                         "A grasp follows poses or takes a force.",
+                         "Give --move and --turn, --along, or --grasp-force.")
+
+
+def motion_of(pull: Pull, settings: SimulateSettings, progress: Progress = SILENT) -> Motion:
+    """Pull, along equilibria or in time."""
+    if settings.kind == "static":
+        return static_motion(pull, progress)
+    return dynamic_motion(pull, NewmarkSettings(
+        settings.newmark_beta, settings.newmark_gamma, max_step=settings.step), progress)
 
 
 def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.ndarray]:
@@ -223,37 +189,8 @@ def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
     return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])
 
 
-def _write(stage: Any, model: BranchModel, settings: SimulateSettings,
-           motion: Motion) -> dict[str, Any]:
-    displacement = motion.displacement
-    nodes = surface_nodes(model.mesh)
-    write_pc2(stage.path(f"frames/{settings.name}.pc2"),
-              model.mesh.nodes[nodes] + displacement[:, nodes])
-    if settings.vtu:
-        folder = stage.path(f"frames/{settings.name}/{settings.name}.pvd").parent
-        write_pvd_series(folder, settings.name, model, motion.times, displacement)
-    tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
-                             axis=1).argmax())
-    strain, stress = _largest(model, displacement)
-    frames = {
-        "frame_count": len(displacement), "rate": settings.frame_rate,
-        "times_s": motion.times.tolist(), "energies_j": motion.energy.tolist(),
-        "kinetic_energies_j": motion.kinetic_energy.tolist(),
-        "grasp_forces_n": motion.grasp_force.tolist(),
-        "grasp_torques_nm": motion.grasp_torque.tolist(),
-        "hold_forces_n": motion.hold_forces.tolist(), "min_det_f": motion.min_det_f.tolist(),
-        "converged": motion.converged,
-        "largest_principal_strains": strain, "largest_principal_stresses_pa": stress}
-    write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
-    return {
-        "converged": motion.converged, "frame_count": len(displacement),
-        "energy_j": float(motion.energy[-1]),
-        "grasp_force_n": motion.grasp_force[-1].tolist(),
-        "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
-        "min_det_f": float(motion.min_det_f.min())}
-
-
-def _largest(model: BranchModel, displacement: np.ndarray) -> tuple[list[float], list[float]]:
+def largest_strains(model: BranchModel, displacement: np.ndarray,
+                    ) -> tuple[list[float], list[float]]:
     """Return the largest principal strain and stress [Pa] of each frame."""
     states = [strain_state(model, frame) for frame in displacement]
     return ([float(s.principal_strain[:, -1].max()) for s in states],

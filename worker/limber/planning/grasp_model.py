@@ -25,9 +25,7 @@ from limber.mechanics import (
     follow_poses,
     solve_static,
 )
-from limber.mechanics.model import point_masses
 from limber.mechanics.strain import strain_state
-from limber.store import Branch
 
 _PARTS = ("mesh", "reach", "gravity", "point_masses")
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
@@ -154,27 +152,25 @@ def acceptable(result: StaticResult) -> str:
     return "" if result.min_det_f > 0.0 else "inverted"
 
 
-def read_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
-    """Read the branch model of a branch folder.
+def grasp_model_of(mesh: TetMesh, skeleton: Skeleton, gravity: tuple[float, float, float] | None,
+                   masses: tuple[PointMass, ...] = ()) -> GraspModel:
+    """Return the model of a scanned branch.
 
-    Without ``gravity`` the scanned shape is the rest state and free of stress. With it the
-    scanned shape is the one that the branch hangs in under its own weight: the shape that it
+    Without ``gravity`` [m/s^2] the scanned shape is the rest state and free of stress. With it
+    the scanned shape is the one that the branch hangs in under its own weight: the shape that it
     would have without weight is computed first, so that the rest state is the scan again.
 
     Raises:
-        BranchFolderError: a file is missing.
         WorkError: the mesh marks no material, or the branch cannot bear its weight.
     """
-    mesh = TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
-    skeleton = Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
     missing = {"young", "poisson", "density"} - set(mesh.cell_data)
     if missing:
         raise WorkError(f"The mesh has no {', '.join(sorted(missing))}.",
                         "Its energy cannot be computed.", "Reconstruct the branch again.")
     reach = Reach.of(skeleton, Grasp.from_mesh(mesh).centre)
-    if not gravity:
+    if gravity is None:
         return GraspModel(mesh, reach, None)
     from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 
-    hanging = GraspModel(mesh, reach, branch.gravity, point_masses(branch))
+    hanging = GraspModel(mesh, reach, gravity, masses)
     return replace(hanging, mesh=unloaded_rest_shape(hanging.model))

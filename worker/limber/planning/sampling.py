@@ -12,40 +12,19 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import WorkError
 from limber.jobs.process import end_with_parent
-from limber.planning.field import GraspSamples, fit_field
-from limber.planning.grasp_model import GraspModel, Reach, acceptable, read_grasp_model
+from limber.planning.field import GraspSamples
+from limber.planning.grasp_model import GraspModel, Reach, acceptable
 from limber.progress import SILENT, Progress
-from limber.store import Branch
 
 _LAYER = 0.06  # share of the reach
 _TAUT = 2.0  # times the median force
 _SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
-
-
-class EnergySettings(BaseModel):
-    """How the energy field is sampled."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    samples: int = Field(150, ge=30, description="Grasp positions to solve.")
-    deflection: float = Field(0.4, gt=0, le=1.0, description=(
-        "Largest distance from rest, as a share of the branch's length up to the grasp."))
-    stretch: float = Field(0.2, ge=0, le=1.0, description=(
-        "How far out of its curve the branch may be pulled straight: 0 the distance between base "
-        "and grasp at rest, 1 the length of branch between them."))
-    gravity: bool = Field(False, description=(
-        "Let the branch bear its own weight; the scanned shape is then the one it hangs in. "
-        "Otherwise it has no weight, and the scanned shape is free of stress."))
-    workers: int = Field(2, ge=1, le=16, description="Processes that solve side by side.")
-    seed: int = Field(0, ge=0, description="Of the sampled positions.")
 
 
 @dataclass(frozen=True)
@@ -217,50 +196,6 @@ def _solve_side_by_side(grasp_model: GraspModel, targets: np.ndarray, workers: i
         finally:
             stop.set()
         return [solved for future in futures for solved in future.result()]
-
-
-def sample_energy_field(folder: Path, settings: EnergySettings, *, force: bool = False,
-                        progress: Progress = SILENT,
-                        warn: Callable[[str], None] = lambda _message: None) -> dict[str, Any]:
-    """Stage ``energy``: sample grasp poses and fit the field; writes ``energy.npz``.
-
-    Raises:
-        BranchFolderError: no mesh yet.
-        WorkError: too few poses could be solved.
-    """
-    branch = Branch.open(folder)
-    grasp_model = read_grasp_model(branch, gravity=settings.gravity)
-    digests = energy_inputs(grasp_model)
-    if not force and branch.is_current("energy", settings, digests=digests):
-        return branch.manifest.stages["energy"].result
-    with branch.stage("energy", settings, digests=digests) as stage:
-        progress(0.0, "rest state")
-        targets = sample_positions(
-            grasp_model.reach, grasp_model.rest_position, settings.samples,
-            deflection=settings.deflection, stretch=settings.stretch, seed=settings.seed)
-        samples, reasons = sample_branch(grasp_model, targets, workers=settings.workers,
-                                         progress=progress.part(0.02, 0.9))
-        samples, taut_count = without_taut(samples)
-        field = fit_field(samples, grasp_model.reach.base, seed=settings.seed,
-                          progress=progress.part(0.9, 1.0))
-        rejected = len(samples.rejected_poses)
-        if rejected > 0.2 * settings.samples:
-            warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); paths keep "
-                 "away from them.")
-        field.write(stage.path("energy.npz"), {
-            "rest_pose": samples.poses[0], "arc_length_m": np.array(grasp_model.reach.arc_length)})
-        stage.result.update(
-            sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
-            taut_count=taut_count,
-            energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
-            errors=field.errors, kernel=field.work_fit.kernel, shape=field.work_fit.shape,
-            chart_stretch=field.chart.stretch,
-            fitted_to_forces=len(field.work_fit.gradient_weights) > 0,
-            max_energy_j=float(samples.energies.max()),
-            max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
-            rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
-    progress(1.0, "energy field fitted")
-    return branch.manifest.stages["energy"].result
 
 
 def without_taut(samples: GraspSamples) -> tuple[GraspSamples, int]:

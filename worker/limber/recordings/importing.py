@@ -2,16 +2,17 @@
 
 import re
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from limber.alignment import Alignment
+from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.estimation.forward.hung_load import settled
-from limber.geometry.tets.tet_mesh import TetMesh
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
 from limber.recordings.checks import clean
@@ -39,7 +40,6 @@ from limber.recordings.tables import (
     split_title,
     with_columns,
 )
-from limber.store import Branch, file_digest
 
 Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement"]
 
@@ -99,46 +99,43 @@ class ImportSettings(BaseModel):
     yolo_class: str | None = Field(None, description="Which of its classes is the branch.")
 
 
-def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
-                force: bool = False, progress: Progress = SILENT, warn: Any = lambda text: None,
-                ) -> dict[str, Any]:
-    """Bring a recording into ``pulls/NAME`` of a branch folder.
+@dataclass(frozen=True)
+class BranchFrame:
+    """What an import must know of the branch.
+
+    Attributes:
+        alignment: From the scan's coordinates to the branch's.
+        gravity: [m/s^2] in the branch's frame.
+        nodes: Of its mesh [m], shape [n, 3]; only a steady load asks for them.
+    """
+
+    alignment: Alignment = field(default_factory=Alignment)
+    gravity: tuple[float, float, float] = GRAVITY
+    nodes: np.ndarray | None = None
+
+
+def import_recording(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
+                     branch: BranchFrame, progress: Progress = SILENT) -> dict[str, Any]:
+    """Bring a recording into ``folder`` in the pull format.
+
+    Args:
+        kind: What SOURCE is, as :func:`kind_of` tells.
 
     Returns:
-        ``pull``, ``kind``, ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
+        ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
         load ``displacement_m``, ``settled_s`` and ``registration_rms_m``; of a force table
         ``slope_n_per_m``, ``slope_interval_n_per_m`` and ``why_no_modulus``.
 
     Raises:
         InputError: SOURCE cannot be read as what it is said to be.
     """
-    source = Path(source)
-    if not source.exists():
-        raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
-    kind = _guess(source) if settings.kind == "auto" else settings.kind
-    branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
-    key, digests = f"pull:{name}", {"source": _digest(source)}
-    for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
-                          ("yolo", settings.yolo_weights)):
-        if named and Path(named).is_file():
-            digests[key_of] = _digest(Path(named))
-    if not force and branch.is_current(key, settings, digests=digests):
-        return branch.manifest.stages[key].result
-    with branch.stage(key, settings, digests=digests) as stage:
-        prefix = f"pulls/{name}/"
-        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
-            stage.remove(old)
-        folder = stage.path(prefix + "pull.toml").parent
-        progress(0.1, f"reading {kind}")
-        if kind == "force-displacement":
-            stage.result.update(_import_force_table(source, folder, settings, warn))
-        elif settings.weight is not None or settings.load is not None:
-            stage.result.update(_import_load(kind, source, folder, name, settings, branch, warn))
-        else:
-            stage.result.update(_import_motion(kind, source, folder, name, settings, branch,
-                                               warn, progress.part(0.1, 1.0)))
-        stage.result |= {"pull": name, "kind": kind}
-    return stage.result
+    progress(0.1, f"reading {kind}")
+    if kind == "force-displacement":
+        return _import_force_table(source, folder, settings, progress.warn)
+    if settings.weight is not None or settings.load is not None:
+        return _import_load(kind, source, folder, name, settings, branch, progress.warn)
+    return _import_motion(kind, source, folder, name, settings, branch, progress.warn,
+                          progress.part(0.1, 1.0))
 
 
 def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
@@ -170,7 +167,8 @@ def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
     return Stream(times, positions.reshape(len(times), -1), names), labels[:positions.shape[1]]
 
 
-def _guess(source: Path) -> str:
+def kind_of(source: Path) -> str:
+    """Return what a recording is, by its name and content."""
     if source.is_dir():
         if (source / "pull.toml").exists():
             return "pull"
@@ -186,18 +184,6 @@ def _guess(source: Path) -> str:
     moved = any(re.search(r"displacement|travel|stroke|deflection", name) for name in names)
     forced = any(re.search(r"force|load", name) for name in names)
     return "force-displacement" if moved and forced else "markers"
-
-
-def _digest(path: Path) -> str:
-    if path.is_file():
-        return file_digest(path)
-    import hashlib
-
-    joined = hashlib.sha256()
-    for file in sorted(path.rglob("*")):
-        if file.is_file():
-            joined.update(file.relative_to(path).as_posix().encode() + file_digest(file).encode())
-    return joined.hexdigest()
 
 
 def _import_force_table(source: Path, folder: Path, settings: ImportSettings, warn: Any,
@@ -220,7 +206,7 @@ def _import_force_table(source: Path, folder: Path, settings: ImportSettings, wa
 
 
 def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                   branch: Branch, warn: Any, progress: Progress) -> dict[str, Any]:
+                   branch: BranchFrame, warn: Any, progress: Progress) -> dict[str, Any]:
     if kind == "pull":
         shutil.copytree(source, folder, dirs_exist_ok=True)
         pull = read_pull(folder)
@@ -256,7 +242,7 @@ def _with_offset(pull: Pull, warn: Any) -> PullEntry:
 
 
 def _import_load(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                 branch: Branch, warn: Any) -> dict[str, Any]:
+                 branch: BranchFrame, warn: Any) -> dict[str, Any]:
     """A pull of a few frames from a recording of a branch that a steady load bends."""
     if kind not in ("markers", "c3d"):
         raise InputError(f"A steady load was given, but {source.name} is {kind}.",
@@ -278,7 +264,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
         rest, positions = placed.apply(rest), placed.apply(positions)
     for message in (*still.warnings, *(placed.warnings if placed else ())):
         warn(message)
-    _require_near(rest, name, branch)
+    _require_near(rest, name, branch.nodes)
     sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
     load = _load(settings, branch)
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
@@ -297,13 +283,12 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
             "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
 
 
-def _require_near(rest: np.ndarray, name: str, branch: Branch) -> None:
+def _require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
     """Refuse markers that lie elsewhere than the branch, as those of a capture's own frame do.
 
     Raises:
         InputError: one is farther from the mesh than a quarter of its extent.
     """
-    nodes = TetMesh.read(branch.require("mesh.vtu", "reconstruct")).nodes
     off = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in rest])
     extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
     if off.max() > 0.25 * extent:
@@ -328,24 +313,24 @@ def _against(moved: np.ndarray, load: np.ndarray) -> str:
             "branch's frame (--nominal), and does the load pull that way?")
 
 
-def _load(settings: ImportSettings, branch: Branch) -> np.ndarray:
+def _load(settings: ImportSettings, branch: BranchFrame) -> np.ndarray:
     """Force on the branch [N] in the branch's frame, shape [3]."""
     if settings.load is None:
         down = np.array(branch.gravity)
         return settings.weight * down / np.linalg.norm(down)
-    turn = np.array(branch.manifest.alignment.rotation)
+    turn = np.array(branch.alignment.rotation)
     return turn @ settings.load if settings.coordinates == "scan" else np.array(settings.load)
 
 
-def _place(point: tuple[float, float, float], settings: ImportSettings, branch: Branch,
+def _place(point: tuple[float, float, float], settings: ImportSettings, branch: BranchFrame,
            ) -> tuple[float, float, float]:
     """A point [m] of the user's frame in the branch's."""
     x, y, z = _in_branch(np.array([point]), settings, branch)[0]
     return float(x), float(y), float(z)
 
 
-def _in_branch(points: np.ndarray, settings: ImportSettings, branch: Branch) -> np.ndarray:
-    alignment = branch.manifest.alignment
+def _in_branch(points: np.ndarray, settings: ImportSettings, branch: BranchFrame) -> np.ndarray:
+    alignment = branch.alignment
     return alignment.apply(points / alignment.scale) if settings.coordinates == "scan" else points
 
 
@@ -356,7 +341,7 @@ def _markers(kind: str, source: Path, settings: ImportSettings) -> tuple[Stream,
 
 
 def _registered(rest: np.ndarray, labels: list[str], name: str, settings: ImportSettings,
-                branch: Branch) -> Registration | None:
+                branch: BranchFrame) -> Registration | None:
     if settings.nominal is None:
         return None
     known, nominal = read_nominal(Path(settings.nominal))
@@ -364,7 +349,7 @@ def _registered(rest: np.ndarray, labels: list[str], name: str, settings: Import
 
 
 def _assembled(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-               branch: Branch, progress: Progress) -> Pull:
+               branch: BranchFrame, progress: Progress) -> Pull:
     observations, rest, messages = None, None, []
     if kind in ("markers", "c3d"):
         stream, labels = _markers(kind, source, settings)
@@ -394,7 +379,7 @@ def _assembled(kind: str, source: Path, folder: Path, name: str, settings: Impor
     return Pull(name, entry, robot.times, poses, wrenches, observations, tuple(messages))
 
 
-def _entry(observation: Any, source: Path, settings: ImportSettings, branch: Branch,
+def _entry(observation: Any, source: Path, settings: ImportSettings, branch: BranchFrame,
            rest: np.ndarray | None, *, drive: Any, mode: Any, sigma: float,
            grasp: tuple[float, float, float]) -> PullEntry:
     return PullEntry(

@@ -15,8 +15,8 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.errors import InputError
+from limber.plain import plain
 from limber.recordings.streams import Stream, read_stream, write_stream
-from limber.store import plain
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 WRENCH_COLUMNS = ("fx_n", "fy_n", "fz_n", "tx_nm", "ty_nm", "tz_nm")

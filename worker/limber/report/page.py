@@ -47,18 +47,13 @@ class Section:
         self.pictures.append((_inline_png(_png(figure)), caption))
 
 
-def write_report(folder: Path, *, picture: Path | None = None, progress: Progress = SILENT,
-                 ) -> dict[str, Any]:
-    """Write ``report.html`` into a branch folder from whatever stages have been run.
+def draw_page(branch: Branch, *, picture: Path | None = None, progress: Progress = SILENT,
+              ) -> tuple[str, list[Section]]:
+    """Return the page of whatever stages a branch has, as HTML, and its sections.
 
     Args:
-        folder: The branch folder.
         picture: A render of the scene to put at the top, PNG.
-
-    Returns:
-        ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``.
     """
-    branch = Branch.open(folder)
     page = [_summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
         _scan, _mesh, *_pulls(branch), _estimate, *_simulations(branch), _energy,
@@ -66,15 +61,7 @@ def write_report(folder: Path, *, picture: Path | None = None, progress: Progres
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
-    html = _render(branch, page)
-    with branch.stage("report", {"picture": bool(picture)}) as stage:
-        stage.path("report.html").write_text(html, encoding="utf-8")
-        stage.result.update(
-            figure_count=sum(len(section.pictures) for section in page),
-            sections=[section.title for section in page if not section.missing],
-            missing=[section.title for section in page if section.missing])
-    progress(1.0, "written")
-    return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
+    return _render(branch, page), page
 
 
 def _summary(branch: Branch, picture: Path | None) -> Section:
@@ -162,7 +149,7 @@ def _estimate(branch: Branch) -> Section:
     if not branch.has("estimate.json"):
         section.missing = "limber estimate NAME.branch"
         return section
-    from limber.estimation import figures as estimation_figures
+    from limber.report import estimate_figures
 
     estimate = json.loads(branch.path("estimate.json").read_text(encoding="utf-8"))
     virtual = _virtual_result(branch)
@@ -178,7 +165,7 @@ def _estimate(branch: Branch) -> Section:
         f"Method: {estimate['method']}; {estimate['forward_count']} forward simulations; "
         f"loss {estimate['loss_m2']:.3g} m²; "
         f"{'converged' if estimate['converged'] else 'NOT converged'}.")
-    for figure, caption in estimation_figures.report_figures(branch, estimate):
+    for figure, caption in estimate_figures.report_figures(estimate):
         section.draw(figure, caption)
     section.text += estimate.get("warnings", [])
     return section
@@ -236,7 +223,7 @@ def _plans(branch: Branch) -> list[Callable[[Branch], Section]]:
 
 
 def _plan(branch: Branch, name: str) -> Section:
-    from limber.planning import figures as planning_figures
+    from limber.report import plan_figures
 
     section = Section(f"Paths: {name}")
     plan = json.loads(branch.path(f"plans/{name}.json").read_text(encoding="utf-8"))
@@ -245,7 +232,7 @@ def _plan(branch: Branch, name: str) -> Section:
     section.text.append(
         f"D-RRT* saves {plan['energy_saved_percent']:.1f} % of the energy along the path for "
         f"{plan['length_added_percent']:+.1f} % of length. Seed {plan['seed']}.")
-    for figure, caption in planning_figures.report_figures(branch, name):
+    for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
     return section
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from limber.errors import BranchFolderError
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.store import Branch, plain
+from limber.plain import plain
+from limber.store import Branch
 
 FORMAT = 1
 """Of the .npz file; the add-on refuses another one."""

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.state import ReducedSettings
 from limber.mechanics.reduced.training import TrainingSettings
 from limber.session.held import HeldBranch
 from limber.session.settings import SessionSettings
+from limber.stages.loading import load_model
 from limber.store import Branch
 
 
@@ -26,5 +26,5 @@ def load_held(folder: Path, settings: SessionSettings) -> HeldBranch:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
     """
     gravity = {} if settings.gravity else {"gravity": None}
-    model = BranchModel.from_branch(Branch.open(folder), **gravity)
+    model = load_model(Branch.open(folder), **gravity)
     return HeldBranch(model, np.zeros_like(model.mesh.nodes))

@@ -1,8 +1,7 @@
 """``limber estimate --follow``: read a pull while it is recorded, or replay one at its own pace."""
 
-import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from limber.estimation.online.exact import Beside, FullBranch, Here
 from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.preparation import Subject, forwards_of, pull_names, subject_of
+from limber.estimation.preparation import Subject, forwards_of
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import scaled_start
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, build_reduced
@@ -26,7 +25,6 @@ from limber.recordings.alignment import frames_of
 from limber.recordings.checks import clean
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import Observations, Pull, read_pull
-from limber.store import Branch, plain
 
 SAID = {
     "enough": "every modulus is known to 2 %; another pull would add nothing that matters.",
@@ -42,30 +40,32 @@ PRIOR_DEVIATION = 0.4
 """Of log E around what the reduced model was built for: it knows no more than twice or half."""
 
 
-def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
-           progress: Progress = SILENT, warn: Callable[[str], None] = lambda text: None,
-           training_count: int = 60) -> dict[str, Any]:
-    """Estimate frame by frame from the first pull that is named (or the only one).
+def follow(folder: Path, name: str, subject: Subject, settings: EstimateSettings, *,
+           axes: Path | None = None, pace: float = 1.0, training_count: int = 60,
+           progress: Progress = SILENT) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Estimate frame by frame from the pull in ``folder``.
 
     A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
     replayed at ``pace`` times its own speed (0: as fast as it goes). The full model corrects the
-    reduced one from a second process; when the pull is over it is waited for. Writes
-    ``estimate-online.json`` with the estimate after every frame; `limber estimate` afterwards
-    gives the final word.
+    reduced one from a second process; when the pull is over it is waited for.
+
+    Args:
+        folder: The pull's.
+        name: What it is called in messages.
+        axes: The table of cylinders that were fitted to the scan, or None.
+
+    Returns:
+        The result, and the estimate after every frame.
 
     Raises:
-        InputError: no such pull, or one without markers.
+        InputError: a pull without markers or without frames.
     """
-    branch = Branch.open(branch_folder)
-    name = _name(branch, settings)
-    subject = subject_of(branch, settings)
-    folder = branch.path(f"pulls/{name}")
     size = _size(folder)
     first = read_pull(folder)
     if first.observations is None:
         raise InputError(f"{name} has images.", "They are tracked when the pull is over.",
                          "Follow a pull with markers, or run `limber estimate` afterwards.")
-    begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count, warn)
+    begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count)
     if _size(folder) != size:
         # It is being recorded now: what has been missed is caught up with.
         pace = np.inf
@@ -84,7 +84,7 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
                          enough=latest.enough)
                 for kind, is_so in (("enough", latest.enough), ("idle", latest.idle)):
                     if is_so and kind not in told:
-                        warn(f"{name}: {frame.time:.2f} s: {SAID[kind]}")
+                        progress.warn(f"{name}: {frame.time:.2f} s: {SAID[kind]}")
                         told.add(kind)
             progress(0.95, "waiting for the full model")
             settled = estimator.settle()
@@ -93,36 +93,25 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
             if not states:
                 raise
             stopped = True
-            warn(f"Stopped at {states[-1].time:.2f} s; what was known then is kept.")
+            progress.warn(f"Stopped at {states[-1].time:.2f} s; what was known then is kept.")
     if not states:
         raise InputError(f"{name} has no frames.", "Nothing could be followed.", "Record a pull.")
     if estimator.refresh_count:
-        warn(f"{name}: the moduli left what the reduced model knew; it was made again "
+        progress.warn(f"{name}: the moduli left what the reduced model knew; it was made again "
              f"{estimator.refresh_count} times on the way.")
-    result = _result(name, states, slowest) | _with_radii(branch, subject, states[-1]) | {
+    result = _result(name, states, slowest) | _with_radii(axes, subject, states[-1]) | {
         "frame_count": estimator.frame_count, "stopped": stopped,
         "model_error": estimator.model_error, "refresh_count": estimator.refresh_count}
-    with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
-        stage.path("estimate-online.json").write_text(
-            json.dumps(plain(result | _history(states)), indent=1), encoding="utf-8")
-        stage.result.update(result)
-    return stage.result
+    return result, _history(states)
 
 
-def _with_radii(branch: Branch, subject: Subject, last: OnlineState) -> dict[str, Any]:
+def _with_radii(axes: Path | None, subject: Subject, last: OnlineState) -> dict[str, Any]:
     """The last interval together with what the scan's radii leave open, as an estimate's."""
-    if not branch.has("skeleton.csv"):
+    if axes is None:
         return {}
-    radii = geometry_error(branch.path("skeleton.csv"), subject.mesh, subject.weights)
+    radii = geometry_error(axes, subject.mesh, subject.weights)
     return {"young_interval_sensor_pa": last.interval, "young_interval_pa": total_interval(
         last.young, last.interval, ModelError(geometry=radii))}
-
-
-def _name(branch: Branch, settings: EstimateSettings) -> str:
-    """The pull to follow; one that a recorder writes is not in the branch's manifest."""
-    if settings.pull and (branch.folder / "pulls" / settings.pull[0] / "pull.toml").is_file():
-        return settings.pull[0]
-    return pull_names(branch, settings)[0]
 
 
 @dataclass(frozen=True)
@@ -151,7 +140,7 @@ class Begun:
 
 
 def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Progress,
-          training_count: int, warn: Callable[[str], None] = lambda text: None) -> Begun:
+          training_count: int) -> Begun:
     """Make the reduced model around what is known: an earlier estimate, or a rough fit.
 
     A basis knows moduli within its training's spread; around a uniform guess that spread would
@@ -167,8 +156,9 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
         rough = _rough(pull, subject, settings)
         if rough is None:
             deviation, spread = BLIND_DEVIATION, 4.0
-            warn(f"{pull.name}: nothing has moved yet. The reduced model is made around "
-                 f"E = {start.young[0] / 1e6:.3g} MPa throughout (--young gives another).")
+            progress.warn(
+                f"{pull.name}: nothing has moved yet. The reduced model is made around "
+                f"E = {start.young[0] / 1e6:.3g} MPa throughout (--young gives another).")
         else:
             start = rough
     gravity = pull.entry.gravity_m_s2 or (0.0, 0.0, 0.0)
@@ -248,7 +238,7 @@ def _result(name: str, states: list[OnlineState], slowest: float) -> dict[str, A
             "untrusted_frames": sum(not state.trusted for state in states)}
 
 
-def _history(states: list[OnlineState]) -> dict[str, Any]:
-    return {"history": [{"time_s": state.time, "young_pa": state.young,
+def _history(states: list[OnlineState]) -> list[dict[str, Any]]:
+    return [{"time_s": state.time, "young_pa": state.young,
                          "young_interval_pa": state.interval, "residual": state.residual,
-                         "enough": state.enough, "idle": state.idle} for state in states]}
+                         "enough": state.enough, "idle": state.idle} for state in states]

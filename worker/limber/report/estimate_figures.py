@@ -7,17 +7,15 @@ import numpy as np
 
 from limber.estimation.identifiability import UNRESOLVED_DEVIATION
 from limber.estimation.uncertainty import OUTLIER
-from limber.store import Branch
 
 OBSERVED, SIMULATED, TRUE = "#222222", "#2a6fb0", "#c0602a"
 
 
-def report_figures(branch: Branch, estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
+def report_figures(estimate: dict[str, Any]) -> Iterator[tuple[Any, str]]:
     """Yield each figure (matplotlib) of ``estimate.json`` with its caption.
 
     Args:
-        branch: The opened branch folder.
-        estimate: Content of its ``estimate.json``.
+        estimate: Content of a branch's ``estimate.json``.
     """
     yield (young_along_branch(estimate), _interval_caption(estimate))
     yield (what_the_pulls_tell(estimate),

@@ -1,0 +1,49 @@
+"""The process that has bpy and makes a scene: the add-on's ``make_scene.py`` on prepared data.
+
+The core never imports bpy: the ``bpy`` package in this Python, or a Blender program, runs it.
+"""
+
+import importlib.util
+import os
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from limber.errors import MissingDependencyError
+from limber.progress import Progress
+
+_SCRIPT = Path(__file__).parents[3] / "addon" / "make_scene.py"
+
+
+def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
+    """Run the script with ``arguments``; returns what it made and with which Blender."""
+    from limber.jobs.process import run_json_process
+
+    progress(0.0, "starting Blender")
+    result = run_json_process("scene", [*blender_command(), "--", *map(str, arguments)], progress,
+                              fix="`limber doctor` says which Blender was used.")
+    return {key: result[key] for key in ("object_count", "frame_count", "blender")}
+
+
+def blender_command() -> list[str]:
+    """Return the command that runs the add-on's script in a process with bpy.
+
+    Raises:
+        MissingDependencyError: neither the bpy package nor a Blender is there.
+    """
+    if not _SCRIPT.is_file():
+        raise MissingDependencyError(
+            f"The add-on's {_SCRIPT.name} is not beside the worker.",
+            "`limber scene` needs it.", "Run from a checkout of the project.")
+    named = os.environ.get("LIMBER_SCENE_BLENDER")
+    if named is None and importlib.util.find_spec("bpy") is not None:
+        return [sys.executable, str(_SCRIPT)]
+    blender = named or os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
+    if not blender:
+        raise MissingDependencyError(
+            "There is no bpy package in this Python and no Blender was found.",
+            "A scene needs one of them.",
+            "Install bpy (pip install 'limber[blender]'), or set LIMBER_BLENDER to a Blender.")
+    return [blender, "--background", "--factory-startup", "--python-exit-code", "3",
+            "--python", str(_SCRIPT)]

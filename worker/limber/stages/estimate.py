@@ -1,0 +1,150 @@
+"""Young's modulus along the branch, from pulls."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import Cancelled, LimberError
+from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.fit import (
+    Estimate,
+    details,
+    fit_branch,
+    foretell,
+    judge_model,
+    summary,
+)
+from limber.estimation.online.follow import follow as follow_pull
+from limber.estimation.preparation import Subject
+from limber.estimation.settings import EstimateSettings
+from limber.geometry.cloud.cloud import read_cloud
+from limber.plain import plain
+from limber.progress import SILENT, Progress
+from limber.stages.loading import (
+    known_pulls,
+    load_pulls,
+    load_subject,
+    pull_names,
+    pulls_digest,
+)
+from limber.store import Branch
+
+EVALUATIONS = ".estimate-evaluations.jsonl"
+"""Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
+
+
+def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
+             progress: Progress = SILENT) -> dict[str, Any]:
+    """Estimate Young's modulus from the pulls of a branch folder.
+
+    Writes ``estimate.json`` and the modulus into ``mesh.vtu``. Stopped by Ctrl-C it keeps the
+    best so far in ``estimate.json`` (``converged`` is then false); run again, it resumes.
+
+    Returns:
+        DESIGN's keys and ``warnings``.
+
+    Raises:
+        InputError: no pulls, or pulls that cannot tell Young's modulus.
+        WorkError: the simulation finds no equilibrium.
+        Cancelled: after the best so far was kept.
+    """
+    branch = Branch.open(branch_folder)
+    names = pull_names(branch, settings)
+    subject = load_subject(branch, settings)
+    digests = {"mesh geometry": subject.mesh.geometry_digest(),
+               "pulls": pulls_digest(branch, names)}
+    if not force and branch.is_current("estimate", settings, digests=digests):
+        stored = branch.manifest.stages["estimate"].result
+        if not stored.get("stopped"):
+            return stored
+    warnings: list[str] = []
+    heard = progress.keeping(warnings)
+    pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
+    log_path = branch.folder / EVALUATIONS
+    if force:
+        log_path.unlink(missing_ok=True)
+    log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
+    found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
+                       digest=json.dumps(digests, sort_keys=True),
+                       progress=heard.part(0.2, 0.9))
+    found.warnings = warnings
+    if not found.stopped:
+        judge_model(found, subject, pulls[0].entry.grasp, settings,
+                    axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None,
+                    cloud=_cloud(branch), progress=heard.part(0.9, 0.98))
+        if settings.hold_out:
+            _foretell_others(branch, names, subject, found, settings, heard)
+    result = summary(found, settings)
+    earlier = branch.manifest.stages.get("estimate")
+    if found.stopped and earlier is not None and not earlier.result.get("stopped"):
+        raise Cancelled("The estimate was stopped.",
+                        "The finished estimate of an earlier run is kept.",
+                        "Run it again when there is time for it.")
+    with branch.stage("estimate", settings, digests=digests) as stage:
+        full = result | details(found, subject, pulls)
+        stage.path("estimate.json").write_text(
+            json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        if not found.stopped:
+            subject.mesh.with_data(cell_data={
+                "young": subject.weights @ found.values.young,
+                "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
+                "density": np.full(subject.mesh.tet_count, found.values.density),
+            }).write(stage.path("mesh.vtu"))
+        stage.result.update(result)
+    if found.stopped:
+        raise Cancelled("The estimate was stopped.",
+                        f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
+                        "estimate.json, not in the mesh.", "Run it again to resume.")
+    log.forget()
+    return stage.result
+
+
+def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
+           training_count: int = 60, progress: Progress = SILENT) -> dict[str, Any]:
+    """Estimate frame by frame from the first pull that is named (or the only one).
+
+    A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
+    replayed at ``pace`` times its own speed (0: as fast as it goes). Writes
+    ``estimate-online.json`` with the estimate after every frame; `limber estimate` afterwards
+    gives the final word.
+
+    Raises:
+        InputError: no such pull, or one without markers.
+    """
+    branch = Branch.open(branch_folder)
+    name = _followed(branch, settings)
+    subject = load_subject(branch, settings)
+    result, history = follow_pull(
+        branch.path(f"pulls/{name}"), name, subject, settings, pace=pace,
+        training_count=training_count, progress=progress,
+        axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
+    with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
+        stage.path("estimate-online.json").write_text(
+            json.dumps(plain(result | {"history": history}), indent=1), encoding="utf-8")
+        stage.result.update(result)
+    return stage.result
+
+
+def _followed(branch: Branch, settings: EstimateSettings) -> str:
+    """The pull to follow; one that a recorder writes is not in the branch's manifest."""
+    if settings.pull and (branch.folder / "pulls" / settings.pull[0] / "pull.toml").is_file():
+        return settings.pull[0]
+    return pull_names(branch, settings)[0]
+
+
+def _cloud(branch: Branch) -> np.ndarray | None:
+    return read_cloud(branch.path("cloud.ply")).points if branch.has("cloud.ply") else None
+
+
+def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
+                     settings: EstimateSettings, progress: Progress) -> None:
+    """Score the branch's pulls that this estimate was not asked to use."""
+    for name in [name for name in known_pulls(branch) if name not in names]:
+        try:
+            pull = load_pulls(branch, [name], subject, settings)[0]
+            foretell(pull, subject, found, settings)
+        except LimberError as error:
+            progress.warn(
+                f"{name}, which the estimate did not use, could not be scored: {error}")

@@ -1,0 +1,63 @@
+"""Bring a recording of a pull into the branch folder."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from limber.errors import InputError
+from limber.files import file_digest
+from limber.progress import SILENT, Progress
+from limber.recordings.importing import BranchFrame, ImportSettings, import_recording, kind_of
+from limber.stages.loading import load_mesh
+from limber.store import Branch
+
+
+def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
+                force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Bring a recording into ``pulls/NAME`` of a branch folder.
+
+    Returns:
+        ``pull``, ``kind`` and what :func:`limber.recordings.importing.import_recording` found.
+
+    Raises:
+        InputError: SOURCE cannot be read as what it is said to be.
+    """
+    source = Path(source)
+    if not source.exists():
+        raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
+    kind = kind_of(source) if settings.kind == "auto" else settings.kind
+    branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
+    key, digests = f"pull:{name}", {"source": _digest(source)}
+    for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
+                          ("yolo", settings.yolo_weights)):
+        if named and Path(named).is_file():
+            digests[key_of] = _digest(Path(named))
+    if not force and branch.is_current(key, settings, digests=digests):
+        return branch.manifest.stages[key].result
+    with branch.stage(key, settings, digests=digests) as stage:
+        prefix = f"pulls/{name}/"
+        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+            stage.remove(old)
+        folder = stage.path(prefix + "pull.toml").parent
+        stage.result.update(import_recording(kind, source, folder, name, settings,
+                                             _frame(branch, kind, settings), progress))
+        stage.result |= {"pull": name, "kind": kind}
+    return stage.result
+
+
+def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:
+    if kind == "force-displacement":
+        return BranchFrame()
+    loaded = settings.weight is not None or settings.load is not None
+    return BranchFrame(branch.manifest.alignment, branch.gravity,
+                       load_mesh(branch).nodes if loaded else None)
+
+
+def _digest(path: Path) -> str:
+    if path.is_file():
+        return file_digest(path)
+    joined = hashlib.sha256()
+    for file in sorted(path.rglob("*")):
+        if file.is_file():
+            joined.update(file.relative_to(path).as_posix().encode() + file_digest(file).encode())
+    return joined.hexdigest()

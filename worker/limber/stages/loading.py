@@ -1,0 +1,135 @@
+"""What stages read from a branch folder, as the values that the packages below take.
+
+The packages know no folder: whatever of a branch's mesh, masses, axes and pulls goes into a
+computation comes through here.
+"""
+
+import hashlib
+import json
+
+from limber.errors import InputError
+from limber.estimation.preparation import Subject, observed, subject_of
+from limber.estimation.settings import EstimateSettings
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.model import BranchModel, PointMass
+from limber.planning.grasp_model import GraspModel, grasp_model_of
+from limber.progress import SILENT, Progress
+from limber.recordings.checks import clean
+from limber.recordings.recording import Pull, read_pull
+from limber.store import Branch
+
+
+def load_mesh(branch: Branch) -> TetMesh:
+    """Return the branch's tetrahedra.
+
+    Raises:
+        BranchFolderError: there is no mesh.
+    """
+    return TetMesh.read(branch.require("mesh.vtu", "reconstruct"))
+
+
+def load_skeleton(branch: Branch) -> Skeleton:
+    """Return the branch's axes.
+
+    Raises:
+        BranchFolderError: there is no skeleton.
+    """
+    return Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
+
+
+def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
+    """Return the twigs that a folder's mesh leaves out, as masses where they were attached."""
+    if not branch.has("point_masses.json"):
+        return ()
+    masses = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
+    return tuple(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses)
+
+
+def load_model(branch: Branch, **overrides: object) -> BranchModel:
+    """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for BranchModel.
+
+    Gravity acts as it did on the scan, which the upright turn has turned with the branch;
+    twigs that the mesh leaves out hang on it as masses.
+
+    Raises:
+        BranchFolderError: there is no mesh. InputError: it lacks material data.
+    """
+    mesh = load_mesh(branch)
+    values = {}
+    for name in ("young", "poisson", "density"):
+        value = overrides.pop(name, None)
+        if value is None and name not in mesh.cell_data:
+            raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
+                             "The material is not known.", "Reconstruct again.")
+        values[name] = mesh.cell_data[name] if value is None else value
+    known = {"gravity": branch.gravity, "point_masses": load_point_masses(branch)}
+    return BranchModel(mesh, **values, **{**known, **overrides})
+
+
+def load_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
+    """Return what planning asks of a branch: :func:`limber.planning.grasp_model.grasp_model_of`.
+
+    Raises:
+        BranchFolderError: a file is missing.
+        WorkError: the mesh marks no material, or the branch cannot bear its weight.
+    """
+    return grasp_model_of(load_mesh(branch), load_skeleton(branch),
+                          branch.gravity if gravity else None, load_point_masses(branch))
+
+
+def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
+    """Return the branch that is estimated; the start is uniform.
+
+    Raises:
+        BranchFolderError: a file is missing. InputError: its moduli are not positive.
+    """
+    return subject_of(load_mesh(branch), load_skeleton(branch), load_point_masses(branch), settings)
+
+
+def known_pulls(branch: Branch) -> list[str]:
+    """Return the names of the branch's pulls, sorted."""
+    return [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
+
+
+def pull_names(branch: Branch, settings: EstimateSettings) -> list[str]:
+    """Return the pulls to use, checked.
+
+    Raises:
+        InputError: there are none, or one that was asked for is missing.
+    """
+    known = known_pulls(branch)
+    missing = [name for name in settings.pull if name not in known]
+    if missing or not known:
+        raise InputError(
+            f"{branch.folder} has no pull {', '.join(missing)}." if missing
+            else f"{branch.folder} has no pulls.",
+            f"It has {', '.join(known)}." if known else "There is nothing to estimate from.",
+            "Bring one in with `limber import-pull`, or simulate one with `limber virtual-pull`.")
+    return list(settings.pull) or known
+
+
+def pulls_digest(branch: Branch, names: list[str]) -> str:
+    """Return a sha256 of all files of these pulls."""
+    joined = hashlib.sha256()
+    for file in sorted(branch.manifest.files):
+        if any(file.startswith(f"pulls/{name}/") for name in names):
+            joined.update(f"{file} {branch.digest(file)}\n".encode())
+    return joined.hexdigest()
+
+
+def load_pulls(branch: Branch, names: list[str], subject: Subject, settings: EstimateSettings,
+               progress: Progress = SILENT) -> list[Pull]:
+    """Read and clean pulls; find control points in their images where there are no markers."""
+    pulls = []
+    for number, name in enumerate(names):
+        folder = branch.path(f"pulls/{name}")
+        pull = read_pull(folder)
+        if pull.entry.observation in ("clouds", "depth"):
+            pull = observed(folder, pull, subject, settings,
+                            progress.part(number / len(names), (number + 1) / len(names)))
+        pull = clean(pull)
+        for message in pull.warnings:
+            progress.warn(message)
+        pulls.append(pull)
+    return pulls

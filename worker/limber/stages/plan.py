@@ -1,0 +1,110 @@
+"""Paths to a goal: RRT* and deformation-aware D-RRT*, compared.
+
+The field serves to search. Every energy, force and strain that is reported comes from the finite
+elements along the found paths; how far the field was off is reported beside them.
+"""
+
+import csv
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import BranchFolderError, InputError
+from limber.mechanics.frames import write_pc2
+from limber.plain import plain
+from limber.planning.compare import PlanSettings
+from limber.planning.field import EnergyField
+from limber.planning.grasp_model import GraspModel
+from limber.planning.objective import arc_lengths
+from limber.planning.plan import PlannedMotion, plan_motion
+from limber.planning.resolve import ResolvedPath
+from limber.planning.sampling import energy_inputs
+from limber.progress import SILENT, Progress
+from limber.scene.data import at_nodes
+from limber.stages.loading import load_grasp_model
+from limber.store import Branch, Stage
+
+_FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
+_COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
+            "strain")
+
+
+def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: int = 2,
+         force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Plan paths on the branch's energy field.
+
+    Writes ``plans/NAME.json``, two csv files and the frames.
+
+    Raises:
+        BranchFolderError: no energy field, or one of another geometry or material.
+        InputError: a name that is none, a start that is not allowed, or two goals.
+        NoPathError: no path; the message says why.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith("-baseline"):
+        raise InputError(f"--name {name!r} cannot name a plan.",
+                         "It becomes part of file names, and -baseline is the other path's.",
+                         "Use letters, digits, dash, dot and underscore.")
+    branch = Branch.open(folder)
+    field_path = branch.require("energy.npz", "energy")
+    energy_stage = branch.manifest.stages["energy"]
+    grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]))
+    digests = energy_inputs(grasp_model)
+    if energy_stage.reads != digests:
+        raise BranchFolderError(
+            "The energy field is of another mesh or another Young's modulus.",
+            "The branch was reconstructed or estimated anew since `limber energy` ran.",
+            "Run `limber energy` again.")
+    key = f"plan:{name}"
+    inputs = {"reads": ["energy.npz"], "digests": digests}
+    if not force and branch.is_current(key, settings, **inputs):
+        return branch.manifest.stages[key].result
+    with branch.stage(key, settings, **inputs) as stage:
+        field = EnergyField.read(field_path)
+        found = plan_motion(field, grasp_model, settings, workers=workers, progress=progress)
+        progress(0.95, "writing")
+        _write(stage, name, grasp_model, field, found)
+        stage.result.update(found.summary)
+    progress(1.0, "planned")
+    return branch.manifest.stages[key].result
+
+
+def _write(stage: Stage, name: str, grasp_model: GraspModel, field: EnergyField,
+           found: PlannedMotion) -> None:
+    detailed = dict(found.summary)
+    baseline, plan = found.baseline, found.plan
+    for key, path in (("baseline", baseline), ("plan", plan)):
+        detailed[key] = found.summary[key] | {
+            "poses": path.poses, "energies_j": path.energies, "forces_n": path.forces,
+            "strains": path.strains, "tips_m": path.tips,
+            "field_energies_j": field.energy(path.poses[:, :3])}
+    stage.path(f"plans/{name}.json").write_text(
+        json.dumps(plain(detailed), allow_nan=False, indent=1) + "\n", encoding="utf-8")
+    stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
+    stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
+    vertices = np.unique(grasp_model.mesh.surface_faces())
+    frames = grasp_model.mesh.nodes[vertices] + plan.displacements[:, vertices]
+    write_pc2(stage.path(f"frames/{name}.pc2"), frames, 0.0, 1.0)
+    stage.path(f"frames/{name}.json").write_text(json.dumps(plain({
+        "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
+        "energies_j": plan.energies, "forces_n": plan.forces, "path": name})) + "\n",
+        encoding="utf-8")
+    # What the scene can colour the surface by, at the vertices and in the order of the frames.
+    model, mesh = grasp_model.model, grasp_model.mesh
+    densities = [at_nodes(mesh, model.internal(u).tet_energy / mesh.volumes)[vertices]
+                 for u in plan.displacements]
+    np.savez_compressed(stage.path(f"frames/{name}.npz"),
+                        strain_energy_density_j_m3=np.array(densities, np.float32))
+
+
+def _table(path: ResolvedPath) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    along = arc_lengths(path.poses[:, :3])
+    rows = np.column_stack([along, path.poses, path.energies, path.forces, path.strains])
+    writer.writerows([f"{value:.9g}" for value in row] for row in rows)
+    return text.getvalue()

@@ -1,0 +1,62 @@
+"""A Blender scene with the branch, its motion and paths."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from limber.errors import InputError, WorkError
+from limber.progress import SILENT, Progress
+from limber.scene.blender import make_scene
+from limber.scene.data import scene_data
+from limber.store import Branch
+
+
+def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | None = None,
+          width: int = 1120, color: str = "young", plan: str | None = None,
+          data_path: Path | None = None, progress: Progress = SILENT) -> dict[str, Any]:
+    """Make a Blender scene of a branch, or only what it shows, as arrays.
+
+    Args:
+        branch_folder: With a mesh.
+        output: The .blend to write.
+        picture: A PNG to render of the end of the path, or None.
+        width: Of the picture [pixels].
+        color: What the branch's colours mean: ``young`` or ``strain_energy``.
+        plan: Which path to show; default the newest.
+        data_path: The .npz to write instead of ``output``.
+
+    Raises:
+        InputError: not one of output and data, or nothing to show.
+        WorkError: Blender failed.
+    """
+    if (output is None) == (data_path is None):
+        raise InputError("Neither or both of --output and --data were given.",
+                         "One says what to make.", "Give -o scene.blend.")
+    progress(0.0, "reading the branch folder")
+    data = scene_data(Branch.open(branch_folder), plan)
+    if color not in data.info["scalars"]:
+        raise InputError(f"The branch has no {color} to show.", "", "Run `limber plan` first.")
+    if data_path is not None:
+        data.write(_writable(data_path))
+        return {"data": data_path, "vertex_count": len(data.arrays["vertices"])}
+    with tempfile.TemporaryDirectory(prefix="limber-scene-") as temporary:
+        prepared = Path(temporary) / "scene.npz"
+        data.write(prepared)
+        arguments = ["--data", prepared, "--scene", _writable(output), "--color", color]
+        if picture is not None:
+            arguments += ["--picture", _writable(picture), "--width", width]
+        result = make_scene(arguments, progress.part(0.1, 1.0))
+    if not output.is_file():
+        raise WorkError(f"Blender ended well but wrote no {output}.", "",
+                        "`limber doctor` says which Blender was used.")
+    return result | {"scene": output, "picture": picture}
+
+
+def _writable(path: Path) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            return path.resolve()
+    except OSError as error:
+        raise InputError(f"{path.parent} cannot be written to ({error.strerror}).",
+                         "The result goes there.", "Choose another place.") from error

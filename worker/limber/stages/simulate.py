@@ -1,0 +1,112 @@
+"""Pull a branch by a pose or a force; writes motion, energy and forces."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import ConvergenceError
+from limber.files import write_atomically
+from limber.mechanics.dynamics.pull import Motion
+from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
+from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.model import BranchModel
+from limber.mechanics.pose_table import PoseTable
+from limber.mechanics.simulate import (
+    SimulateSettings,
+    largest_strains,
+    loaded_model,
+    motion_of,
+    pull_of,
+    require_one_drive,
+)
+from limber.progress import SILENT, Progress
+from limber.stages.loading import load_model
+from limber.store import Branch, Stage
+
+KEY = "simulate"
+
+
+def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
+             along: PoseTable | None = None, force: bool = False,
+             progress: Progress = SILENT) -> dict[str, Any]:
+    """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
+
+    Args:
+        branch_folder: With a mesh.
+        settings: How to pull.
+        along: The grasp's way instead of a motion of the settings.
+
+    Returns:
+        The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
+        ``grasp_force_n``, ``tip_displacement_m``, ``min_det_f``.
+
+    Raises:
+        InputError: options that do not fit. ConvergenceError: the branch could not follow; the
+            frames up to there are written.
+    """
+    branch = Branch.open(branch_folder)
+    branch.require("mesh.vtu", "reconstruct")
+    require_one_drive(settings, along)
+    digests = {"along": along.digest()} if along else {}
+    stored = branch.manifest.stages.get(KEY)
+    if not force and stored and stored.result.get("converged") and branch.is_current(
+            KEY, settings, reads=["mesh.vtu"], digests=digests):
+        return stored.result
+    progress(0.0, "preparing")
+    scanned = _scanned_model(branch, settings)
+    model = loaded_model(scanned, settings, progress.part(0.0, 0.2))
+    pull = pull_of(model, scanned.mesh, settings, along)
+    motion = motion_of(pull, settings, progress.part(0.2, 0.9))
+    for message in motion.warnings:
+        progress.warn(message)
+    with branch.stage(KEY, settings, reads=["mesh.vtu"], digests=digests) as stage:
+        result = _write(stage, pull.model, settings, motion)
+        stage.result.update(result)
+    progress(1.0, "done")
+    if not motion.converged:
+        raise ConvergenceError(
+            f"The branch could not follow: {motion.message}",
+            f"{result['frame_count']} frames up to the last good state are in"
+            f" frames/{settings.name}.pc2; there the grasp force is {result['grasp_force_n']} N.",
+            "Pull less far, or check units and Young's modulus.")
+    return result
+
+
+def _scanned_model(branch: Branch, settings: SimulateSettings) -> BranchModel:
+    gravity = branch.gravity if settings.gravity else None
+    return load_model(
+        branch, young=settings.young, material=settings.material, gravity=gravity,
+        lumped_mass=settings.lumped_mass,
+        damping=RayleighDamping(settings.damping_mass, settings.damping_stiffness))
+
+
+def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
+           motion: Motion) -> dict[str, Any]:
+    displacement = motion.displacement
+    nodes = surface_nodes(model.mesh)
+    write_pc2(stage.path(f"frames/{settings.name}.pc2"),
+              model.mesh.nodes[nodes] + displacement[:, nodes])
+    if settings.vtu:
+        folder = stage.path(f"frames/{settings.name}/{settings.name}.pvd").parent
+        write_pvd_series(folder, settings.name, model, motion.times, displacement)
+    tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
+                             axis=1).argmax())
+    strain, stress = largest_strains(model, displacement)
+    frames = {
+        "frame_count": len(displacement), "rate": settings.frame_rate,
+        "times_s": motion.times.tolist(), "energies_j": motion.energy.tolist(),
+        "kinetic_energies_j": motion.kinetic_energy.tolist(),
+        "grasp_forces_n": motion.grasp_force.tolist(),
+        "grasp_torques_nm": motion.grasp_torque.tolist(),
+        "hold_forces_n": motion.hold_forces.tolist(), "min_det_f": motion.min_det_f.tolist(),
+        "converged": motion.converged,
+        "largest_principal_strains": strain, "largest_principal_stresses_pa": stress}
+    write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
+    return {
+        "converged": motion.converged, "frame_count": len(displacement),
+        "energy_j": float(motion.energy[-1]),
+        "grasp_force_n": motion.grasp_force[-1].tolist(),
+        "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
+        "min_det_f": float(motion.min_det_f.min())}

@@ -1,0 +1,73 @@
+"""Simulate a pull with a known Young's modulus and sensor noise."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.constants import GRAVITY
+from limber.estimation.virtual_pull import (
+    TrueBranch,
+    VirtualPullSettings,
+    simulate_pull,
+    true_branch,
+    write_depth_frames,
+)
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.progress import SILENT, Progress
+from limber.recordings.recording import write_pull
+from limber.store import Branch
+
+
+def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
+                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+    """Simulate a pull of a branch and write it as ``pulls/NAME``.
+
+    Returns:
+        ``pull``, ``young_true_pa``, ``control_points_m``, ``frame_count``, ``tet_count`` of the
+        truth's mesh, ``peak_force_n``, ``travel_m``.
+
+    Raises:
+        InputError: the branch has no skeleton, or the settings do not fit it.
+        WorkError: the branch cannot be pulled like that.
+    """
+    branch = Branch.open(branch_folder)
+    branch.require("skeleton.swc", "reconstruct")
+    key = f"pull:{name}"
+    reads = [file for file in ("skeleton.swc", "truth/skeleton.swc", "truth/truth.json")
+             if branch.has(file)]
+    if not force and branch.is_current(key, settings, reads=reads):
+        return branch.manifest.stages[key].result
+    progress(0.02, "meshing the true branch")
+    truth = _truth(branch, settings)
+    with branch.stage(key, settings, reads=reads) as stage:
+        prefix = f"pulls/{name}/"
+        for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
+            stage.remove(old)
+        folder = stage.path(prefix + "pull.toml").parent
+        pull, displacements = simulate_pull(truth, name, settings, progress=progress.part(0.1, 0.9))
+        write_pull(folder, pull)
+        if settings.camera:
+            write_depth_frames(folder, truth, pull, displacements, settings)
+        reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
+        stage.result.update({
+            "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
+            "fractions": truth.fractions, "frame_count": len(pull.times),
+            "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
+            "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
+    return stage.result
+
+
+def _truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
+    """The truth of a branch folder: that of its generator, or its own skeleton's."""
+    known: dict[str, Any] = {}
+    where = "skeleton.swc"
+    if branch.has("truth/truth.json"):
+        told = json.loads(branch.path("truth/truth.json").read_text(encoding="utf-8"))
+        known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
+        where = "truth/skeleton.swc"
+    made = branch.manifest.stages.get("reconstruct")
+    # An upright turn of the scan turns gravity with it.
+    gravity = tuple((made.result.get("gravity_m_s2") if made else None) or GRAVITY)
+    return true_branch(Skeleton.read_swc(branch.path(where)), settings, gravity=gravity, **known)
