@@ -14,14 +14,11 @@ from limber.errors import InputError
 from limber.perception.camera import D455, read_camera, write_camera
 from limber.perception.masks import read_mask
 from limber.perception.observe import list_frames, read_depth, write_depth
-from limber.recordings.importing import (
-    ImportSettings,
-    import_pull,
-    markers_from_c3d,
-)
+from limber.recordings.importing import ImportSettings, markers_from_c3d
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.registration import rigid_fit
 from limber.recordings.streams import Stream, read_stream, write_stream
+from limber.stages.import_pull import import_pull
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 

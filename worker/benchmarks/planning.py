@@ -29,13 +29,9 @@ from limber.planning.grasp_model import GraspModel, Reach
 from limber.planning.objective import measure_path
 from limber.planning.ompl_engine import ompl_missing
 from limber.planning.resolve import resolve_path
-from limber.planning.sampling import (
-    EnergySettings,
-    sample_branch,
-    sample_positions,
-    without_taut,
-)
+from limber.planning.sampling import sample_branch, sample_positions, without_taut
 from limber.progress import Progress
+from limber.stages.energy import EnergySettings
 
 _PAPER_SAVED, _PAPER_ADDED = 35.69, 8.10  # percent, means over the paper's three branches
 
