@@ -74,19 +74,16 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
     """
     before = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
 
-    class StopsAfter(Progress):
-        calls = 0
+    calls = 0
 
-        def part(self, _start, _stop):
-            return self
-
-        def __call__(self, _fraction, message="", **_numbers):
-            StopsAfter.calls += message == "fitting"
-            if StopsAfter.calls >= 4:
-                raise Cancelled
+    def stop_at_the_fourth(_fraction, message, _numbers):
+        nonlocal calls
+        calls += message == "fitting"
+        if calls >= 4:
+            raise Cancelled
 
     with pytest.raises(Cancelled, match="resume"):
-        estimate(branch_folder, QUICK, progress=StopsAfter())
+        estimate(branch_folder, QUICK, progress=Progress(stop_at_the_fourth))
     kept = json.loads((branch_folder / "estimate.json").read_text())
     assert kept["stopped"] and not kept["converged"]
     assert np.array_equal(TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"], before)
