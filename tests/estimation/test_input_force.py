@@ -15,9 +15,9 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import VirtualPullSettings, simulate_pull
 from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.grasp import rotation_matrix
+from limber.mechanics.points import point_operator
 from limber.recordings.alignment import frames_of
 from limber.recordings.grasping import grasp_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import GraspEntry
 
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])

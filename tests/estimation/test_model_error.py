@@ -16,9 +16,9 @@ from limber.estimation.model_error import (
 from limber.estimation.uncertainty import repeated
 from limber.geometry.skeleton.files import write_cylinders
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.grasping import grasp_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import GraspEntry
 
 YOUNG = np.array([40e6, 22e6, 12e6, 3e6])

@@ -130,7 +130,7 @@ def _depth_rows(quick: bool) -> list[Row]:
 
 
 def _moved(truth: object, displacements: list) -> list[np.ndarray]:
-    from limber.recordings.points import point_operator
+    from limber.mechanics.points import point_operator
 
     operator = point_operator(truth.mesh, truth.control_points)
     return [(operator @ displacement.ravel()).reshape(-1, 3) for displacement in displacements]

@@ -20,9 +20,9 @@ from limber.geometry.mesh_surface import MeshSurfaceSettings
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.importing import ImportSettings
-from limber.recordings.points import point_operator
 from limber.recordings.streams import Stream, write_stream
 from limber.stages.estimate import estimate
 from limber.stages.import_pull import import_pull

@@ -35,10 +35,10 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.shape_error import shape_error
 from limber.estimation.start import scaled_start
 from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
+from limber.mechanics.points import point_operator
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import force_unit_suspicion
 from limber.recordings.grasping import grasp_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import GraspEntry, Pull
 
 MISFIT_FACTOR = 4.0

@@ -23,13 +23,13 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.young_field import young_weights
 from limber.perception.camera import D455, Camera, write_camera
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.progress import SILENT, Progress
 from limber.recordings.grasping import grasp_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import (
     GraspEntry,
     Observations,

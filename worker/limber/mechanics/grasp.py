@@ -14,6 +14,11 @@ from limber.mechanics.elements.shapes import node_weights
 class Grasp:
     """A patch of nodes held by a gripper.
 
+    A grasp is a place on the branch. Which nodes lie within its radius differs from mesh to mesh,
+    and the patch's own centre with it: a few millimetres along a branch change its stiffness by
+    percents. Where the place is known the weights are therefore corrected, as little as possible,
+    until their centre is that place.
+
     Attributes:
         nodes: Indices of the patch's nodes, sorted.
         weights: Parts of a force that the nodes take, shape [k]; they sum to 1. The position of
@@ -37,7 +42,7 @@ class Grasp:
     @classmethod
     def at(cls, mesh: TetMesh, point: np.ndarray, radius: float,
            mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
-        """Return the grasp of all nodes within ``radius`` [m] of ``point`` [m].
+        """Return the grasp of all nodes within ``radius`` [m] of ``point`` [m], centred on it.
 
         A radius of 0 takes the nearest node.
 
@@ -52,11 +57,15 @@ class Grasp:
                 f"No node lies within {radius:g} m of ({', '.join(f'{x:.4g}' for x in point)}) m;"
                 f" the nearest is {distance.min():.4g} m away.", "The gripper would hold nothing.",
                 "Move the point onto the branch or widen the radius; check the units (metres).")
-        return cls.of_nodes(mesh, nodes, mode)
+        return cls.of_nodes(mesh, nodes, mode, point if radius > 0 else None)
 
     @classmethod
-    def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
+    def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped",
+                  point: np.ndarray | None = None) -> "Grasp":
         """Return the grasp marked in the mesh's point data ``grasp``.
+
+        Args:
+            point: The place that is held [m]; None: the patch's own centre.
 
         Raises:
             InputError: none is marked.
@@ -65,12 +74,16 @@ class Grasp:
         if not len(nodes):
             raise InputError("The mesh marks no grasp.", "Point data `grasp` is missing or 0.",
                              "Reconstruct again, or give a grasp point.")
-        return cls.of_nodes(mesh, nodes, mode)
+        return cls.of_nodes(mesh, nodes, mode, point)
 
     @classmethod
     def of_nodes(cls, mesh: TetMesh, nodes: np.ndarray,
-                 mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
+                 mode: Literal["clamped", "pinned"] = "clamped",
+                 point: np.ndarray | None = None) -> "Grasp":
         """Return the grasp of the given nodes.
+
+        Args:
+            point: The place that is held [m]; None: the patch's own centre.
 
         Raises:
             InputError: unknown mode, or a node is fixed.
@@ -86,6 +99,8 @@ class Grasp:
                              f"{np.count_nonzero(fixed[nodes])} of its {len(nodes)} nodes cannot"
                              " move.", "Grasp farther out, or with a smaller radius.")
         weights = _patch_weights(mesh, nodes)
+        if point is not None:
+            weights = _centred(weights, mesh.nodes[nodes] - np.asarray(point, float))
         return cls(nodes, weights, weights @ mesh.nodes[nodes], mode)
 
     def key(self) -> tuple[str, bytes, bytes]:
@@ -154,6 +169,22 @@ def check_pose(pose: np.ndarray) -> np.ndarray:
                          "A pose is x, y, z [m] and a rotation vector [rad].",
                          "Give six numbers.")
     return pose
+
+
+def _centred(weights: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Return weights that sum to 1 and whose moment about the grasp's place vanishes.
+
+    Args:
+        offset: Of the nodes from that place [m], shape [k, 3]. In directions in which the patch
+            has no extent it cannot be centred, and stays.
+    """
+    size = np.linalg.norm(offset, axis=1).max()
+    if size == 0.0:
+        return weights
+    conditions = np.column_stack([np.ones(len(offset)), offset / size])
+    missing = np.array([1.0, 0.0, 0.0, 0.0]) - conditions.T @ weights
+    scaled = conditions * weights[:, None]
+    return weights + scaled @ np.linalg.lstsq(conditions.T @ scaled, missing, rcond=1e-8)[0]
 
 
 def _patch_weights(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:

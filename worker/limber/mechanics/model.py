@@ -97,6 +97,10 @@ class _MeshData:
         self.edge = float(np.linalg.norm(edge, axis=1).mean())
         self.extent = float(np.linalg.norm(np.ptp(mesh.nodes, axis=0)))
 
+    def __getstate__(self) -> dict[str, object]:
+        # Another process makes its own equations: their factors hold compiled memory.
+        return {**vars(self), "equations": {}}
+
     def moved(self, nodes: np.ndarray) -> "_MeshData":
         """Return the data of the mesh with other node positions; patterns are shared."""
         other = copy.copy(self)

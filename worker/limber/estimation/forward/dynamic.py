@@ -13,10 +13,10 @@ from limber.estimation.parameters import Values
 from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import grasp_on, pose_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import PullEntry
 
 

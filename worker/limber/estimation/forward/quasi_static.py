@@ -20,11 +20,11 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import grasp_on, pose_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import PullEntry
 
 SETTINGS = StaticSettings(tolerance=1e-6)

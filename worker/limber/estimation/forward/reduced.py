@@ -10,10 +10,10 @@ from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.forward.quasi_static import uses_torque
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedSensitivities, ReducedState
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import pose_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import PullEntry
 
 STEPS = {"poisson": 2e-3, "density": 2e-2}

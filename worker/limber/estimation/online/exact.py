@@ -15,12 +15,12 @@ import numpy as np
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.jobs.process import end_with_parent
 from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
 from limber.mechanics.reduced.training import Trainer, sample_young
 from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics.solve import solve_static
 from limber.recordings.grasping import grasp_on, pose_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import GraspEntry
 
 REFRESH_STATES = 24

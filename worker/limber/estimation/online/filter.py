@@ -19,9 +19,9 @@ from scipy import stats
 
 from limber.estimation.online.exact import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
+from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedState, ReducedStaticSettings
 from limber.recordings.grasping import pose_on
-from limber.recordings.points import point_operator
 from limber.recordings.recording import GraspEntry
 
 STEP_LIMIT = 0.7

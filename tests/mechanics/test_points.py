@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.recordings.points import point_operator
+from limber.mechanics.points import point_operator
 
 
 @pytest.mark.parametrize("quadratic", [False, True])

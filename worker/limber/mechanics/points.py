@@ -1,4 +1,4 @@
-"""Observed points as a linear function of a mesh's nodal displacements."""
+"""Points of a branch as a linear function of a mesh's nodal displacements."""
 
 import numpy as np
 from scipy import sparse
