@@ -191,7 +191,7 @@ def _groups(forwards: list[QuasiStaticForward]) -> list[list[QuasiStaticForward]
     """Pulls of one grasp and one gravity share a basis."""
     groups: dict[str, list[QuasiStaticForward]] = {}
     for forward in forwards:
-        key = f"{forward.entry.grasp} {forward.entry.gravity_m_s2}"
+        key = f"{forward.entry.grasp} {forward.entry.gravity_m_s2} {forward.entry.weightless}"
         groups.setdefault(key, []).append(forward)
     return list(groups.values())
 

@@ -78,7 +78,8 @@ def _pulled(evaluation: Evaluation, objective: Objective, subject: Subject, mesh
     """
     start = subject.model
     model = BranchModel(mesh, young=start.young, poisson=start.poisson, density=start.density,
-                        gravity=None, point_masses=start.point_masses)
+                        gravity=start.gravity, point_masses=start.point_masses)
+    model = model if start.hanging is None else model.as_scanned()
     weights = young_weights(mesh, subject.control_points)
     forwards = [_forward(forward, model, weights) for forward in objective.forwards]
     for forward, hint in zip(forwards, hints or [], strict=False):

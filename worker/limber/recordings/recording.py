@@ -58,6 +58,8 @@ class PullEntry(BaseModel):
     gravity_m_s2: Vector | None = Field(
         None, description="Gravity that bends the branch out of its rest shape; absent where the "
         "scanned shape already carries it.")
+    weightless: bool = Field(
+        False, description="A simulated pull of a branch without weight.")
     time_offset_s: float = Field(
         0.0, description="Added to the observations' time stamps to get the robot's.")
     grasp: GraspEntry

@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.estimation.forward.force_motion import motion_response
-from limber.estimation.forward.forward import Forward, Simulated
+from limber.estimation.forward.forward import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import Response, nodal_loads
 from limber.estimation.forward.quasi_static import mechanics_names
 from limber.estimation.parameters import Values
@@ -46,8 +46,7 @@ class DynamicForward(Forward):
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
         self.weights = weights
-        gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
-        self._model = model.with_parameters(gravity=gravity)
+        self._model = under_its_weight(model, entry)
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
         # Only the nodes that the observed points hang on need derivatives.

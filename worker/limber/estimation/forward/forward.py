@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.estimation.forward.input_force import Response
 from limber.estimation.parameters import Values
+from limber.mechanics.model import BranchModel
 from limber.recordings.alignment import Frames
 from limber.recordings.recording import PullEntry
 
@@ -31,6 +32,17 @@ class Simulated:
     d_forces: np.ndarray | None = None
     torques: np.ndarray | None = None
     d_torques: np.ndarray | None = None
+
+
+def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
+    """Return the model with the weight that acted in a pull.
+
+    As a rule the branch hung as it was scanned, and ``model`` does so already. A shape that was
+    drawn, not scanned, is bent by the pull's own gravity; a simulated pull may have had none.
+    """
+    if entry.gravity_m_s2 is not None:
+        return model.with_parameters(gravity=entry.gravity_m_s2)
+    return model.with_parameters(gravity=(0.0, 0.0, 0.0)) if entry.weightless else model
 
 
 class Forward(ABC):

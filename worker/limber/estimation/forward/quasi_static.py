@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.errors import InputError, WorkError
-from limber.estimation.forward.forward import Forward, Simulated
+from limber.estimation.forward.forward import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import (
     Course,
     Response,
@@ -70,8 +70,7 @@ class QuasiStaticForward(Forward):
         if self.drive == "force" and entry.grasp.mode == "clamped":
             _require_torque(name, entry, frames)
         self.weights = weights
-        gravity = (0.0, 0.0, 0.0) if entry.gravity_m_s2 is None else entry.gravity_m_s2
-        self._model = model.with_parameters(gravity=gravity)
+        self._model = under_its_weight(model, entry)
         self.uses_torque = uses_torque(entry, frames)
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)

@@ -56,6 +56,7 @@ class FullBranch:
         entry: The recorded grasp.
         rest_points: Observed points at rest [m], shape [m, 3].
         poisson, density, gravity, point_masses: Of the branch.
+        hangs: Whether its weight has bent it to the mesh's shape already.
     """
 
     mesh: TetMesh
@@ -66,12 +67,14 @@ class FullBranch:
     density: float
     gravity: tuple[float, float, float]
     point_masses: tuple[PointMass, ...] = ()
+    hangs: bool = False
 
     def model(self, young: np.ndarray) -> BranchModel:
         """Return the branch with these moduli at the control points [Pa]."""
-        return BranchModel(self.mesh, young=self.weights @ young, poisson=self.poisson,
-                           density=self.density, gravity=self.gravity,
-                           point_masses=self.point_masses)
+        model = BranchModel(self.mesh, young=self.weights @ young, poisson=self.poisson,
+                            density=self.density, gravity=self.gravity,
+                            point_masses=self.point_masses)
+        return model.as_scanned() if self.hangs else model
 
 
 class ExactSolver:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import Cancelled, InputError
+from limber.estimation.forward.forward import under_its_weight
 from limber.estimation.model_error import ModelError, geometry_error, total_interval
 from limber.estimation.objective import Objective
 from limber.estimation.online.exact import Beside, FullBranch, Here
@@ -161,15 +162,15 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
                 f"E = {start.young[0] / 1e6:.3g} MPa throughout (--young gives another).")
         else:
             start = rough
-    gravity = pull.entry.gravity_m_s2 or (0.0, 0.0, 0.0)
-    model = subject.model.with_parameters(young=subject.weights @ start.young, gravity=gravity)
+    model = under_its_weight(subject.model, pull.entry).with_young(subject.weights @ start.young)
     training = TrainingSettings(grasp_count=training_count, young_spread=spread)
     reduced, _ = build_reduced(model, grasp_on(subject.mesh, pull.entry.grasp), subject.weights,
                                start.young, ReducedSettings(training=training), progress)
     rest = subject.control_points if pull.entry.rest_points_m is None else np.array(
         pull.entry.rest_points_m)
     branch = FullBranch(subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson,
-                        start.density, tuple(gravity), subject.model.point_masses)
+                        start.density, tuple(model.gravity), model.point_masses,
+                        model.hanging is not None)
     return Begun(reduced, branch, pull, deviation)
 
 
