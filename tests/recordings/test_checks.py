@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from limber.constants import FORCE_UNITS_N
 from limber.recordings.checks import (
-    FORCE_UNITS_N,
     clean,
     force_unit_suspicion,
     unswapped,

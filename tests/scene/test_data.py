@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from limber.alignment import Alignment
-from limber.errors import BranchFolderError
+from limber.errors import BranchFolderError, InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.scene.data import at_nodes, scene_data
 from limber.store import Branch
@@ -118,7 +118,7 @@ def test_frames_of_another_mesh_are_refused(tmp_path, mesh):
                                  ("cut", _pc2(surface[None])[:-4], "not a whole PC2"),
                                  ("none", b"", "not a whole PC2")):
         branch = _branch(tmp_path / name, mesh, plan__p=plan | {"frames/p.pc2": content})
-        with pytest.raises(BranchFolderError, match=words):
+        with pytest.raises(InputError, match=words):
             scene_data(branch)
 
 

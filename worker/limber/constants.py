@@ -4,3 +4,6 @@ STANDARD_GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
 GRAVITY = (0.0, 0.0, -STANDARD_GRAVITY)
 """Gravity [m/s^2] in a frame whose z is up: that of a branch of which nothing else is known."""
+FORCE_UNITS_N = {"N": 1.0, "gf": 1e-3 * STANDARD_GRAVITY, "mN": 1e-3,
+                 "lbf": 0.45359237 * STANDARD_GRAVITY, "kgf": STANDARD_GRAVITY, "kN": 1e3}
+"""Newtons in one of the units that force sensors report."""

@@ -9,6 +9,10 @@ from limber.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements.shapes import node_weights
 
+RADIAN = 0.3
+"""What a turn by one radian counts as in distances of poses, as part of the branch's extent:
+chosen, not measured."""
+
 
 @dataclass(frozen=True)
 class Grasp:

@@ -31,8 +31,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import lame
+from limber.sparse import NotPositiveDefiniteError
 
 if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel

@@ -22,11 +22,11 @@ import scipy.sparse as sp
 
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.statics.solve import solve_static
+from limber.sparse import NotPositiveDefiniteError
 
 
 @dataclass(frozen=True)

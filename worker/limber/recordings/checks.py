@@ -8,11 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from limber.constants import FORCE_UNITS_N
 from limber.recordings.recording import Observations, Pull
 from limber.recordings.streams import gaps, saturated, spikes
-
-FORCE_UNITS_N = {"gf": 9.80665e-3, "mN": 1e-3, "lbf": 4.4482216, "kgf": 9.80665, "kN": 1e3}
-"""Newtons in one of the units that force sensors report."""
 
 PLAUSIBLE_YOUNG_PA = (2e4, 4e10)
 """From soft silicone to the stiffest dry wood: outside, the force is taken to be mis-scaled."""
@@ -59,7 +57,7 @@ def force_unit_suspicion(young_pa: float) -> str | None:
     if low <= young_pa <= high:
         return None
     fitting = [name for name, newtons in FORCE_UNITS_N.items()
-               if low <= young_pa * newtons <= high]
+               if name != "N" and low <= young_pa * newtons <= high]
     hint = f"Is it in {' or '.join(fitting)}? " if fitting else ""
     return (f"The measured force implies a Young's modulus of {young_pa:.2g} Pa, outside "
             f"{low:.0e}-{high:.0e} Pa for plants: the force may be in another unit than newtons. "

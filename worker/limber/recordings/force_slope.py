@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
+from limber.constants import FORCE_UNITS_N
 from limber.errors import InputError
 from limber.recordings.streams import saturated
 from limber.recordings.tables import (
-    FORCE_UNITS_N,
+    FORCE_NAMES_N,
     LENGTH_UNITS_M,
     Table,
     read_table,
@@ -80,7 +81,7 @@ def read_force_displacement(path: Path, *, unit: str | None = None, force_unit: 
         InputError: a column or its unit is missing, or under 5 rows are left.
     """
     table = read_table(path)
-    force_at, force_scale = _column(table, r"force|load", FORCE_UNITS_N, force_unit)
+    force_at, force_scale = _column(table, r"force|load", FORCE_NAMES_N, force_unit)
     moved_at, moved_scale = _column(table, r"displacement|travel|position|stroke|deflection",
                                     LENGTH_UNITS_M, unit)
     pairs = table.values[:, [moved_at, force_at]]

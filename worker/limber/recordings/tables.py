@@ -11,15 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.constants import FORCE_UNITS_N
 from limber.errors import InputError
 from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
 from limber.recordings.streams import Stream, in_order
 
 LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "metres": 1.0,
                   "meters": 1.0, "millimetres": 1e-3, "millimeters": 1e-3, "inch": 0.0254}
-FORCE_UNITS_N = {"N": 1.0, "gf": 9.80665e-3, "g": 9.80665e-3, "mN": 1e-3, "lbf": 4.4482216,
-                 "lb": 4.4482216, "kgf": 9.80665, "kg": 9.80665, "kN": 1e3, "newton": 1.0,
-                 "newtons": 1.0, "grams": 9.80665e-3, "gram": 9.80665e-3}
+FORCE_NAMES_N = FORCE_UNITS_N | {
+    "newton": 1.0, "newtons": 1.0, "lb": FORCE_UNITS_N["lbf"], "kg": FORCE_UNITS_N["kgf"],
+    **dict.fromkeys(("g", "gram", "grams"), FORCE_UNITS_N["gf"])}
+"""Also what titles call them."""
 TIME_UNITS_S = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3,
                 "msec": 1e-3, "milliseconds": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 ANGLE_UNITS_RAD = {"rad": 1.0, "deg": np.pi / 180}
@@ -88,7 +90,7 @@ def split_title(title: str) -> Title:
     bracket = re.search(r"[(\[]\s*([^)\]]*)\s*[)\]]\s*$", title)
     if bracket:
         return Title(title[:bracket.start()].strip(), bracket.group(1).strip() or None)
-    units = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_UNITS_N, *TIME_UNITS_S,
+    units = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
                                        *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
     head, _, tail = title.strip().rpartition("_")
     if head and tail.lower() in units:
@@ -259,7 +261,7 @@ def _robot_scale(name: str, title: Title, force_unit: str | None, path: Path) ->
     if name.endswith("_n"):
         if force_unit:
             return FORCE_UNITS_N[force_unit]
-        return scale_of(title, FORCE_UNITS_N, "N", path)
+        return scale_of(title, FORCE_NAMES_N, "N", path)
     return scale_of(title, LENGTH_UNITS_M, "m", path)
 
 
@@ -373,7 +375,7 @@ def _is_named(row: list[str]) -> bool:
 
 
 def _units(row: list[str]) -> list[str] | None:
-    known = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_UNITS_N, *TIME_UNITS_S,
+    known = {unit.lower() for unit in (*LENGTH_UNITS_M, *FORCE_NAMES_N, *TIME_UNITS_S,
                                        *ANGLE_UNITS_RAD, *TORQUE_UNITS_NM)}
     bare = [part.strip("()[] ") for part in row]
     return bare if all(not part or part.lower() in known for part in bare) else None

@@ -8,7 +8,6 @@ here. One ``.npz`` file carries them to Blender's process: plain arrays (nothing
 
 import csv
 import json
-import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,6 @@ from limber.store import Branch
 
 FORMAT = 1
 """Of the .npz file; the add-on refuses another one."""
-
-_PC2_HEADER = struct.Struct("<12siiffi")
 
 # Colours as sRGB, evenly spaced; both maps keep their order when seen in grey.
 _COLOUR_MAPS = {
@@ -288,19 +285,16 @@ def _add_strain_energy(data: SceneData, path: Path, vertex_count: int) -> None:
 
 def _read_pc2(path: Path, vertex_count: int) -> np.ndarray:
     """Return the frames of a PC2 file, shape [frames, v, 3]; it must fit the mesh's surface."""
-    content = path.read_bytes()
-    # A file shorter than its header reads as one of other bytes, and is refused as such.
-    head = content[:_PC2_HEADER.size].ljust(_PC2_HEADER.size, b"?")
-    magic, _version, points, _start, _rate, frames = _PC2_HEADER.unpack(head)
-    if magic != b"POINTCACHE2\0" or len(content) != _PC2_HEADER.size + 12 * points * frames:
-        raise BranchFolderError(f"{path} is not a whole PC2 file.", "Its frames cannot be shown.",
-                                "Run the stage that makes it again.")
+    from limber.mechanics.frames import read_pc2
+
+    positions, _, _ = read_pc2(path)
+    points = positions.shape[1]
     if points != vertex_count:
         raise BranchFolderError(
             f"{path} moves {points} vertices; the mesh's surface has {vertex_count}.",
             "The frames belong to another mesh; Blender would silently show the rest shape.",
             "Run `limber plan` again.")
-    return np.frombuffer(content, "<f4", offset=_PC2_HEADER.size).reshape(frames, points, 3)
+    return positions
 
 
 def _carried(points: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:

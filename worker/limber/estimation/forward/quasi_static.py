@@ -17,7 +17,6 @@ from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.gripper_path import force_for_travel
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
@@ -26,6 +25,7 @@ from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_s
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import grasp_on, pose_on
 from limber.recordings.recording import PullEntry
+from limber.sparse import NotPositiveDefiniteError
 
 SETTINGS = StaticSettings(tolerance=1e-6)
 YOUNG_STEP_LIMIT = 0.7

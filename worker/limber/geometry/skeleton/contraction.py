@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from limber.errors import WorkError
 from limber.geometry.skeleton.recentring import recentred
 from limber.progress import SILENT, Progress
+from limber.sparse import CholmodFactor, NotPositiveDefiniteError, SuperLuFactor, general_factor
 
 NEIGHBOURS = 12
 """Neighbours that the point-cloud Laplacian triangulates; 12 is as good as 30 and faster."""
@@ -136,40 +137,24 @@ class _NormalEquations:
 
     def __init__(self, laplacian: sparse.csc_matrix):
         self._laplacian = laplacian
-        self._symbolic = None
+        self._factor: CholmodFactor | SuperLuFactor | None = None
 
     def solve(self, weight: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Solve for W_L = diag(``weight``) and W_H = 1."""
         weighted = sparse.diags(weight) @ self._laplacian
         matrix = (weighted.T @ weighted + sparse.identity(len(points))).tocsc()
+        lower = sparse.tril(matrix, format="csc")
+        lower.sort_indices()
+        if self._factor is None:
+            columns = np.repeat(np.arange(len(points)), np.diff(lower.indptr))
+            self._factor = general_factor(lower.indices, columns, len(points), is_ordered=False)
         try:
-            import cvxopt
-            from cvxopt import cholmod
-        except ImportError:
-            return _solve_by_superlu(matrix, points)
-        lower = sparse.tril(matrix).tocoo()
-        entries = cvxopt.spmatrix(lower.data, lower.row, lower.col, matrix.shape)
-        try:
-            if self._symbolic is None:
-                self._symbolic = cholmod.symbolic(entries)
-            cholmod.numeric(entries, self._symbolic)
-        except (ArithmeticError, ValueError):
-            return _solve_by_superlu(matrix, points)
-        right = cvxopt.matrix(np.ascontiguousarray(points.T).reshape(3, -1).T)
-        cholmod.solve(self._symbolic, right)
-        return _finite(np.array(right))
-
-
-def _solve_by_superlu(matrix: sparse.csc_matrix, points: np.ndarray) -> np.ndarray:
-    from scipy.sparse.linalg import splu
-
-    try:
-        return _finite(splu(matrix, permc_spec="MMD_AT_PLUS_A",
-                            options={"SymmetricMode": True}).solve(points))
-    except RuntimeError as error:
-        raise WorkError(f"The contraction's linear system is singular ({error}).",
-                        "Many points may lie on top of each other.",
-                        "Thin the cloud (--voxel).") from error
+            self._factor.factorise(lower.data)
+        except NotPositiveDefiniteError as error:
+            raise WorkError(f"The contraction's linear system is singular ({error}).",
+                            "Many points may lie on top of each other.",
+                            "Thin the cloud (--voxel).") from error
+        return _finite(self._factor.solve(points))
 
 
 def _finite(points: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
 from limber.mechanics.linear.equations import Tangent, Viscous
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
+from limber.sparse import NotPositiveDefiniteError
 
 _GOOD_TANGENT = 1e-3
 

@@ -11,9 +11,10 @@ import scipy.sparse as sp
 from limber.compiled import for_kernels
 from limber.mechanics.elements.stiffness import tangent_stiffness
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.linear.factor import Factor, NotPositiveDefiniteError, make_factor
+from limber.mechanics.linear.factor import Factor, make_factor
 from limber.mechanics.linear.pattern import LaneLayout, Pattern
 from limber.mechanics.materials import Material
+from limber.sparse import NotPositiveDefiniteError
 
 if TYPE_CHECKING:
     from limber.mechanics.model import BranchModel

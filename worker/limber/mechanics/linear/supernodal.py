@@ -11,13 +11,10 @@ import numpy as np
 
 from limber.compiled import compiled
 from limber.mechanics.linear.fronts import PAD, Fronts
+from limber.sparse import NotPositiveDefiniteError
 
 _COUNT = np.uint64
 """Indices of the inner loops: numba looks whether a signed index counts from the end."""
-
-
-class NotPositiveDefiniteError(ArithmeticError):
-    """The matrix has a pivot that is not positive: the state is not a stable one."""
 
 
 class SupernodalFactor:

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
-from limber.mechanics.grasp import Grasp, check_pose, pose_between, rotation_matrix
+from limber.mechanics.grasp import RADIAN, Grasp, check_pose, pose_between, rotation_matrix
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.basis import Basis, GraspCoordinates, make_basis
@@ -474,7 +474,7 @@ def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bo
 
 
 class _PoseTable:
-    """Poses that distances are taken to; a radian counts as 0.3 of the extent."""
+    """Poses that distances are taken to."""
 
     def __init__(self, poses: np.ndarray, extent: float):
         from scipy.spatial.transform import Rotation
@@ -488,7 +488,7 @@ class _PoseTable:
         away = self.rotations - rotation_matrix(pose[3:])
         # |R1 - R2| is sqrt(2) times the angle between them, where that is small.
         turns = np.sqrt(0.5 * np.einsum("sij,sij->s", away, away))
-        return np.linalg.norm(self.positions - pose[:3], axis=1) + 0.3 * self.extent * turns
+        return np.linalg.norm(self.positions - pose[:3], axis=1) + RADIAN * self.extent * turns
 
     def spacing(self) -> float:
         """Return the 90th percentile of the distance to the nearest other pose [m]."""

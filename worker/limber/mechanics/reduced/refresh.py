@@ -12,7 +12,6 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.dynamics import ReducedStepper
 from limber.mechanics.reduced.model import (
@@ -25,6 +24,7 @@ from limber.mechanics.reduced.model import (
 from limber.mechanics.reduced.training import Snapshots, Trainer
 from limber.mechanics.statics.solve import StaticResult
 from limber.progress import SILENT, Progress
+from limber.sparse import NotPositiveDefiniteError
 
 _CORRECTIONS = 4
 

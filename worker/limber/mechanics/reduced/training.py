@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.errors import ConvergenceError, InputError
-from limber.mechanics.grasp import Grasp, rotation_matrix, rotation_vector
+from limber.mechanics.grasp import RADIAN, Grasp, rotation_matrix, rotation_vector
 from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.progress import SILENT, Progress
 
-_ROTATION_SCALE = 0.3
-"""Metres per radian, as part of the extent, in the distance of two poses."""
 _YOUNG_SCALE = 0.1
-"""The same for a factor e in Young's modulus."""
+"""Metres per factor e in Young's modulus, as part of the extent; chosen, not measured."""
 _TIP_TURNS = 1.3
 """How much a cantilever's end turns per turn of its chord: between 1 (stiff) and 1.5 (small)."""
 
@@ -185,7 +183,7 @@ def pose_distance(model: BranchModel, poses: np.ndarray, young: np.ndarray, pose
              * Rotation.from_rotvec(np.atleast_2d(poses)[:, 3:])).magnitude()
     factor = np.abs(np.log(np.atleast_2d(young) / control_young)).max(axis=1)
     return (np.linalg.norm(np.atleast_2d(poses)[:, :3] - pose[:3], axis=1)
-            + model.extent * (_ROTATION_SCALE * turns + _YOUNG_SCALE * factor))
+            + model.extent * (RADIAN * turns + _YOUNG_SCALE * factor))
 
 
 class Trainer:

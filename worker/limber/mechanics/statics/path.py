@@ -6,7 +6,6 @@ import numpy as np
 
 from limber.mechanics.grasp import pose_between
 from limber.mechanics.linear.equations import Tangent
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import Material
 from limber.mechanics.model import InternalState
 from limber.mechanics.statics.problem import Problem, Target, make_result, strain_warnings
@@ -14,6 +13,7 @@ from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.snap import settle
 from limber.mechanics.strain import principal_stretch
 from limber.progress import Progress
+from limber.sparse import NotPositiveDefiniteError
 
 _SOFT_DET_F = 0.75
 _SNAP = 1 / 64

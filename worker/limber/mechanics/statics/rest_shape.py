@@ -15,11 +15,11 @@ import numpy as np
 from limber.errors import ConvergenceError, InputError
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 from limber.mechanics.linear.equations import Viscous
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
 from limber.mechanics.strain import deformation_gradients
 from limber.progress import SILENT, Progress
+from limber.sparse import NotPositiveDefiniteError
 
 _MAX_ITERATIONS = 40
 _MAX_UNLOADING = 100

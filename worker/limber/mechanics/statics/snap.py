@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from limber.mechanics.linear.equations import Equations, Tangent
-from limber.mechanics.linear.factor import NotPositiveDefiniteError
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel
+from limber.sparse import NotPositiveDefiniteError
 
 if TYPE_CHECKING:
     from limber.mechanics.statics.path import Path
