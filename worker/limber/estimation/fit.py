@@ -23,7 +23,7 @@ from limber.estimation.model_error import (
     total_interval,
 )
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
-from limber.estimation.optimise import Fit, gauss_newton, nelder_mead
+from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import (
     Subject,
@@ -66,7 +66,6 @@ class Estimate:
         warnings: What the user should know.
         held_out: Per pull, how a fit that did not see it foretells it: RMS distance [m] and RMS
             force error [N], also over the pull's own travel and peak force.
-        stopped: Whether it was stopped before its end.
         model_error: What residuals cannot show: of the branch's shape and of its mesh.
     """
 
@@ -76,8 +75,12 @@ class Estimate:
     identifiability: Identifiability
     warnings: list[str] = field(default_factory=list)
     held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
-    stopped: bool = False
     model_error: ModelError = field(default_factory=ModelError)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was stopped before its end."""
+        return self.fit.status is FitStatus.stopped
 
     @property
     def values(self) -> Values:
@@ -140,16 +143,15 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     objective = objective.with_space(space)
     try:
         fit, objective = _fitted(objective, space.pack(start), settings, tell, reduction)
-        stopped = False
     except Stopped:
-        fit, stopped = _best_so_far(objective), True
+        fit = _best_so_far(objective)
+    stopped = fit.status is FitStatus.stopped
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, tell)
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
             tell(message)
-    found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged,
-                     stopped=stopped)
+    found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged)
     _judge(found, tell)
     if settings.hold_out and len(objective.forwards) > 1 and not stopped:
         found.held_out = _held_out(found, settings)
@@ -249,7 +251,7 @@ def _best_so_far(objective: Objective) -> Fit:
                         "There is nothing to keep yet.", "Run it again.")
     quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
     evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
-    return Fit(evaluation, False, "stopped")
+    return Fit(evaluation, FitStatus.stopped, "stopped")
 
 
 def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,

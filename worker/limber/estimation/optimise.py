@@ -1,6 +1,7 @@
 """The optimisers: the paper's Nelder-Mead, and Gauss-Newton with exact sensitivities."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares, minimize
@@ -20,19 +21,40 @@ FORCE_SETTLED = 0.1
 """Change of a fit, in standard deviations, below which the course is left where it is."""
 
 
+class FitStatus(StrEnum):
+    """How a fit ended; each is its own text.
+
+    converged: by the optimiser's own criterion.
+    out_of_evaluations: no more simulations were allowed.
+    misfit: it settled, but farther from the measurements than was asked for.
+    unconfirmed: a reduced model's fit that the full model could not confirm.
+    stopped: by the user.
+    """
+
+    converged = "converged"
+    out_of_evaluations = "out of evaluations"
+    misfit = "misfit"
+    unconfirmed = "unconfirmed"
+    stopped = "stopped"
+
+
 @dataclass(frozen=True)
 class Fit:
     """Where an optimiser ended.
 
     Attributes:
         evaluation: The best one, with derivatives where they were asked for.
-        converged: Whether the optimiser's own criterion ended it.
-        reason: That criterion in words.
+        status: How it ended.
+        reason: Why, in words with numbers.
     """
 
     evaluation: Evaluation
-    converged: bool
+    status: FitStatus
     reason: str
+
+    @property
+    def converged(self) -> bool:
+        return self.status is FitStatus.converged
 
 
 def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True,
@@ -94,7 +116,8 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
         moved = found.x
         if np.linalg.norm(away) < FORCE_SETTLED:
             break
-    return Fit(_required(objective, found.x + shift), found.status > 0, str(found.message))
+    status = FitStatus.converged if found.status > 0 else FitStatus.out_of_evaluations
+    return Fit(_required(objective, found.x + shift), status, str(found.message))
 
 
 def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: int = 400,
@@ -166,18 +189,20 @@ class _Settling:
         if self._has_settled:
             raise StopIteration
 
-    def verdict(self, is_small: bool, limit: int) -> tuple[bool, str]:
-        """Whether it converged, and why it ended."""
+    def verdict(self, is_small: bool, limit: int) -> tuple[FitStatus, str]:
+        """How it ended, and why."""
         error = f"the mean squared distance of the points, {self._error:.3g} m2,"
         if self._delta is not None and self._error < self._delta:
-            return True, f"{error} fell below {self._delta:.3g} m2"
+            return FitStatus.converged, f"{error} fell below {self._delta:.3g} m2"
         if not (self._has_settled or is_small):
-            return False, (f"{limit} simulations were not enough: {error} still falls. Allow more "
-                           "(--evaluations), or use --method gauss-newton")
+            return FitStatus.out_of_evaluations, (
+                f"{limit} simulations were not enough: {error} still falls. Allow more "
+                "(--evaluations), or use --method gauss-newton")
         if self._delta is None:
-            return True, f"{error} settled"
-        return False, (f"{error} settled above the {self._delta:.3g} m2 asked for (--delta-m2): "
-                       "noise or the model's error is larger than that")
+            return FitStatus.converged, f"{error} settled"
+        return FitStatus.misfit, (
+            f"{error} settled above the {self._delta:.3g} m2 asked for (--delta-m2): noise or the "
+            "model's error is larger than that")
 
 
 def _required(objective: Objective, free: np.ndarray) -> Evaluation:

@@ -23,7 +23,7 @@ from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.forward.reduced import ReducedForward
 from limber.estimation.objective import Objective
-from limber.estimation.optimise import Fit
+from limber.estimation.optimise import Fit, FitStatus
 from limber.estimation.parameters import Values
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
 from limber.mechanics.reduced.training import Trainer, sample_young
@@ -163,7 +163,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, tell: T
                    for forward in corrected.forwards):
             tell("The full model finds no equilibrium at the reduced model's fit: it could not be "
                  "checked. Use --forward full.")
-            return replace(fit, converged=False)
+            return replace(fit, status=FitStatus.unconfirmed)
         # What was evaluated before belongs to another correction.
         corrected.forget()
         again = optimise(corrected, fit.evaluation.free, is_near=True)
@@ -175,7 +175,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, tell: T
             return fit
     tell("The corrections of the reduced model did not settle: the last one changed a free value "
          f"by {moved.max():.2g} (1 is a factor of 2.7).")
-    return replace(fit, converged=False)
+    return replace(fit, status=FitStatus.unconfirmed)
 
 
 def _required(forward: Forward) -> QuasiStaticForward:

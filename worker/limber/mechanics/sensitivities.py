@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.errors import InputError
+from limber.mechanics.dynamics.motion import MotionState
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.materials import lame_by_poisson
 from limber.mechanics.model import BranchModel, product_with
+from limber.mechanics.statics.result import StaticResult
 
 PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_stiffness")
 """What can be differentiated for. ``log_young`` is one column for each column of the weights."""
@@ -65,7 +67,7 @@ class StaticSensitivities:
     strain_energy: np.ndarray
 
 
-def static_sensitivities(model: BranchModel, result: "StaticResult",  # noqa: F821
+def static_sensitivities(model: BranchModel, result: StaticResult,
                          grasp: Grasp | Sequence[Grasp] | None, weights: np.ndarray | None,
                          parameters: Sequence[str] = ("log_young",), *, is_held: bool = True,
                          control_young: np.ndarray | None = None) -> StaticSensitivities:
@@ -82,7 +84,7 @@ def static_sensitivities(model: BranchModel, result: "StaticResult",  # noqa: F8
     equations = model.equations(grasps if is_held else ())
     u = result.displacement
     tangent = equations.tangent(model, u)
-    explicit = explicit_forces(model, wanted, result, None)
+    explicit = explicit_forces(model, wanted, u)
 
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(u, direction)
@@ -149,15 +151,16 @@ def young_shares(model: BranchModel, wanted: ParameterSet) -> np.ndarray:
     return (wanted.weights * control).T / mapped
 
 
-def explicit_forces(model: BranchModel, wanted: ParameterSet,
-                    state: "StaticResult | MotionState",  # noqa: F821
-                    viscous: Viscous | None) -> list[np.ndarray]:
+def explicit_forces(model: BranchModel, wanted: ParameterSet, displacement: np.ndarray, *,
+                    motion: MotionState | None = None,
+                    viscous: Viscous | None = None) -> list[np.ndarray]:
     """Return the derivative of internal and inertial force less load, the motion held.
 
     Each of shape [node_count, 3] [N per parameter].
 
     Args:
-        state: A static result, or an instant of a motion.
+        displacement: [m], shape [node_count, 3].
+        motion: The instant of a motion that it belongs to; None: equilibrium.
         viscous: The viscous part of that instant.
     """
     changes, partials = lame_changes(model, wanted), []
@@ -165,12 +168,13 @@ def explicit_forces(model: BranchModel, wanted: ParameterSet,
              for name in wanted.labels()]
     for name, change in zip(plain, changes, strict=True):
         if change is not None:
-            partials.append(model.internal(state.displacement, lame_pair=change,
+            partials.append(model.internal(displacement, lame_pair=change,
                                            viscous=viscous).force)
         elif name == "log_density":
-            partials.append(_density_force(model, state))
+            partials.append(_density_force(model, displacement, motion))
         else:
-            partials.append(_damping_force(model, name, state, viscous))
+            partials.append(np.zeros_like(displacement) if motion is None
+                            else _damping_force(model, name, motion, viscous))
     return partials
 
 
@@ -181,30 +185,28 @@ def viscous_force(model: BranchModel, displacement: np.ndarray,
             - model.internal(displacement).force)
 
 
-def _density_force(model: BranchModel, state: object) -> np.ndarray:
+def _density_force(model: BranchModel, displacement: np.ndarray,
+                   motion: MotionState | None) -> np.ndarray:
     bare = model.without_point_masses()
     force = -bare.weight_force
     if bare.weight_stiffness is not None:
         # What carries the weight grows with it.
-        force = force + product_with(bare.weight_stiffness, state.displacement)
-    velocity = getattr(state, "velocity", None)
-    if velocity is not None:
-        force = force + bare.mass_times(state.acceleration + model.damping.mass * velocity)
+        force = force + product_with(bare.weight_stiffness, displacement)
+    if motion is not None:
+        force = force + bare.mass_times(
+            motion.acceleration + model.damping.mass * motion.velocity)
     return force
 
 
-def _damping_force(model: BranchModel, name: str, state: object,
+def _damping_force(model: BranchModel, name: str, motion: MotionState,
                    viscous: Viscous | None) -> np.ndarray:
-    velocity = getattr(state, "velocity", None)
-    if velocity is None:
-        return np.zeros_like(state.displacement)
     if name == "damping_mass":
-        return model.mass_times(velocity)
+        return model.mass_times(motion.velocity)
     if viscous is None:
-        return np.zeros_like(state.displacement)
+        return np.zeros_like(motion.displacement)
     # The viscous force is linear in the factor.
-    return (model.internal(state.displacement, viscous=viscous).force
-            - model.internal(state.displacement).force) / model.damping.stiffness
+    return (model.internal(motion.displacement, viscous=viscous).force
+            - model.internal(motion.displacement).force) / model.damping.stiffness
 
 
 def explicit_energies(model: BranchModel, wanted: ParameterSet,

@@ -25,6 +25,7 @@ from limber.mechanics import (
     follow_poses,
     solve_static,
 )
+from limber.mechanics.status import Status
 from limber.mechanics.strain import strain_state
 
 _PARTS = ("mesh", "reach", "gravity", "point_masses")
@@ -145,11 +146,11 @@ class GraspModel:
             object.__setattr__(self, name, value)
 
 
-def acceptable(result: StaticResult) -> str:
-    """Return why a solution cannot be believed, or an empty string."""
+def refusal(result: StaticResult) -> Status | None:
+    """Return why a solution cannot be believed, or None."""
     if not result.converged:
         return result.status
-    return "" if result.min_det_f > 0.0 else "inverted"
+    return None if result.min_det_f > 0.0 else Status.inverted
 
 
 def grasp_model_of(mesh: TetMesh, skeleton: Skeleton, gravity: tuple[float, float, float] | None,

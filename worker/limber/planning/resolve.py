@@ -6,7 +6,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from limber.errors import ConvergenceError
-from limber.planning.grasp_model import GraspModel, acceptable
+from limber.planning.grasp_model import GraspModel, refusal
 from limber.planning.objective import PathMeasures, measure_path, resample
 from limber.progress import SILENT, Progress
 
@@ -50,11 +50,11 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
     state = grasp_model.rest.displacement
     for point in resample(approach, _APPROACH_STEP)[1:-1]:
         result = grasp_model.follow(point[None], state)[0]
-        state = state if acceptable(result) else result.displacement
+        state = state if refusal(result) else result.displacement
     good, reasons = [], []
     for point in path:
         result = grasp_model.follow(point[None], state)[0]
-        if reason := acceptable(result):
+        if reason := refusal(result):
             reasons.append(reason)
         else:
             good.append(result)

@@ -18,8 +18,9 @@ import numpy as np
 
 from limber.errors import WorkError
 from limber.jobs.process import end_with_parent
+from limber.mechanics.status import Status
 from limber.planning.field import GraspSamples
-from limber.planning.grasp_model import GraspModel, Reach, acceptable
+from limber.planning.grasp_model import GraspModel, Reach, refusal
 from limber.progress import SILENT, Progress
 
 _LAYER = 0.06  # share of the reach
@@ -38,7 +39,7 @@ class _Solved:
     force: np.ndarray
     tip: np.ndarray
     min_det_f: float
-    trouble: str
+    trouble: Status | None
 
 
 def sample_positions(reach: Reach, rest: np.ndarray, count: int, *, deflection: float,
@@ -99,7 +100,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
         solved = _solve_tree(grasp_model, targets, np.arange(len(targets)), report)
     rest = grasp_model.rest
     at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, 0.0, np.zeros(3),
-                      grasp_model.tip(rest.displacement), rest.min_det_f, "")
+                      grasp_model.tip(rest.displacement), rest.min_det_f, None)
     good = [at_rest, *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
     bad = sorted((s for s in solved if s.trouble), key=lambda s: s.target)
     reasons = [s.trouble for s in bad]
@@ -110,7 +111,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
         works=np.array([s.work for s in good]), forces=np.array([s.force for s in good]),
         tips=np.array([s.tip for s in good]), min_det_f=np.array([s.min_det_f for s in good]),
         rejected_poses=rejected)
-    return samples, {reason: reasons.count(reason) for reason in sorted(set(reasons))}
+    return samples, {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
 
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
@@ -128,7 +129,7 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
         found = _Solved(
             int(numbers[target]), grasp_model.pose(result.displacement),
             grasp_model.energy(result), grasp_model.work(result), result.reaction_force,
-            grasp_model.tip(result.displacement), float(result.min_det_f), acceptable(result))
+            grasp_model.tip(result.displacement), float(result.min_det_f), refusal(result))
         if not found.trouble:
             positions.append(targets[target])
             states.append(result.displacement)

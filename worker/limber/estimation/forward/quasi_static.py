@@ -304,7 +304,8 @@ class QuasiStaticForward(Forward):
         held = self.grasp.nodes
         arm = model.mesh.nodes[held] + result.displacement[held] - about
         columns = []
-        for column, partial in enumerate(explicit_forces(model, wanted, result, None)):
+        for column, partial in enumerate(explicit_forces(
+                model, wanted, result.displacement)):
             out = partial + model.tangent_times(result.displacement,
                                                 np.ascontiguousarray(slope[..., column]))
             columns.append(np.cross(arm, out[held]).sum(axis=0))

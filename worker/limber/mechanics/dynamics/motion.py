@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from limber.errors import ConvergenceError, InputError
+from limber.mechanics.status import Status
 
 
 @dataclass(frozen=True)
@@ -92,8 +93,7 @@ class DynamicResult:
     """A motion.
 
     Attributes:
-        converged: Whether all frames were reached; otherwise the arrays end with the last good
-            frame.
+        status: How it ended. If not converged, the arrays end with the last good frame.
         times: [s], shape [frames].
         displacement: [m], shape [frames, node_count, 3].
         strain_energy, kinetic_energy: [J], shape [frames].
@@ -108,8 +108,7 @@ class DynamicResult:
         sensitivities: Where asked for.
     """
 
-    converged: bool
-    status: str
+    status: Status
     times: np.ndarray
     displacement: np.ndarray
     strain_energy: np.ndarray
@@ -128,6 +127,11 @@ class DynamicResult:
     message: str = ""
     warnings: list[str] = field(default_factory=list)
     sensitivities: DynamicSensitivities | None = None
+
+    @property
+    def converged(self) -> bool:
+        """Whether all frames were reached."""
+        return self.status is Status.converged
 
     def require(self) -> "DynamicResult":
         """Return the result itself.

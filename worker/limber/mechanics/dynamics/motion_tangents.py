@@ -57,7 +57,8 @@ class MotionTangents:
         """Return the explicit derivatives of forces where pinned patches make them jump."""
         if not self.equations.pinned:
             return []
-        return explicit_forces(self.model, self.wanted, state, viscous)
+        return explicit_forces(self.model, self.wanted, state.displacement, motion=state,
+                               viscous=viscous)
 
     def jump(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
         """Take the reaction of the motion that was imposed on pinned patches."""
@@ -72,7 +73,8 @@ class MotionTangents:
         beta, gamma = settings.beta, settings.gamma
         rate, inertia = gamma / (beta * dt), 1 / (beta * dt**2)
         formula, alpha = old.rate_formula(dt), model.damping.mass
-        partials = explicit_forces(model, self.wanted, new, viscous)
+        partials = explicit_forces(model, self.wanted, new.displacement, motion=new,
+                                   viscous=viscous)
 
         def force(change: np.ndarray) -> np.ndarray:
             return (model.tangent_times(new.displacement, change, viscous)
@@ -114,6 +116,6 @@ class MotionTangents:
         return moved, force
 
     def _first_out(self, state: MotionState) -> list[np.ndarray]:
-        partials = explicit_forces(self.model, self.wanted, state, None)
+        partials = explicit_forces(self.model, self.wanted, state.displacement, motion=state)
         return [partial + self.model.tangent_times(state.displacement, tangent.displacement)
                 for partial, tangent in zip(partials, self._states, strict=True)]

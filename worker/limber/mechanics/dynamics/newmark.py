@@ -7,6 +7,7 @@ import numpy as np
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import MotionState, NewmarkSettings
 from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.status import Status
 from limber.sparse import NotPositiveDefiniteError
 
 _GOOD_TANGENT = 1e-3
@@ -25,7 +26,7 @@ class NewmarkStepper:
         self.drive, self.settings = drive, settings
         self.model, self.equations = drive.model, drive.equations
         self.iteration_count = 0
-        self.status, self.trouble = "converged", ""
+        self.status, self.trouble = Status.converged, ""
         self.tangent: Tangent | None = None
         self._tangent_step, self._tangent_error = 0.0, np.inf
 
@@ -63,7 +64,7 @@ class NewmarkStepper:
                               + np.linalg.norm(out - residual))
             if not np.isfinite(norm) or (len(norms) > 4 and norm > 0.9 * min(norms)
                                          and norms[-1] > 0.9 * min(norms[:-1])):
-                self.trouble, self.status = "the iteration does not converge", "stalled"
+                self.trouble, self.status = "the iteration does not converge", Status.stalled
                 return None
             if increment is not None and norm <= max(settings.tolerance * reference,
                                                      self._floor()):
@@ -91,7 +92,7 @@ class NewmarkStepper:
             new.displacement = new.displacement + increment
             self._follow(old, new, dt)
         self.trouble = f"no convergence in {settings.max_iterations} iterations"
-        self.status = "stalled"
+        self.status = Status.stalled
         return None
 
     def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
@@ -122,7 +123,8 @@ class NewmarkStepper:
                 self.model, new.displacement, increment=increment, viscous=viscous,
                 mass_factor=inertia + damping.mass * rate)
         except NotPositiveDefiniteError:
-            self.trouble, self.status = "the stiffness has no positive pivots", "stalled"
+            self.trouble = "the stiffness has no positive pivots"
+            self.status = Status.stalled
             return False
         self._tangent_step = dt
         return True
@@ -141,7 +143,7 @@ class NewmarkStepper:
 
     def _accepted(self, new: MotionState, min_det_f: float) -> MotionState | None:
         if min_det_f <= 0:
-            self.trouble, self.status = "an element would turn inside out", "inverted"
+            self.trouble, self.status = "an element would turn inside out", Status.inverted
             return None
-        self.status = "converged"
+        self.status = Status.converged
         return new

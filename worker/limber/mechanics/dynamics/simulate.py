@@ -28,6 +28,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import ParameterSet, reactions
 from limber.mechanics.statics.problem import base_forces, checked_forces, strain_warnings
 from limber.mechanics.statics.result import StaticResult
+from limber.mechanics.status import Status
 from limber.mechanics.strain import principal_stretch
 from limber.progress import SILENT, Progress
 
@@ -155,7 +156,7 @@ class _Motion:
             return False
         stretch = principal_stretch(self.model, new.displacement)
         if stretch.value > self.settings.stretch_limit:
-            stepper.status = "torn"
+            stepper.status = Status.torn
             stepper.trouble = f"stretched to {100 * stretch.value:.0f} % {stretch.at}"
             return False
         if viscous is not None:
@@ -220,7 +221,7 @@ class _Motion:
                 self.tangents.wanted.labels(), stacked("displacement_change"),
                 change[:, 0] if self.drive.single else change)
         return DynamicResult(
-            converged=complete, status="converged" if complete else self.stepper.status,
+            status=Status.converged if complete else self.stepper.status,
             times=stacked("time"), displacement=stacked("displacement"),
             strain_energy=stacked("strain_energy"), energy=stacked("energy"),
             kinetic_energy=stacked("kinetic_energy"), load_energy=stacked("load_energy"),

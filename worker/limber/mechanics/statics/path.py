@@ -11,6 +11,7 @@ from limber.mechanics.model import InternalState
 from limber.mechanics.statics.problem import Problem, Target, make_result, strain_warnings
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.snap import settle
+from limber.mechanics.status import Status
 from limber.mechanics.strain import principal_stretch
 from limber.progress import Progress
 from limber.sparse import NotPositiveDefiniteError
@@ -40,7 +41,7 @@ class Path:
         self.trouble = ""
         # Where the branch had to snap, as part of the way, and whether it buckled there.
         self.snaps: list[tuple[float, bool]] = []
-        self.status = "stalled"
+        self.status = Status.stalled
 
     def _begin_constraint(self, begin: np.ndarray) -> None:
         problem, nodes = self.problem, self.model.mesh.nodes
@@ -78,7 +79,7 @@ class Path:
                 if step < self.settings.min_step:
                     taken = settle(self, min(1.0, self.reached + _SNAP))
                     if taken is None:
-                        return self._result(False)
+                        return self._result()
                     self.reached, step = self.reached + taken, _SNAP
                 continue
             quick = self.iterations - before <= 6
@@ -87,8 +88,8 @@ class Path:
             self.reached += taken
             if self.reached > 1 - 1e-12:
                 self.reached = 1.0
-        self.status = "converged"
-        return self._result(True)
+        self.status = Status.converged
+        return self._result()
 
     def _step(self, part: float) -> float | None:
         """Try a step to ``part`` of the way; return the length taken, None if it failed."""
@@ -190,32 +191,32 @@ class Path:
     def _accept(self, trial: np.ndarray, state: InternalState, part: float,
                 stable: bool) -> float | None:
         if state.min_det_f <= 0:
-            self.status, self.trouble = "inverted", "an element would turn inside out"
+            self.status, self.trouble = Status.inverted, "an element would turn inside out"
             return None
         if not stable and not self._is_stable(trial):
-            self.status, self.trouble = "unstable", "the equilibrium found is not stable"
+            self.status, self.trouble = Status.unstable, "the equilibrium found is not stable"
             return None
         if (stretch := principal_stretch(self.model, trial)).value > self.settings.stretch_limit:
-            self.status = "torn"
+            self.status = Status.torn
             self.trouble = f"stretched to {100 * stretch.value:.0f} % of its length {stretch.at}"
             return None
         self.displacement, self.state = trial, state
         taken = part - self.reached
-        self.status = "stalled"
+        self.status = Status.stalled
         return taken
 
     def _is_stable(self, trial: np.ndarray) -> bool:
         return self.equations.tangent(self.model, trial).is_positive_definite
 
-    def _result(self, converged: bool) -> StaticResult:
+    def _result(self) -> StaticResult:
         stretch = principal_stretch(self.model, self.displacement)
-        message = "" if converged else (
+        message = "" if self.status is Status.converged else (
             f"{self.trouble}; stopped at {100 * self.reached:.1f} % of the way, where the branch"
             f" is stretched most {stretch.at} ({100 * (stretch.value - 1):.1f} %)"
             + self._softening())
         warnings = strain_warnings(stretch) + buckling_warnings(self.snaps)
         load = self.load_at(self.reached)
-        return make_result(self.problem, self.displacement, self.state, load, converged=converged,
+        return make_result(self.problem, self.displacement, self.state, load,
                            status=self.status, message=message, warnings=warnings,
                            iterations=self.iterations, residual_history=self.history,
                            seconds=time.perf_counter() - self.started, reached=self.reached,

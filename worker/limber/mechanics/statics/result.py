@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from limber.errors import ConvergenceError
+from limber.mechanics.status import Status
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,7 @@ class StaticResult:
     """A static state, and how it was found.
 
     Attributes:
-        converged: Whether it is a stable equilibrium under the wanted loads, with no element
-            inverted. If not, the state is the last good one on the way.
-        status: ``converged``, ``stalled`` (step control gave up), ``torn`` (stretched over the
-            limit), ``inverted``, ``unstable``, ``false_equilibrium``.
+        status: How the solve ended. If not converged, the state is the last good one on the way.
         displacement: [m], shape [node_count, 3].
         pose: Pose of the grasp in this state [m, rad], shape [6] ([g, 6] for several), or None.
         strain_energy: Of the strain since the model's mesh [J].
@@ -63,8 +61,7 @@ class StaticResult:
         warnings: What a user should know.
     """
 
-    converged: bool
-    status: str
+    status: Status
     displacement: np.ndarray
     pose: np.ndarray | None
     strain_energy: float
@@ -81,6 +78,11 @@ class StaticResult:
     message: str = ""
     warnings: list[str] = field(default_factory=list)
     snapped_at: list[float] = field(default_factory=list)
+
+    @property
+    def converged(self) -> bool:
+        """Whether it is a stable equilibrium under the wanted loads, with no element inverted."""
+        return self.status is Status.converged
 
     def require(self) -> "StaticResult":
         """Return the result itself.

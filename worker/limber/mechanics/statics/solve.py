@@ -17,6 +17,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.path import Path
 from limber.mechanics.statics.problem import Problem, Target
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
+from limber.mechanics.status import Status
 from limber.progress import SILENT, Progress
 
 
@@ -99,7 +100,7 @@ def _verified(problem: Problem, result: StaticResult, goal: Target, pose: np.nda
     lower = result.energy - again.energy
     if again.converged and lower > 1e-3 * abs(again.energy):
         return replace(
-            result, converged=False, status="false_equilibrium",
+            result, status=Status.false_equilibrium,
             message=f"energy {result.energy:.6g} J, but {again.energy:.6g} J on the"
                     " way from rest: a false equilibrium")
     return result
