@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from limber.errors import Cancelled, NoPathError
+from limber.planning.cost import CostWeights, measure_path
 from limber.planning.goals import GraspGoal, TipGoal, default_goal, goal_points
-from limber.planning.objective import Objective, measure_path
 from limber.planning.ompl_engine import ompl_missing
-from limber.planning.rrt_star import Problem, Search, plan_path
+from limber.planning.rrt_star import PathProblem, Search, plan_path
 from limber.progress import Progress
 
 START = np.array([-0.13, 0.0, 0.0])
@@ -18,11 +18,11 @@ ENGINES = ["own", pytest.param("ompl", marks=pytest.mark.skipif(
 
 def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):
     limited = field.limited(**limits)
-    objective = Objective.between(field, START, np.array(goal.position),
+    cost = CostWeights.between(field, START, np.array(goal.position),
                                   deformation=deformation, distance=distance)
-    return Problem(START, goal_points(goal, field, limited),
+    return PathProblem(START, goal_points(goal, field, limited),
                    lambda points: goal.distance(field, points) <= goal.tolerance,
-                   field, limited, objective.weights)
+                   field, limited, cost.weights)
 
 
 def measured(field, points):
@@ -111,7 +111,7 @@ def test_goal_behind_a_wall(ridge_field):
     start_and_goal_only = ridge_field.limited(max_energy=1.0)._replace(
         rejected=np.random.default_rng(0).uniform([-0.03, -0.2, -0.2], [0.03, 0.2, 0.2],
                                                   (2000, 3)))
-    walled = Problem(problem.start, problem.goals, problem.in_goal, ridge_field,
+    walled = PathProblem(problem.start, problem.goals, problem.in_goal, ridge_field,
                      start_and_goal_only, problem.weights)
     with pytest.raises(NoPathError, match="500 iterations"):
         plan_path(walled, Search(iterations=500))

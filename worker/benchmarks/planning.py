@@ -23,10 +23,10 @@ from limber.geometry.tets.marks import mark
 from limber.mechanics import Grasp, solve_static, young_weights
 from limber.plain import plain
 from limber.planning.compare import PlanSettings, plan_pair, random_start
+from limber.planning.cost import measure_path
 from limber.planning.field import EnergyField, error_measures, fit_field
 from limber.planning.goals import GraspGoal, default_goal
 from limber.planning.grasp_model import GraspModel, Reach
-from limber.planning.objective import measure_path
 from limber.planning.ompl_engine import ompl_missing
 from limber.planning.resolve import resolve_path
 from limber.planning.sampling import sample_branch, sample_positions, without_taut

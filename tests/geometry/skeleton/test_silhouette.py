@@ -8,7 +8,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.silhouette import View, within_silhouette, without_hidden_twigs
-from limber.geometry.skeleton.skeleton import CLAMPED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.perception.camera import D455, depth_to_cloud
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.stages.reconstruct import reconstruct
@@ -56,7 +56,7 @@ def test_no_branch_is_thicker_than_its_silhouette():
     pixel = 1.1 / camera.fx
     assert np.mean(thinner.radius <= 1.25 * truth.radius + pixel) > 0.8
     assert np.all(thinner.radius > 0.9 * truth.radius)
-    assert count == (thinner.radius_state == CLAMPED).sum() > 0.8 * truth.node_count
+    assert count == (thinner.radius_state == LIMITED).sum() > 0.8 * truth.node_count
 
 
 def test_a_depth_cameras_place_goes_with_the_cloud():

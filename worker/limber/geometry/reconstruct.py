@@ -15,7 +15,7 @@ from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
-from limber.geometry.skeleton.skeleton import CLAMPED, INTERPOLATED, Skeleton
+from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
 from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.forks import smooth_forks
@@ -157,7 +157,7 @@ def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed
             skeleton.arc_length[skeleton.main_path()[-1]]),
         "radius_min_m": float(skeleton.radius.min()), "radius_max_m": float(skeleton.radius.max()),
         "radius_sigma_median_m": float(np.median(skeleton.radius_sigma)),
-        "clamped_radius_count": int((skeleton.radius_state == CLAMPED).sum()),
+        "clamped_radius_count": int((skeleton.radius_state == LIMITED).sum()),
         "interpolated_radius_count": int((skeleton.radius_state == INTERPOLATED).sum()),
         "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
         "tet_count": meshed.mesh.tet_count, "mesh_node_count": meshed.mesh.node_count,
@@ -226,8 +226,8 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
         reach: ``silhouette_reach`` of the settings.
     """
     skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
-    skeleton, clamped = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
-    if not (dropped or clamped):
+    skeleton, limited = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
+    if not (dropped or limited):
         return found, ""
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
     text = ""

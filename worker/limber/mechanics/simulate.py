@@ -7,7 +7,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import ConvergenceError, InputError
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.dynamics.pull import Motion, Pull, dynamic_motion, static_motion
+from limber.mechanics.dynamics.load_case import (
+    LoadCase,
+    SimulatedMotion,
+    dynamic_motion,
+    static_motion,
+)
 from limber.mechanics.dynamics.simulate import NewmarkSettings
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel, PointMass
@@ -94,9 +99,9 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
     return _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
 
 
-def pull_of(model: BranchModel, scan: TetMesh, settings: SimulateSettings,
-            along: PoseTable | None = None) -> Pull:
-    """Return the pull that settings ask for.
+def load_case_of(model: BranchModel, scan: TetMesh, settings: SimulateSettings,
+            along: PoseTable | None = None) -> LoadCase:
+    """Return the load case that settings ask for.
 
     Args:
         model: At its rest shape.
@@ -128,7 +133,7 @@ def pull_of(model: BranchModel, scan: TetMesh, settings: SimulateSettings,
     times, part = _ramp(settings, along.duration if along else settings.duration)
     changes = along.changes(times) if along else part[:, None] * np.concatenate(
         [settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
-    return Pull(model, start, grasp, follows_pose, holds,
+    return LoadCase(model, start, grasp, follows_pose, holds,
                 _way(start.pose[0], changes, settings.grasp_mode), force, loads, times, part)
 
 
@@ -159,11 +164,12 @@ def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> No
                          "Give --move and --turn, --along, or --grasp-force.")
 
 
-def motion_of(pull: Pull, settings: SimulateSettings, progress: Progress = SILENT) -> Motion:
+def motion_of(case: LoadCase, settings: SimulateSettings,
+              progress: Progress = SILENT) -> SimulatedMotion:
     """Pull, along equilibria or in time."""
     if settings.kind == "static":
-        return static_motion(pull, progress)
-    return dynamic_motion(pull, NewmarkSettings(
+        return static_motion(case, progress)
+    return dynamic_motion(case, NewmarkSettings(
         settings.newmark_beta, settings.newmark_gamma, max_step=settings.step), progress)
 
 

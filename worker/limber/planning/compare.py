@@ -7,11 +7,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError, NoPathError
+from limber.planning.cost import STEP, CostWeights
 from limber.planning.field import EnergyField, FieldArrays
 from limber.planning.goals import Goal, allowed_points, goal_points
-from limber.planning.objective import STEP, Objective
 from limber.planning.ompl_engine import ompl_missing
-from limber.planning.rrt_star import FoundPath, Problem, Search, plan_path
+from limber.planning.rrt_star import FoundPath, PathProblem, Search, plan_path
 from limber.progress import SILENT, Progress
 
 
@@ -55,7 +55,7 @@ class PathPair:
     baseline: FoundPath
     plan: FoundPath
     approach: np.ndarray
-    objective: Objective
+    cost: CostWeights
 
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings, *,
@@ -77,24 +77,24 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         return goal.distance(field, points) <= goal.tolerance
 
     found = []
-    objective = Objective.between(field, start, nearest, deformation=settings.deformation_weight,
+    weighed = CostWeights.between(field, start, nearest, deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
-    shortest = Objective(0.0, 1.0, objective.energy_scale, objective.length_scale)
-    for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", objective)]):
+    shortest = CostWeights(0.0, 1.0, weighed.energy_scale, weighed.length_scale)
+    for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
         part = progress.part(0.45 * number, 0.45 * (number + 1))
         part(0.0, name)
-        problem = Problem(start, goals, in_goal, field, limits, cost.weights)
+        problem = PathProblem(start, goals, in_goal, field, limits, cost.weights)
         found.append(plan_path(problem, search, engine=engine, progress=part))
-    return PathPair(*found, _approach(field, start, settings), objective)
+    return PathPair(*found, _approach(field, start, settings), weighed)
 
 
 def _approach(field: EnergyField, start: np.ndarray, settings: PlanSettings) -> np.ndarray:
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]
-    objective = Objective.between(field, field.rest, start, distance=settings.distance_weight,
-                                  deformation=max(settings.deformation_weight, 1.0))
-    problem = Problem(field.rest, start[None], lambda points: np.linalg.norm(
-        points - start, axis=1) < 1e-9, field, field.limited(), objective.weights)
+    cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
+                               deformation=max(settings.deformation_weight, 1.0))
+    problem = PathProblem(field.rest, start[None], lambda points: np.linalg.norm(
+        points - start, axis=1) < 1e-9, field, field.limited(), cost.weights)
     return plan_path(problem, Search(iterations=1500, seed=settings.seed)).points
 
 

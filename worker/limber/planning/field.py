@@ -4,7 +4,7 @@ Two scalars are kept apart. Both are zero in the rest state, the branch with the
 which hangs under its own weight where it is given any:
 
 - ``energy``: strain energy above that of the rest state, the paper's measure of deformation.
-  Lifting a sagging branch can take it below zero; the field is clamped there.
+  Lifting a sagging branch can take it below zero; the field is cut off there.
 - ``work``: what the gripper has done to get there slowly, the strain energy plus the weight
   lifted. Its gradient is the force of the gripper. Without gravity the two are one.
 
@@ -99,7 +99,7 @@ class EnergyField:
     Attributes:
         samples: What it was fitted to.
         chart: The coordinates of the fits.
-        energy_fit, work_fit: Interpolants of the two scalars (clamped by the methods).
+        energy_fit, work_fit: Interpolants of the two scalars (cut off at 0 by the methods).
         shape_fit: Six channels: natural rotation vector and tip position.
         region: Where the field may be believed.
         errors: Held-out errors; see :func:`held_out_errors`.
@@ -123,9 +123,9 @@ class EnergyField:
         return np.maximum(self._value(self.energy_fit, points)[:, 0], 0.0)
 
     def energy_gradient(self, points: np.ndarray) -> np.ndarray:
-        """Return its gradient [N], shape [n, 3]; zero where the energy is clamped."""
-        clamped = self._value(self.energy_fit, points)[:, 0] <= 0.0
-        return np.where(clamped[:, None], 0.0, self._gradient(self.energy_fit, points, 0))
+        """Return its gradient [N], shape [n, 3]; zero where the energy is cut off."""
+        cut_off = self._value(self.energy_fit, points)[:, 0] <= 0.0
+        return np.where(cut_off[:, None], 0.0, self._gradient(self.energy_fit, points, 0))
 
     def work(self, points: np.ndarray) -> np.ndarray:
         """Return the gripper's slow work from rest [J] at ``points``, shape [n]."""
@@ -312,7 +312,7 @@ def _rms(values: np.ndarray) -> float:
 
 @compiled
 def energy_at(point, field):
-    """Return the clamped energy [J] at ``point`` [3]."""
+    """Return the energy [J], cut off at 0, at ``point`` [3]."""
     return max(value_at(mapped(point, *field.chart), 0, *field.energy), 0.0)
 
 

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from limber.errors import MissingDependencyError
-from limber.planning.objective import edge_cost
-from limber.planning.rrt_star import Problem, Search
+from limber.planning.cost import edge_cost
+from limber.planning.rrt_star import PathProblem, Search
 from limber.progress import Progress
 
 _REWIRE_FACTOR = 0.05
@@ -29,7 +29,7 @@ def ompl_missing() -> str:
     return ""
 
 
-def search_with_ompl(problem: Problem, search: Search, progress: Progress,
+def search_with_ompl(problem: PathProblem, search: Search, progress: Progress,
                      ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
     """Return the best path [n, 3] or None, the cost's history and the tree's size.
 
@@ -93,7 +93,7 @@ class _Watch:
         return self._calls > self._search.iterations
 
 
-def _space(base: object, problem: Problem) -> object:
+def _space(base: object, problem: PathProblem) -> object:
     space = base.RealVectorStateSpace(len(problem.start))
     bounds = base.RealVectorBounds(len(problem.start))
     for axis, (low, high) in enumerate(zip(problem.low, problem.high, strict=True)):
@@ -103,7 +103,7 @@ def _space(base: object, problem: Problem) -> object:
     return space
 
 
-def _rules(base: object, information: object, problem: Problem, search: Search) -> tuple:
+def _rules(base: object, information: object, problem: PathProblem, search: Search) -> tuple:
     """Make the subclasses of OMPL's classes that know the problem."""
     generator = np.random.default_rng([search.seed, 2])
     weights, field = problem.weights, problem.limits
@@ -116,7 +116,7 @@ def _rules(base: object, information: object, problem: Problem, search: Search) 
             spot = point(state)
             return math.isfinite(edge_cost(spot, spot, field, weights))
 
-    class Motion(base.MotionValidator):
+    class EdgeCheck(base.MotionValidator):
         def checkMotion(self, first: object, second: object, *_last: object) -> bool:
             return math.isfinite(edge_cost(point(first), point(second), field, weights))
 
@@ -145,4 +145,4 @@ def _rules(base: object, information: object, problem: Problem, search: Search) 
 
     goal = GoalRegion(information)
     goal.setThreshold(1e-12)
-    return Validity(information), Motion(information), PathCost(information), goal
+    return Validity(information), EdgeCheck(information), PathCost(information), goal

@@ -6,8 +6,8 @@ from multiprocessing import get_context
 import numpy as np
 
 from limber.errors import ConvergenceError
+from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.grasp_model import GraspModel, refusal
-from limber.planning.objective import PathMeasures, measure_path, resample
 from limber.progress import SILENT, Progress
 
 _APPROACH_STEP = 0.02  # [m] between poses on the way from rest to the start

@@ -16,8 +16,8 @@ import numpy as np
 
 from limber.compiled import compiled
 from limber.errors import NoPathError
+from limber.planning.cost import EdgeWeights, edge_cost, path_cost
 from limber.planning.field import EnergyField, FieldArrays
-from limber.planning.objective import EdgeWeights, edge_cost, path_cost
 from limber.planning.smoothing import polish, shortcut, slide_end
 from limber.progress import SILENT, Progress
 
@@ -25,7 +25,7 @@ _CHUNK = 250  # iterations between two reports of progress, each a chance to can
 
 
 @dataclass(frozen=True)
-class Problem:
+class PathProblem:
     """A start, goals and a cost.
 
     Attributes:
@@ -100,7 +100,7 @@ class FoundPath:
     engine: str = "own"
 
 
-def plan_path(problem: Problem, search: Search, *, engine: str = "own",
+def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
               progress: Progress = SILENT) -> FoundPath:
     """Search for the path of least cost with ``engine`` ``own`` or ``ompl``.
 
@@ -129,7 +129,7 @@ def plan_path(problem: Problem, search: Search, *, engine: str = "own",
                      history, node_count, engine)
 
 
-def _search(problem: Problem, search: Search, progress: Progress,
+def _search(problem: PathProblem, search: Search, progress: Progress,
             ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
     generator = np.random.default_rng([search.seed, 0])
     dimension = len(problem.start)

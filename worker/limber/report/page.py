@@ -98,7 +98,7 @@ def _scan(branch: Branch) -> Section:
     result = _reconstruction(branch)
     section.text += result.get("warnings") or []
     if result.get("clamped_radius_count"):
-        section.text.append(f"{result['clamped_radius_count']} radii were clamped to the cloud's "
+        section.text.append(f"{result['clamped_radius_count']} radii were limited to the cloud's "
                             "scale.")
     return section
 

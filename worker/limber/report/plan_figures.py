@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from limber.planning.cost import arc_lengths
 from limber.planning.field import EnergyField
-from limber.planning.objective import arc_lengths
 from limber.store import Branch
 
 if TYPE_CHECKING:

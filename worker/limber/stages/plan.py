@@ -17,9 +17,9 @@ from limber.errors import BranchFolderError, InputError
 from limber.mechanics.frames import write_pc2
 from limber.plain import plain
 from limber.planning.compare import PlanSettings
+from limber.planning.cost import arc_lengths
 from limber.planning.field import EnergyField
 from limber.planning.grasp_model import GraspModel
-from limber.planning.objective import arc_lengths
 from limber.planning.plan import PlannedMotion, plan_motion
 from limber.planning.resolve import ResolvedPath
 from limber.planning.sampling import energy_inputs

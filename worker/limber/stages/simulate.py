@@ -8,7 +8,7 @@ import numpy as np
 
 from limber.errors import ConvergenceError
 from limber.files import write_atomically
-from limber.mechanics.dynamics.pull import Motion
+from limber.mechanics.dynamics.load_case import SimulatedMotion
 from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
@@ -16,9 +16,9 @@ from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.simulate import (
     SimulateSettings,
     largest_strains,
+    load_case_of,
     loaded_model,
     motion_of,
-    pull_of,
     require_one_drive,
 )
 from limber.progress import SILENT, Progress
@@ -57,12 +57,12 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     progress(0.0, "preparing")
     scanned = _scanned_model(branch, settings)
     model = loaded_model(scanned, settings, progress.part(0.0, 0.2))
-    pull = pull_of(model, scanned.mesh, settings, along)
-    motion = motion_of(pull, settings, progress.part(0.2, 0.9))
+    case = load_case_of(model, scanned.mesh, settings, along)
+    motion = motion_of(case, settings, progress.part(0.2, 0.9))
     for message in motion.warnings:
         progress.warn(message)
     with branch.stage(KEY, settings, reads=["mesh.vtu"], digests=digests) as stage:
-        result = _write(stage, pull.model, settings, motion)
+        result = _write(stage, case.model, settings, motion)
         stage.result.update(result)
     progress(1.0, "done")
     if not motion.converged:
@@ -83,7 +83,7 @@ def _scanned_model(branch: Branch, settings: SimulateSettings) -> BranchModel:
 
 
 def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
-           motion: Motion) -> dict[str, Any]:
+           motion: SimulatedMotion) -> dict[str, Any]:
     displacement = motion.displacement
     nodes = surface_nodes(model.mesh)
     write_pc2(stage.path(f"frames/{settings.name}.pc2"),

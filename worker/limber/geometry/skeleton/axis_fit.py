@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.skeleton import CLAMPED, INTERPOLATED, MEASURED, Skeleton
+from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
 from limber.geometry.surface.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
@@ -169,13 +169,13 @@ def attached(skeleton: Skeleton) -> Skeleton:
                                radius_state=skeleton.radius_state[keep])
 
 
-def clamped(skeleton: Skeleton, low: float, high: float) -> Skeleton:
-    """Return the skeleton with radii clamped to [low, high] [m], those nodes marked.
+def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
+    """Return the skeleton with radii limited to [low, high] [m], those nodes marked.
 
     The paper's rule r in [alpha D, beta D], with the cloud's scale D.
     """
     outside = (skeleton.radius < low) | (skeleton.radius > high)
-    state = np.where(outside, CLAMPED, skeleton.radius_state).astype(np.int8)
+    state = np.where(outside, LIMITED, skeleton.radius_state).astype(np.int8)
     return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
 
 
@@ -195,7 +195,7 @@ def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
             if place >= max(6, len(own) // 8):
                 cap = min(cap, growth * float(np.median(radius[own[:place]])))
             if radius[node] > cap:
-                radius[node], state[node] = cap, CLAMPED
+                radius[node], state[node] = cap, LIMITED
     return replace(skeleton, radius=radius, radius_state=state)
 
 

@@ -87,7 +87,7 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
     """Write one cylinder for each node but the root, as CSV in metres.
 
     Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
-    standard deviation, and its state (0 measured, 1 clamped, 2 interpolated).
+    standard deviation, and its state (0 measured, 1 limited, 2 interpolated).
     """
     start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
     length = np.linalg.norm(end - start, axis=1)

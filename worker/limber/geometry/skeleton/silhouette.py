@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
-from limber.geometry.skeleton.skeleton import CLAMPED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 
 _ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouette tells the width
 _WINDOW = 3  # nodes to each side whose silhouette is taken together
@@ -74,7 +74,7 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
         view: Where it was seen from.
 
     Returns:
-        The skeleton, and how many radii were clamped.
+        The skeleton, and how many radii were limited.
     """
     segment, _ = nearest_cylinders(skeleton, points)
     pixel = view.pitch * np.linalg.norm(points - view.eye, axis=1)
@@ -95,11 +95,11 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
             # Half a pixel to each side, that the edge may have lost, and as much for its place.
             cap = _SLACK * float(area[own[near]].sum()) / (2 * total) + width[own[near]].max()
             if radius[node] > cap:
-                radius[node], state[node] = cap, CLAMPED
+                radius[node], state[node] = cap, LIMITED
         if run == 0 and radius[0] > 1.1 * radius[members[1]]:
-            radius[0], state[0] = 1.1 * radius[members[1]], CLAMPED
-    clamped = int((radius < skeleton.radius).sum())
-    return replace(skeleton, radius=radius, radius_state=state), clamped
+            radius[0], state[0] = 1.1 * radius[members[1]], LIMITED
+    limited = int((radius < skeleton.radius).sum())
+    return replace(skeleton, radius=radius, radius_state=state), limited
 
 
 def _beyond(skeleton: Skeleton, twig: np.ndarray, carrier: np.ndarray, view: View,

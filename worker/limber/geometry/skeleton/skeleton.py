@@ -7,8 +7,8 @@ import numpy as np
 
 from limber.errors import InputError
 
-MEASURED, CLAMPED, INTERPOLATED = 0, 1, 2
-"""Values of ``radius_state``: fitted to points, clamped to the cloud's scale, or filled in."""
+MEASURED, LIMITED, INTERPOLATED = 0, 1, 2
+"""Values of ``radius_state``: fitted to points, limited to the cloud's scale, or filled in."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Skeleton:
         radius_sigma: Standard deviation of each radius [m], shape [n]; 0 where unknown.
         branch: Index of the unforked run that each node belongs to, shape [n]; 0 is the main one.
         order: Branching order, 0 for the main run, shape [n].
-        radius_state: ``MEASURED``, ``CLAMPED`` or ``INTERPOLATED``, shape [n].
+        radius_state: ``MEASURED``, ``LIMITED`` or ``INTERPOLATED``, shape [n].
     """
 
     nodes: np.ndarray

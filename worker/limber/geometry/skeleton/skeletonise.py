@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from limber.geometry.skeleton.axis_fit import (
     AxisFit,
     attached,
-    clamped,
     fit_axes,
+    limited,
     nearest_cylinders,
     resampled,
     tapered,
@@ -61,9 +61,9 @@ class SkeletonSettings(BaseModel):
     plants: Literal["refuse", "largest", "joined"] = Field(
         "refuse", description="Two plants in one cloud: refuse, take the largest, or join them.")
     radius_low: float = Field(
-        5e-4, ge=0, description="Radii are clamped from below at this share of the diagonal.")
+        5e-4, ge=0, description="Radii are limited from below at this share of the diagonal.")
     radius_high: float = Field(
-        0.1, gt=0, le=1, description="Radii are clamped from above at this share.")
+        0.1, gt=0, le=1, description="Radii are limited from above at this share.")
 
 
 @dataclass(frozen=True)
@@ -258,12 +258,12 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
     skeleton, strands = _without_strands(skeleton.subset(keep))
-    skeleton = resampled(clamped(skeleton, low, high), 1.0)
+    skeleton = resampled(limited(skeleton, low, high), 1.0)
     fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.5, 0.8))
     skeleton, late = _without_strands(fit.skeleton)
     fit = fit_axes(skeleton, points, rounds=6 if late else 0, progress=progress.part(0.8, 1.0))
     pruned += strands + late
-    return replace(fit, skeleton=tapered(clamped(fit.skeleton, low, high))), pruned
+    return replace(fit, skeleton=tapered(limited(fit.skeleton, low, high))), pruned
 
 
 def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
@@ -276,7 +276,7 @@ def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
     for _ in range(3):
         skeleton = skeleton.moved(_evened(skeleton))
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
-    skeleton = _with_full_tips(tapered(clamped(skeleton, low, high)), points, fit)
+    skeleton = _with_full_tips(tapered(limited(skeleton, low, high)), points, fit)
     return replace(fit, skeleton=replace(
         skeleton, radius_sigma=0.25 * skeleton.radius,
         radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8)))

@@ -13,7 +13,7 @@ def straight_beam(length: float, radius_root: float, radius_tip: float | None = 
                   quadratic: bool = True, young: float = 1e8, poisson: float = 0.35,
                   density: float = 900.0, fractions: tuple[float, ...] = (0.2, 0.4, 0.6, 0.8),
                   grasp_fraction: float = 1.0) -> TetMesh:
-    """Mesh a straight round beam that starts at the origin, clamped there.
+    """Mesh a straight round beam that starts at the origin, fixed there.
 
     The cross-section is a regular polygon of the circle's area (for 6 sides its second moment is
     0.8 % over the circle's), with one node on the axis.

@@ -67,12 +67,12 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
     tangents = None
     if sensitivities is not None:
         tangents = MotionTangents(drive, settings, sensitivities, sensitivity_nodes)
-    run = _Motion(drive, settings, tangents)
+    run = _Run(drive, settings, tangents)
     run.begin(start)
     return run.go(progress)
 
 
-class _Motion:
+class _Run:
     """A motion under way."""
 
     def __init__(self, drive: Drive, settings: NewmarkSettings,

@@ -8,7 +8,7 @@ from limber.mechanics.grasp import pose_between
 from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.materials import Material
 from limber.mechanics.model import InternalState
-from limber.mechanics.statics.problem import Problem, Target, make_result, strain_warnings
+from limber.mechanics.statics.problem import StaticProblem, Target, make_result, strain_warnings
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.snap import settle
 from limber.mechanics.status import Status
@@ -24,7 +24,7 @@ _SNAP = 1 / 64
 class Path:
     """The way from a start to a target, in steps of adapted length."""
 
-    def __init__(self, problem: Problem, begin: np.ndarray, goal: Target,
+    def __init__(self, problem: StaticProblem, begin: np.ndarray, goal: Target,
                  pose: np.ndarray | None):
         self.problem, self.goal, self.pose = problem, goal, pose
         self.model, self.equations = problem.model, problem.equations

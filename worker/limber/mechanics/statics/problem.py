@@ -29,7 +29,7 @@ class Target:
     load: np.ndarray
 
 
-class Problem:
+class StaticProblem:
     """One set of constraints; solves for a target from a start."""
 
     def __init__(self, model: BranchModel, grasp: Grasp | Sequence[Grasp] | None,
@@ -101,7 +101,7 @@ def strain_warnings(stretch: Place) -> list[str]:
             " Check the units of loads and of Young's modulus."]
 
 
-def make_result(problem: Problem, displacement: np.ndarray, state: InternalState,
+def make_result(problem: StaticProblem, displacement: np.ndarray, state: InternalState,
                 load: np.ndarray, **found: object) -> StaticResult:
     """Return a result with the reactions that belong to a displacement."""
     model = problem.model
@@ -134,7 +134,7 @@ def base_forces(model: BranchModel, out: np.ndarray) -> np.ndarray:
     return base if model.hanging is None else base + model.hanging.total.base
 
 
-def grasp_wrench(problem: Problem, grasp: Grasp, positions: np.ndarray, out: np.ndarray,
+def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, out: np.ndarray,
                  centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return force [N] and torque [Nm] about ``centre`` of a gripper on the branch.
 

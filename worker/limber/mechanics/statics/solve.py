@@ -15,7 +15,7 @@ import numpy as np
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.path import Path
-from limber.mechanics.statics.problem import Problem, Target
+from limber.mechanics.statics.problem import StaticProblem, Target
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.status import Status
 from limber.progress import SILENT, Progress
@@ -40,7 +40,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
     Raises:
         InputError: arguments that do not fit each other.
     """
-    problem = Problem(model, grasp, pose is not None, settings)
+    problem = StaticProblem(model, grasp, pose is not None, settings)
     goal = problem.target(pose, grasp_force, nodal_forces)
     begin = problem.displacement_of(start)
     result = Path(problem, begin, goal, pose).run(progress)
@@ -58,7 +58,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
 
     After a pose that fails the next starts from the last converged state.
     """
-    problem = Problem(model, grasp, True, settings)
+    problem = StaticProblem(model, grasp, True, settings)
     displacement = problem.displacement_of(start)
     results = []
     for number, pose in enumerate(poses):
@@ -83,18 +83,18 @@ def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
     Args:
         displacement: [m], shape [node_count, 3]; rows of nodes that are not fixed are unused.
     """
-    problem = Problem(model, None, False, settings)
+    problem = StaticProblem(model, None, False, settings)
     goal = problem.target(None, None, nodal_forces)
     held = np.where(model.fixed[:, None], displacement, 0.0)
     begin = np.zeros_like(held)
     return Path(problem, begin, replace(goal, held=held), None).run(SILENT)
 
 
-def _verified(problem: Problem, result: StaticResult, goal: Target, pose: np.ndarray | None,
+def _verified(problem: StaticProblem, result: StaticResult, goal: Target, pose: np.ndarray | None,
               progress: Progress) -> StaticResult:
     """Return the result, or, if a path from rest in small steps ends lower, a refusal."""
     careful = replace(problem.settings, max_step=problem.settings.max_step / 4, verify=False)
-    other = Problem(problem.model, problem.grasps or None, problem.is_held, careful)
+    other = StaticProblem(problem.model, problem.grasps or None, problem.is_held, careful)
     other.single = problem.single
     again = Path(other, problem.displacement_of(None), goal, pose).run(progress)
     lower = result.energy - again.energy

@@ -1,4 +1,4 @@
-"""A pull of a branch: what holds it, what pulls it, and the motion that follows."""
+"""A load case: what holds a branch, what pulls it, and the motion that follows."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from limber.progress import Progress
 
 
 @dataclass(frozen=True)
-class Pull:
+class LoadCase:
     """Loads and constraints over the frames of a pull.
 
     Attributes:
@@ -72,7 +72,7 @@ class Pull:
 
 
 @dataclass(frozen=True)
-class Motion:
+class SimulatedMotion:
     """Frames of a motion; shorter than the pull where the branch could not follow.
 
     Attributes:
@@ -100,51 +100,52 @@ class Motion:
     warnings: list[str]
 
 
-def static_motion(pull: Pull, progress: Progress) -> Motion:
+def static_motion(case: LoadCase, progress: Progress) -> SimulatedMotion:
     """Follow a pull through equilibria; ends with the first frame that has none."""
-    held, poses, forces = pull.held, pull.poses(), pull.nodal_forces()
+    held, poses, forces = case.held, case.poses(), case.nodal_forces()
     results: list[StaticResult] = []
-    for number, part in enumerate(pull.part):
-        progress(number / len(pull.part), "following the pull", frame=number)
+    for number, part in enumerate(case.part):
+        progress(number / len(case.part), "following the pull", frame=number)
         results.append(solve_static(
-            pull.model, grasp=held or None, pose=poses[number] if held else None,
-            nodal_forces=part * forces, start=results[-1] if results else pull.start))
+            case.model, grasp=held or None, pose=poses[number] if held else None,
+            nodal_forces=part * forces, start=results[-1] if results else case.start))
         if not results[-1].converged:
             break
     last, count = results[-1], len(results)
     reactions = np.array([r.reaction_force for r in results]).reshape(count, -1, 3)
     torques = np.array([r.reaction_torque for r in results]).reshape(count, -1, 3)
-    force, hold_forces = _forces(pull, reactions)
-    return Motion(
-        times=pull.times[:count], displacement=np.array([r.displacement for r in results]),
-        energy=np.array([r.energy for r in results]) - pull.start.energy,
+    force, hold_forces = _forces(case, reactions)
+    return SimulatedMotion(
+        times=case.times[:count], displacement=np.array([r.displacement for r in results]),
+        energy=np.array([r.energy for r in results]) - case.start.energy,
         kinetic_energy=np.zeros(count), grasp_force=force,
-        grasp_torque=pull.at_grippers(torques)[0], hold_forces=hold_forces,
+        grasp_torque=case.at_grippers(torques)[0], hold_forces=hold_forces,
         min_det_f=np.array([r.min_det_f for r in results]), converged=last.converged,
         message=last.message, warnings=last.warnings)
 
 
-def dynamic_motion(pull: Pull, settings: NewmarkSettings, progress: Progress) -> Motion:
+def dynamic_motion(case: LoadCase, settings: NewmarkSettings,
+                   progress: Progress) -> SimulatedMotion:
     """Follow a pull in time, with inertia and damping."""
-    held, forces = pull.held, pull.nodal_forces()
+    held, forces = case.held, case.nodal_forces()
     found = simulate_dynamics(
-        pull.model, grasp=held or None, poses=pull.poses() if held else None,
-        nodal_forces=pull.part[:, None, None] * forces if forces.any() else None,
-        times=pull.times, start=pull.start, settings=settings, progress=progress)
+        case.model, grasp=held or None, poses=case.poses() if held else None,
+        nodal_forces=case.part[:, None, None] * forces if forces.any() else None,
+        times=case.times, start=case.start, settings=settings, progress=progress)
     count = len(found.times)
-    force, hold_forces = _forces(pull, found.reaction_force.reshape(count, -1, 3))
-    return Motion(
+    force, hold_forces = _forces(case, found.reaction_force.reshape(count, -1, 3))
+    return SimulatedMotion(
         times=found.times, displacement=found.displacement,
-        energy=found.energy - pull.start.energy,
+        energy=found.energy - case.start.energy,
         kinetic_energy=found.kinetic_energy, grasp_force=force,
-        grasp_torque=pull.at_grippers(found.reaction_torque.reshape(count, -1, 3))[0],
+        grasp_torque=case.at_grippers(found.reaction_torque.reshape(count, -1, 3))[0],
         hold_forces=hold_forces, min_det_f=found.min_det_f, converged=found.converged,
         message=found.message, warnings=found.warnings)
 
 
-def _forces(pull: Pull, reactions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _forces(case: LoadCase, reactions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the gripper's forces [frames, 3] and those of the holds [frames, holds, 3]."""
-    force, hold_forces = pull.at_grippers(reactions[:, :len(pull.held)])
-    if not pull.follows_pose:
-        force = pull.part[:len(reactions), None] * pull.grasp_force
+    force, hold_forces = case.at_grippers(reactions[:, :len(case.held)])
+    if not case.follows_pose:
+        force = case.part[:len(reactions), None] * case.grasp_force
     return force, hold_forces

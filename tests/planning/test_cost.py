@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.planning.objective import (
-    Objective,
+from limber.planning.cost import (
+    CostWeights,
     arc_lengths,
     edge_cost,
     measure_path,
@@ -16,46 +16,46 @@ START, GOAL = np.array([-0.12, 0.0, 0.0]), np.array([0.12, 0.0, 0.0])
 
 
 @pytest.fixture
-def objective(ridge_field):
-    return Objective.between(ridge_field, START, GOAL, deformation=1.0, distance=0.5)
+def cost_weights(ridge_field):
+    return CostWeights.between(ridge_field, START, GOAL, deformation=1.0, distance=0.5)
 
 
-def test_cost_is_the_integral(ridge_field, objective):
-    """The edge's cost is the two integrals of the objective, here by fine quadrature."""
+def test_cost_is_the_integral(ridge_field, cost_weights):
+    """The edge's cost is the two integrals of the cost, here by fine quadrature."""
     line = np.linspace(START, GOAL, 4001)
     energy = ridge_field.energy(line)
     along = np.linspace(0.0, 0.24, 4001)
     wanted = np.trapz(energy, along) / (energy.max() * 0.24) + 0.5  # noqa: NPY201
-    found = edge_cost(START, GOAL, ridge_field.limited(), objective.weights)
+    found = edge_cost(START, GOAL, ridge_field.limited(), cost_weights.weights)
     assert found == pytest.approx(wanted, rel=2e-3)
 
 
-def test_division_of_an_edge_changes_nothing(ridge_field, objective):
+def test_division_of_an_edge_changes_nothing(ridge_field, cost_weights):
     """Additive: a line in 3 or in 48 edges costs the same, to quadrature error."""
-    costs = [path_cost(np.linspace(START, GOAL, n), ridge_field.limited(), objective.weights)
+    costs = [path_cost(np.linspace(START, GOAL, n), ridge_field.limited(), cost_weights.weights)
              for n in (2, 4, 13, 49)]
     assert np.ptp(costs) < 2e-3 * costs[0]
 
 
-def test_there_and_back_cost_the_same(ridge_field, objective):
+def test_there_and_back_cost_the_same(ridge_field, cost_weights):
     """Symmetric in direction, which rewiring relies on."""
     field = ridge_field.limited()
-    assert edge_cost(START, GOAL, field, objective.weights) == pytest.approx(
-        edge_cost(GOAL, START, field, objective.weights), rel=1e-12)
+    assert edge_cost(START, GOAL, field, cost_weights.weights) == pytest.approx(
+        edge_cost(GOAL, START, field, cost_weights.weights), rel=1e-12)
 
 
-def test_limits_make_an_edge_infinite(ridge_field, objective):
+def test_limits_make_an_edge_infinite(ridge_field, cost_weights):
     """An edge over the ridge is refused by a limit on energy, and by one on force."""
-    over = edge_cost(START, GOAL, ridge_field.limited(max_energy=0.2), objective.weights)
-    hard = edge_cost(START, GOAL, ridge_field.limited(max_force=2.0), objective.weights)
+    over = edge_cost(START, GOAL, ridge_field.limited(max_energy=0.2), cost_weights.weights)
+    hard = edge_cost(START, GOAL, ridge_field.limited(max_force=2.0), cost_weights.weights)
     assert np.isinf(over) and np.isinf(hard)
-    assert np.isfinite(edge_cost(START, GOAL, ridge_field.limited(1.0, 20.0), objective.weights))
+    assert np.isfinite(edge_cost(START, GOAL, ridge_field.limited(1.0, 20.0), cost_weights.weights))
 
 
-def test_outside_the_samples_is_infinite(ridge_field, objective):
+def test_outside_the_samples_is_infinite(ridge_field, cost_weights):
     """No edge leaves the region where the field is known."""
     assert np.isinf(edge_cost(START, np.array([0.5, 0, 0]), ridge_field.limited(),
-                              objective.weights))
+                              cost_weights.weights))
 
 
 def test_measures_of_a_known_path():

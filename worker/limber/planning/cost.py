@@ -32,7 +32,7 @@ class EdgeWeights(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Objective:
+class CostWeights:
     """The weights ``a_def`` and ``a_dis``, both without unit, and the scales ``E0`` [J], ``L0``
     [m]. The baseline RRT* is ``a_def = 0``, ``a_dis = 1``."""
 
@@ -43,7 +43,7 @@ class Objective:
 
     @classmethod
     def between(cls, field: EnergyField, start: np.ndarray, goal: np.ndarray, *,
-                deformation: float, distance: float) -> "Objective":
+                deformation: float, distance: float) -> "CostWeights":
         """Scale to the straight line from ``start`` to ``goal`` [3]."""
         line = resample(np.stack([start, goal]), STEP)
         line = line[field.region.contains(line)]
