@@ -47,7 +47,7 @@ twice the stated noise. Of 10 branches reconstructed from scans, all sound ones 
 and the one whose axis ran into a twig and back came to 13, with moduli threefold off."""
 
 WIDE = 0.15
-"""Standard deviation of a log E from which it is worth a word what would narrow it."""
+"""Standard deviation of a log E from which it is worth a word what would narrow it: chosen."""
 ADVICE = {"sensor": "More pulls, in other directions or farther, would narrow it.",
           "geometry": "A scan from more sides, or with less noise, would narrow it.",
           "mesh": "A finer mesh (--mesh-spacing of reconstruct) would narrow it."}

@@ -9,9 +9,10 @@ from limber.estimation.objective import Evaluation
 from limber.estimation.parameters import ParameterSpace
 
 UNRESOLVED_DEVIATION = 0.5
-"""A modulus whose logarithm has a larger standard deviation is linked to its neighbour."""
+"""A modulus whose logarithm has a larger standard deviation is linked to its neighbour: chosen."""
 SCALE_DEVIATION = 0.7
-"""The data must give the scale of all moduli together better than this (in its logarithm)."""
+"""The data must give the scale of all moduli together better than this (in its logarithm): a
+factor of two, chosen."""
 
 
 @dataclass(frozen=True)

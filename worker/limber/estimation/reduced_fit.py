@@ -30,6 +30,8 @@ from limber.mechanics.reduced.training import Trainer, sample_young
 from limber.progress import SILENT, Progress
 from limber.recordings.grasping import pose_on
 
+# Sizes and limits are chosen; the model's error is measured by every fit and corrected, so that
+# they cost time, not truth.
 STATES_PER_PULL = 24
 """Full solutions along each pull that the basis is made of."""
 FEWEST_STATES = 24
@@ -39,8 +41,11 @@ SIZE, SIZE_PER_PULL = 48, 16
 YOUNG_SPREAD = 1.5
 """Factor in Young's modulus within which they are sampled."""
 ROUGH_KEY_FRAMES = 4
+"""Of the full model's fit that the basis is made around."""
 ROUND_LIMIT = 5
+"""Corrections at most."""
 REBUILD_LIMIT = 2
+"""Other bases at most, where the fit left what the first was made for."""
 SETTLED = 1e-3
 """Change of a log E by a new correction at which it is good enough."""
 SETTLED_DEVIATIONS = 0.05

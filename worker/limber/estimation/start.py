@@ -10,8 +10,10 @@ from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 
 PARTS = (0.25, 0.45, 0.7)
-"""Of a fast pull's frames, how many are fitted before all of them are."""
+"""Of a fast pull's frames, how many are fitted before all of them are: over a quarter a branch
+cannot be a whole swing off. The parts between are chosen, not measured."""
 FEWEST_FRAMES = 6
+"""Fewer frames say nothing of a motion."""
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:

@@ -8,9 +8,10 @@ from scipy import stats
 from limber.estimation.objective import Evaluation, Objective
 
 OUTLIER = 4.5
-"""Standardised residual (RMS over axes) from which a measurement is named an outlier."""
+"""Standardised residual (RMS over axes) from which a measurement is named an outlier: chosen,
+far beyond normal noise."""
 OUTLIER_SHARE = 0.15
-"""Above this share of residuals far off, the others are not the truth about the noise."""
+"""Above this share of residuals far off, the others are not the truth about the noise: chosen."""
 
 
 @dataclass(frozen=True)

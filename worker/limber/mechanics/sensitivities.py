@@ -23,6 +23,7 @@ PARAMETERS = ("log_young", "poisson", "log_density", "damping_mass", "damping_st
 """What can be differentiated for. ``log_young`` is one column for each column of the weights."""
 
 _REFINEMENTS = 12
+"""Of a solve, at most: a bound, refinement ends at round-off."""
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,9 @@ PointLoad = tuple[float, float, float, float, float, float]
 PlacedMass = tuple[float, float, float, float]
 
 _PROBE = 1e-6
-# Of the way from base to grasp: how far a branch is bent when nothing is asked for.
+"""[N], so little that the branch answers linearly."""
 _DEFAULT_BEND = 0.2
+"""Of the way from base to grasp: how far a branch is bent when nothing is asked for; chosen."""
 
 
 class SimulateSettings(BaseModel):

@@ -86,10 +86,6 @@ class RadialInterpolant:
                    gradient_weights.reshape(-1, dimension, values.shape[1]).copy(),
                    np.ascontiguousarray(polynomial), powers)
 
-    @property
-    def channel_count(self) -> int:
-        return self.value_weights.shape[1]
-
     def value(self, points: np.ndarray) -> np.ndarray:
         """Return the field at ``points`` [n, dimension], shape [n, channels]."""
         return _values(np.ascontiguousarray(points, float), *self.arrays)

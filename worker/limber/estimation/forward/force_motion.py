@@ -12,6 +12,7 @@ from limber.mechanics.dynamics.motion import DEFAULT_SETTINGS
 from limber.mechanics.model import BranchModel
 
 MODES = 16
+"""That carry the change of a motion; the rest follows statically. Chosen, not measured."""
 SPARE = 8
 ITERATIONS = 8
 """Subspace iteration: with this many vectors more than modes wanted, so often."""

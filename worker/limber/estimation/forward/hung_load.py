@@ -14,7 +14,7 @@ from limber.recordings.recording import Observations
 FRAMES = 4
 """Frames that the settled part is averaged into."""
 STILL_SHARE = 0.005
-"""Settled means: within this share of the whole displacement of where it ends."""
+"""Settled means: within this share of the whole displacement of where it ends: chosen."""
 REGISTRATION_SHARE = 0.25
 """A marker whose place on the body is off by 1 mm is off by so much of that when it moves: the
 displacement changes along a bent body by about its slope."""

@@ -24,7 +24,7 @@ from limber.recordings.recording import GraspEntry
 
 COURSE_MISFIT = 1.5
 """Mean squared deviation of readings from their course, over the stated, from which the course
-gets more key frames."""
+gets more key frames: chosen, not measured."""
 CLIPPED = 4.0
 """A reading farther off its course than so many deviations is an outlier, no bend of the course."""
 
@@ -58,11 +58,6 @@ class Course:
     spread: np.ndarray
     values: np.ndarray
     exact: bool = False
-
-    @property
-    def at_frames(self) -> np.ndarray:
-        """Shape [f, c]."""
-        return self.spread @ self.values
 
 
 def course_of(frames: Frames, sigma: np.ndarray, count: int, components: int) -> Course:

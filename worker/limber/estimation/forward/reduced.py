@@ -53,7 +53,6 @@ class ReducedForward(Forward):
         self._poses = [pose_on(reduced.grasp, entry.grasp, pose)
                        for pose in frames.poses[self.keys]]
         self._states: list[ReducedState | None] = [None] * len(self._poses)
-        self.untrusted_count = 0
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
@@ -65,12 +64,11 @@ class ReducedForward(Forward):
         positions, forces = np.empty(shape), np.empty((len(self._poses), 6))
         d_positions = np.zeros((*shape, count + len(extra))) if sensitivities else None
         d_forces = np.zeros((len(self._poses), 6, count + len(extra))) if sensitivities else None
-        before, untrusted = None, 0
+        before = None
         for index, pose in enumerate(self._poses):
             state = model.solve_static(pose, start=self._states[index] or before)
             if not state.converged:
                 return None
-            untrusted += not state.trusted
             self._states[index] = before = state
             positions[index] = self._seen(state)
             # About the recorded grasp point, which the patch's centre lies beside.
@@ -89,7 +87,6 @@ class ReducedForward(Forward):
                     return None
                 d_positions[index, ..., column] = (self._seen(ahead) - self._seen(behind)) / step
                 d_forces[index, :, column] = (_wrench(ahead, arm) - _wrench(behind, arm)) / step
-        self.untrusted_count = untrusted
         positions, wrenches, d_positions, d_wrenches = (
             None if value is None else np.tensordot(self.spread, value, axes=1)
             for value in (positions, forces, d_positions, d_forces))

@@ -26,6 +26,7 @@ from limber.recordings.recording import GraspEntry
 REFRESH_STATES = 24
 """Full solutions of a basis that is made while a pull goes on."""
 REFRESH_SPREAD = 1.5
+"""Factor in Young's modulus within which they are sampled; as for a fit, chosen."""
 
 
 @dataclass(frozen=True)

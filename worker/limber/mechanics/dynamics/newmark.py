@@ -11,6 +11,8 @@ from limber.mechanics.status import Status
 from limber.sparse import NotPositiveDefiniteError
 
 _GOOD_TANGENT = 1e-3
+"""Part of the residual that a tangent's own solve may leave for the next step to begin with it:
+chosen, not measured."""
 
 
 class NewmarkStepper:

@@ -23,6 +23,8 @@ _NO_INCREMENT = np.zeros((0, 3))
 _NO_MEMORY = np.zeros((0, 0, 6, 0))
 _FIRST_SHIFT = 1e-7
 _LAST_SHIFT = 1.0
+"""What is added to the diagonal until it is positive definite, tenfold each time, as parts of its
+mean: a range, from just over round-off to another matrix."""
 
 
 @dataclass(frozen=True)

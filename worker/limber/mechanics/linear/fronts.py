@@ -17,7 +17,8 @@ PAD = 8
 """Rows are padded to multiples of this: no loop over rows has a remainder."""
 
 _RELAX = ((24, 0.4), (72, 0.1), (200, 0.05))
-"""A child is joined to its parent if so many columns together have less than this part of zeros."""
+"""A child is joined to its parent if so many columns together have less than this part of zeros.
+Chosen along with the kernels on 2,752 quadratic tetrahedra; not measured one by one."""
 
 
 @dataclass(frozen=True)

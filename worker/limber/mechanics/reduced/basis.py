@@ -17,6 +17,8 @@ from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.training import Snapshots
 
+# Shares and steps weigh what a basis is made of against each other: chosen, not measured one by
+# one; the errors that come out are (scripts/bench mechanics, rows of the reduced model).
 TANGENT_SHARE = 0.25
 """Weight of tangents beside states; they stand for the change by the steps below."""
 SWING_SHARE = 0.1

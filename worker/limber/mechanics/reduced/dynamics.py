@@ -20,10 +20,14 @@ from limber.mechanics.reduced.model import ReducedModel, ReducedState, solved_ra
 from limber.progress import SILENT, Progress
 
 _HALVINGS = 6
+"""Of a step that fails, at most, where nobody waits for it."""
 _NEAR = 1e-5
+"""Next gain of energy over the energy from which Newton is taken to close in; chosen."""
 _JUMP = 2e-3
-"""Grasp's motion off its old velocity, as part of the extent, that a first step foresees."""
+"""Grasp's motion off its old velocity, as part of the extent, that a first step foresees: chosen,
+not measured."""
 _LIVE_HALVINGS = 3
+"""The same where a frame is waited for: 8 steps of about a millisecond fit into one of 60 Hz."""
 _NEWMARK = NewmarkSettings()
 
 

@@ -50,7 +50,7 @@ _STATIC = ReducedStaticSettings()
 _DEFAULT = ReducedSettings()
 _NO_INCREMENT = np.empty(0)
 _LEADING = 20
-"""Modes that tell whether a state is like those of the training."""
+"""Modes that tell whether a state is like those of the training: chosen, not measured."""
 
 
 @dataclass

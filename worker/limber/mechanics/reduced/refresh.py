@@ -27,6 +27,7 @@ from limber.progress import SILENT, Progress
 from limber.sparse import NotPositiveDefiniteError
 
 _CORRECTIONS = 4
+"""Newton steps of the full model that a reduced state is compared after: chosen, not measured."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,10 @@ _TIP_TURNS = 1.3
 """How much a cantilever's end turns per turn of its chord: between 1 (stiff) and 1.5 (small)."""
 
 _SWING = 0.14
-"""How far the lowest vibration swings a state out, as part of the extent; higher ones less."""
+"""How far the lowest vibration swings a state out, as part of the extent; higher ones less: about
+what brisk motion does. Chosen, not measured."""
 _SWING_COUNT = 3
+"""States swung out from one: chosen, not measured."""
 
 
 @dataclass(frozen=True)
