@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from limber.errors import InputError
-from limber.mechanics.grasp import Grasp, pose_between
+from limber.mechanics.grasp import RADIAN, Grasp, pose_between
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.model import as_control_points
 from limber.mechanics.statics.solve import solve_static
@@ -20,8 +20,6 @@ from limber.session.protocol import GRASP_LIMIT, Load
 FULL_STEP = 0.05
 """Longest way to the wanted poses that the full model goes before it shows a frame, as part of the
 branch's extent."""
-_TURN = 0.3
-"""Metres per radian in the distance of two poses, as part of the extent."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +186,7 @@ class HeldBranch:
         held = self.grasps[number]
         move = held.goal - held.pose
         return float(np.linalg.norm(move[:3])
-                     + _TURN * self.model.extent * np.linalg.norm(move[3:]))
+                     + RADIAN * self.model.extent * np.linalg.norm(move[3:]))
 
     def put(self, number: int, pose: np.ndarray, displacement: np.ndarray) -> None:
         """Note that a grasp is at a pose now, with the branch displaced so."""
