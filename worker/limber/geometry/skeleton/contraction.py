@@ -12,6 +12,7 @@ follows every hole of the scan and costs several times the time (`scripts/bench 
 
 import time
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 import scipy.sparse as sparse
@@ -30,6 +31,21 @@ _GROWTH = 3.0
 _STILL_THICK = 0.6  # share of points not yet on a line, down to which the weights grow
 
 
+class ContractionStatus(StrEnum):
+    """How a contraction ended; each is its own text.
+
+    contracted: nearly all points lie on lines.
+    stalled: points no longer moved.
+    iteration_limit: no more solves were allowed.
+    given: the skeleton was given, nothing was contracted.
+    """
+
+    contracted = "contracted"
+    stalled = "stalled"
+    iteration_limit = "iteration limit"
+    given = "skeleton given"
+
+
 @dataclass(frozen=True)
 class Contraction:
     """What the contraction ended with.
@@ -40,7 +56,7 @@ class Contraction:
         linearity: Share of the variance around each point that lies along one line, 1/3 to 1,
             shape [n]: 1 where the cloud has become a curve.
         iterations: Number of linear solves.
-        status: ``contracted``, ``stalled`` (points no longer moved) or ``iteration limit``.
+        status: How it ended.
         history: One dict an iteration: ``moved`` [m], ``active`` (share of points not yet on a
             curve), ``seconds``.
         drawn: Contracted points [m] before they were recentred: less right, but they tell
@@ -50,7 +66,7 @@ class Contraction:
     points: np.ndarray
     linearity: np.ndarray
     iterations: int
-    status: str
+    status: ContractionStatus
     history: list[dict[str, float]] = field(default_factory=list)
     drawn: np.ndarray = field(default=None)
 
@@ -80,7 +96,7 @@ def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: fl
     solver = _NormalEquations(laplacian)
     weight = np.ones(len(points))
     history: list[dict[str, float]] = []
-    status, linearity = "iteration limit", local_linearity(positions)
+    status, linearity = ContractionStatus.iteration_limit, local_linearity(positions)
     for iteration in range(iteration_limit):
         started = time.perf_counter()
         drawn = solver.solve(weight, positions)
@@ -97,10 +113,10 @@ def contract(points: np.ndarray, *, iteration_limit: int = 12, linear_enough: fl
         progress((iteration + 1) / iteration_limit, "contracting", iteration=iteration + 1,
                  active=float(active.mean()), moved_m=moved * scale)
         if active.mean() < active_share:
-            status = "contracted"
+            status = ContractionStatus.contracted
             break
         if iteration > 3 and moved * scale < 0.1 * max(done["moved"] for done in history):
-            status = "stalled"
+            status = ContractionStatus.stalled
             break
     axes = recentred((points - centre) / scale, positions)
     return Contraction(axes * scale + centre, linearity, len(history), status, history,

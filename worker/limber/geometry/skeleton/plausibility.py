@@ -6,11 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
+from limber.geometry.skeleton.contraction import ContractionStatus
 from limber.geometry.skeleton.curve_graph import CurveGraph
 from limber.geometry.skeleton.skeleton import Skeleton
-
-GIVEN = "skeleton given"
-"""Status of a contraction that was not needed."""
 
 _STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _NAMED = 3  # gaps and loops that are named one by one
@@ -90,7 +88,7 @@ def _sheet_share(points: np.ndarray, reach: float) -> float:
 
 def warnings(result: Any) -> list[str]:
     texts = []
-    if result.contraction.status == GIVEN:
+    if result.contraction.status is ContractionStatus.given:
         far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
             result.node_of_point]))
         if far > 0.5:

@@ -17,7 +17,7 @@ from limber.geometry.skeleton.axis_fit import (
     resampled,
     tapered,
 )
-from limber.geometry.skeleton.contraction import Contraction, contract
+from limber.geometry.skeleton.contraction import Contraction, ContractionStatus, contract
 from limber.geometry.skeleton.curve_graph import (
     CurveGraph,
     curve_graph,
@@ -28,7 +28,6 @@ from limber.geometry.skeleton.curve_graph import (
 from limber.geometry.skeleton.level_sets import POINT_LIMIT, is_sparse, level_graph
 from limber.geometry.skeleton.pieces import second_base
 from limber.geometry.skeleton.plausibility import (
-    GIVEN,
     check_no_sheet,
     check_one_plant,
     check_round,
@@ -182,7 +181,7 @@ def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
     """Wrap a user's own skeleton, in the cloud's frame; nothing is changed in it."""
     segment, residual = nearest_cylinders(skeleton, points)
     noise = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
-    nothing = Contraction(points[:0], np.empty(0), 0, GIVEN)
+    nothing = Contraction(points[:0], np.empty(0), 0, ContractionStatus.given)
     return SkeletonResult(skeleton, nothing, segment, residual, noise)
 
 
