@@ -151,6 +151,7 @@ class BranchModel:
         self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
         self.hanging: Hanging | None = None
+        self.density: np.ndarray | None = None
         self._set(young, poisson, density)
 
     @property
@@ -422,7 +423,7 @@ class BranchModel:
         self.poisson = per_tet("Poisson's ratio", poisson, count)
         check_young(self.young)
         check_poisson(self.poisson)
-        before = getattr(self, "density", None)
+        before = self.density
         changed = density is not before
         self.density = per_tet("Density", density, count)
         if self.density.min() <= 0:

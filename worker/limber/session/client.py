@@ -60,6 +60,7 @@ class InteractiveSession:
         self._listener.start()
         self._ids = 0
         self._frames: FrameReader | None = None
+        self._is_closed = False
         hello = self.wait_for("hello", start_seconds)
         trouble = self._trouble() if hello is None else other_protocol(hello)
         if trouble:
@@ -201,6 +202,7 @@ class InteractiveSession:
             # Where the session was killed it could not tidy up itself.
             Path(self.hello["positions"]).unlink(missing_ok=True)
             self._frames = None
+            self._is_closed = True
         self._listener.join(1.0)
         for stream in (self._process.stdin, self._process.stdout, self._errors):
             if stream and not stream.closed:
@@ -235,7 +237,7 @@ class InteractiveSession:
         return self._ids
 
     def _check(self) -> None:
-        if self._frames is None and hasattr(self, "hello"):
+        if self._is_closed:
             raise WorkError("The session is closed.", "", "Start a new one.")
         if not self.alive:
             raise WorkError(

@@ -65,7 +65,7 @@ class Surface:
         except Exception as error:  # trimesh's readers raise whatever their parsers raise
             raise InputError(f"{path} cannot be read as a surface ({error}).",
                              "STL, PLY, OBJ or OFF was expected.", "Export it anew.") from error
-        if not hasattr(mesh, "faces") or len(mesh.faces) == 0:
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise InputError(f"{path} has no triangles.", "A closed surface was expected.",
                              "For a cloud of points use `limber reconstruct`.")
         vertices = np.asarray(mesh.vertices, float) * scale
