@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
-from limber.mechanics.grasp import RADIAN, Grasp, check_pose, pose_between, rotation_matrix
+from limber.mechanics.grasp import Grasp, check_pose, pose_between
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.basis import Basis, GraspCoordinates, make_basis
@@ -43,6 +43,7 @@ from limber.mechanics.reduced.training import (
     sample_poses,
     sample_young,
 )
+from limber.mechanics.reduced.training_poses import TrainingPoses
 from limber.progress import SILENT, Progress
 
 FORMAT = 3
@@ -114,7 +115,7 @@ class ReducedModel:
         # The leading modes: those of vibrations are not in the states, the last are small.
         modes = np.arange(self.size) >= self.basis.lift_count
         self._known = np.flatnonzero(modes & (self._largest > 0))[:_LEADING]
-        self._table = _PoseTable(self.poses, self.extent)
+        self._table = TrainingPoses(self.poses, self.extent)
         self._spacing = self._table.spacing()
         self._weight_lower = np.tril(self.weight_stiffness)
         self._set()
@@ -273,7 +274,7 @@ class ReducedModel:
         if start is None:
             return near
         own = (start.pose, start.coordinates)
-        far = _PoseTable(np.array([start.pose, near[0][0]]), self.extent).distance(pose)
+        far = TrainingPoses(np.array([start.pose, near[0][0]]), self.extent).distance(pose)
         return [own, *near] if far[0] <= 2 * far[1] else [near[0], own, *near[1:]]
 
     def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
@@ -471,35 +472,6 @@ def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bo
         shift = max(4 * shift, 1e-6)
         if shift > 1e3 or not np.isfinite(scale):
             return np.full(len(right), np.nan), False
-
-
-class _PoseTable:
-    """Poses that distances are taken to."""
-
-    def __init__(self, poses: np.ndarray, extent: float):
-        from scipy.spatial.transform import Rotation
-
-        self.positions = np.atleast_2d(poses)[:, :3]
-        self.rotations = Rotation.from_rotvec(np.atleast_2d(poses)[:, 3:]).as_matrix()
-        self.extent = extent
-
-    def distance(self, pose: np.ndarray) -> np.ndarray:
-        """Return the distance of each pose to one [m], shape [s]."""
-        away = self.rotations - rotation_matrix(pose[3:])
-        # |R1 - R2| is sqrt(2) times the angle between them, where that is small.
-        turns = np.sqrt(0.5 * np.einsum("sij,sij->s", away, away))
-        return np.linalg.norm(self.positions - pose[:3], axis=1) + RADIAN * self.extent * turns
-
-    def spacing(self) -> float:
-        """Return the 90th percentile of the distance to the nearest other pose [m]."""
-        if len(self.positions) < 3:
-            return self.extent
-        from scipy.spatial.transform import Rotation
-
-        vectors = Rotation.from_matrix(self.rotations).as_rotvec()
-        nearest = [np.partition(self.distance(np.concatenate([position, vector])), 1)[1]
-                   for position, vector in zip(self.positions, vectors, strict=True)]
-        return float(np.percentile(nearest, 90))
 
 
 def as_control_points(model: BranchModel, points: Sequence[np.ndarray] | None = None,
