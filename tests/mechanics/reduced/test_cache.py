@@ -52,6 +52,7 @@ def test_all_that_a_model_depends_on_is_in_its_key(branch):
     mesh = model.mesh
     others = [
         (model.with_parameters(gravity=(0, 0, 0)), grasp, weights, young, SETTINGS),
+        (model.as_scanned(), grasp, weights, young, SETTINGS),
         (model.with_parameters(density=800.0), grasp, weights, young, SETTINGS),
         (model.with_parameters(poisson=0.3), grasp, weights, young, SETTINGS),
         (model.with_point_masses([PointMass((0, 0, 0.2), 0.01)]), grasp, weights, young, SETTINGS),

@@ -315,13 +315,19 @@ class BranchModel:
                                        layout.mean_gradients, layout.nodes)
         return float(stretch), min(int(tet), self.mesh.tet_count - 1)
 
-    def largest_principal_strains(self, displacement: np.ndarray) -> np.ndarray:
+    def largest_principal_strains(self, displacement: np.ndarray,
+                                  carried: np.ndarray | None = None) -> np.ndarray:
         """Return the largest principal Green-Lagrange strain of each element, [tet_count].
 
         Of its mean deformation, as :meth:`largest_stretch`; in a millisecond for thousands.
+
+        Args:
+            carried: Strain that carries the weight in the mesh's shape, [tet_count, 6], to be
+                added (limber.mechanics.strain.carried_strain).
         """
         layout, out = self._data.layout, np.empty(self.mesh.tet_count)
         largest_principal_strains(for_kernels(displacement), layout.mean_gradients, layout.nodes,
+                                  for_kernels(np.empty((0, 6)) if carried is None else carried),
                                   out)
         return out
 

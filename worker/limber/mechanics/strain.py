@@ -78,6 +78,16 @@ def strain_of(model: BranchModel, stress: np.ndarray) -> np.ndarray:
     return ((1 + poisson) * stress - poisson * trace * np.eye(3)) / young
 
 
+def carried_strain(model: BranchModel) -> np.ndarray | None:
+    """Return the mean strain that carries the weight on the scan, [tet_count, 6] (00 11 22 01 02
+    12), None for a branch that carries none there."""
+    if model.hanging is None:
+        return None
+    part = model.weights / model.weights.sum(axis=1, keepdims=True)
+    strain = np.einsum("eq,eqij->eij", part, strain_of(model, _carried(model)))
+    return strain[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+
+
 def _carried(model: BranchModel) -> np.ndarray:
     """Return the stress that carries the weight on the scan [Pa], shape [tet_count, q, 3, 3]."""
     if model.hanging is None:

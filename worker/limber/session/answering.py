@@ -39,6 +39,9 @@ _QUICK = ReducedStaticSettings(max_iterations=12, max_halvings=2, start_count=2)
 class Answering:
     """Answers for a branch: with the reduced model of its one grasp, else with the full one.
 
+    Loads, and weight taken away, are not among what the reduced model has learnt: under them
+    equilibria are the full model's, and motion is not trusted.
+
     Args:
         folder, settings: Of the session, for the trainer.
         held: The branch.
@@ -51,7 +54,7 @@ class Answering:
         self.held = held
         self._folder, self._settings, self._tell, self._say = folder, settings, tell, say
         self._learning: Learning | None = None
-        self._known: dict[tuple[str, bytes, bool], ReducedModel] = {}
+        self._known: dict[tuple[str, bytes], ReducedModel] = {}
         self._reduced: ReducedModel | None = None
         self._state: ReducedState | None = None
         self._stepper: ReducedStepper | None = None
@@ -109,7 +112,7 @@ class Answering:
     def set_gravity(self, on: bool) -> None:
         """Let the branch bear its weight, or not."""
         self.held.set_gravity(on)
-        self._changed()
+        self._choose()
 
     def set_young(self, young: np.ndarray) -> None:
         """Set Young's modulus at the control points [Pa]."""
@@ -157,7 +160,7 @@ class Answering:
             self._learning.close()
         (held,) = self.held.grasps.values()
         self._learning = Learning(self._folder, self._settings, held.grasp,
-                                  self.held.gravity_on, self._tell, self._say)
+                                  self._tell, self._say)
 
     def seconds_left(self, last_received: float) -> float:
         """Return how long there is to wait for another command before :meth:`answer` is due."""
@@ -196,11 +199,11 @@ class Answering:
             self._learning.close()
 
     @property
-    def _key(self) -> tuple[str, bytes, bool] | None:
+    def _key(self) -> tuple[str, bytes] | None:
         if len(self.held.grasps) != 1:
             return None
         (held,) = self.held.grasps.values()
-        return key_of(held.grasp, self.held.gravity_on)
+        return key_of(held.grasp)
 
     def _changed(self) -> None:
         self._doubted.clear()
@@ -211,13 +214,14 @@ class Answering:
         """Take the model that fits what is held, and stand still or move as is wanted."""
         key = self._key
         base = None if key is None else self._known.get(key)
-        self._reduced = None if base is None else base.with_young(self.held.young)
+        reduced = None if base is None else base.with_young(self.held.young)
+        self._reduced = reduced if self.held.loads is None else None
         self._state, self._stepper = None, None
         self._is_due = True
-        if self._wants_motion and self._reduced is not None:
+        if self._wants_motion and reduced is not None:
             (held,) = self.held.grasps.values()
-            start = self._reduced.solve_static(held.pose, nodal_forces=self.held.loads)
-            self._stepper = ReducedStepper(self._reduced, start, nodal_forces=self.held.loads,
+            start = reduced.solve_static(held.pose, nodal_forces=self.held.loads)
+            self._stepper = ReducedStepper(reduced, start, nodal_forces=self.held.loads,
                                            settings=_LIVE)
             self._last_step = time.monotonic() - 1 / RATE
 
@@ -232,8 +236,7 @@ class Answering:
 
     def _from_reduced(self, reduced: ReducedModel) -> Answer:
         ((number, held),) = self.held.grasps.items()
-        state = reduced.solve_static(held.goal, start=self._state, nodal_forces=self.held.loads,
-                                     settings=_QUICK)
+        state = reduced.solve_static(held.goal, start=self._state, settings=_QUICK)
         if state.converged:
             self._state = state
             self.held.put(number, held.goal, reduced.displacement(state))
@@ -244,7 +247,7 @@ class Answering:
         if self._learning is not None and state.converged:
             self._learning.check(state)
         at = HeldAt(number, shown.pose, shown.reaction_force, shown.reaction_torque)
-        return Answer(displacement, (at,), shown.strain_energy, is_converged=state.converged,
+        return Answer(displacement, (at,), shown.energy, is_converged=state.converged,
                       is_reached=state.converged, is_reduced=True,
                       is_trusted=state.trusted and not self._is_doubted(state.pose))
 
@@ -269,9 +272,9 @@ class Answering:
         displacement = reduced.displacement_of(self._stepper.state.coordinates)
         self.held.put(number, pose, displacement)
         return Answer(displacement, (HeldAt(number, pose, *stepper.reaction(pose)),),
-                      stepper.strain_energy, stepper.kinetic_energy, stepper.state.time,
+                      stepper.energy, stepper.kinetic_energy, stepper.state.time,
                       is_converged=good, is_reached=bool(np.array_equal(pose, held.goal)),
-                      is_reduced=True, is_trusted=good)
+                      is_reduced=True, is_trusted=good and self.held.loads is None)
 
     def _within_reach(self, pose: np.ndarray, goal: np.ndarray, way: float,
                       seconds: float) -> np.ndarray:

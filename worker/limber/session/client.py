@@ -101,7 +101,7 @@ class InteractiveSession:
         """Hold the branch where it is now; return the reply with ``grasp`` and ``pose``.
 
         Args:
-            vertex: Of the surface; or ``point`` [m] on the branch as it hung at the start.
+            vertex: Of the surface; or ``point`` [m] on the branch as it was scanned.
             radius: Of the patch [m].
 
         Raises:

@@ -98,7 +98,8 @@ class Frame:
         is_trusted: The model is within what it knows, and at the wanted pose.
         is_converged: An equilibrium was found (in motion: the step was).
         is_reached: The grasps are where they were asked to be; else on the way there.
-        strain_energy, kinetic_energy: [J].
+        energy: Potential of strain and weight above the hanging branch [J]; its gradient to the
+            pose is the gripper's force. kinetic_energy: [J].
         reaction_force, reaction_torque: Of the first gripper on the branch [N, Nm], shape [3].
         delay: From the worker's receipt of the command to the publication [s].
         time: Time of the simulated motion [s]; 0 in statics.
@@ -119,7 +120,7 @@ class Frame:
     is_trusted: bool
     is_converged: bool
     is_reached: bool
-    strain_energy: float
+    energy: float
     kinetic_energy: float
     reaction_force: np.ndarray
     reaction_torque: np.ndarray

@@ -11,9 +11,11 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.mechanics.grasp import RADIAN, Grasp, pose_between
+from limber.mechanics.loaded import LoadedBranch
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.model import as_control_points
 from limber.mechanics.statics.solve import solve_static
+from limber.mechanics.strain import carried_strain
 from limber.session.frames import HeldAt
 from limber.session.protocol import GRASP_LIMIT, Load
 
@@ -27,9 +29,10 @@ class Answer:
     """A state of the branch, whichever model it is from.
 
     Attributes:
-        displacement: Of all nodes from the unloaded shape [m], shape [node_count, 3].
+        displacement: Of all nodes from where the branch hangs [m], shape [node_count, 3].
         grasps: What is held, with forces.
-        strain_energy, kinetic_energy: [J]. time: Of a motion [s].
+        energy: Potential of strain and weight above the hanging branch [J].
+        kinetic_energy: [J]. time: Of a motion [s].
         is_converged: An equilibrium was found, or the step was.
         is_reached: The grasps are where they were asked to be.
         is_reduced: From the reduced model. is_trusted: Within what the model knows.
@@ -38,7 +41,7 @@ class Answer:
 
     displacement: np.ndarray
     grasps: tuple[HeldAt, ...] = ()
-    strain_energy: float = 0.0
+    energy: float = 0.0
     kinetic_energy: float = 0.0
     time: float = 0.0
     is_converged: bool = True
@@ -61,28 +64,24 @@ class HeldBranch:
     """A branch, what holds it and what hangs on it.
 
     Args:
-        model: Its nodes are the unloaded shape.
-        displacement: From there to how it hangs now [m], shape [node_count, 3].
-        targets: Named places as nodes and weights: ``{name: (nodes [k], weights [k])}``.
+        loaded: The branch as it hangs, with its targets.
     """
 
-    def __init__(self, model: BranchModel, displacement: np.ndarray,
-                 targets: dict[str, tuple[np.ndarray, np.ndarray]] | None = None):
-        self.model = model
-        self.displacement = displacement
-        self.hanging = model.mesh.nodes + displacement
-        self.targets = targets or {}
+    def __init__(self, loaded: LoadedBranch):
+        self.loaded = loaded
+        self.model = model = loaded.model
+        self.displacement = np.zeros_like(model.mesh.nodes)
         self.weights, self.young = as_control_points(model)
         faces = model.mesh.surface_faces()
         self.surface, compact = np.unique(faces, return_inverse=True)
         self.faces = compact.reshape(-1, 3)
         self.grasps: dict[int, Held] = {}
-        self.gravity_on = bool(np.any(model.gravity))
-        self.loads: np.ndarray | None = None
-        self._weight = model.gravity
+        self.gravity_on = model.hanging is not None
+        self._hung: np.ndarray | None = None
         self._count = 0
         self._last: Answer | None = None
         self._strains = _AtVertices(model, self.surface)
+        self._carried = carried_strain(model)
 
     def grab(self, vertex: int | None, point: tuple[float, float, float] | None, radius: float,
              mode: Literal["clamped", "pinned"]) -> int:
@@ -98,8 +97,7 @@ class HeldBranch:
         if len(self.grasps) >= GRASP_LIMIT:
             raise InputError(f"There are {GRASP_LIMIT} grasps already.",
                              "A frame has room for no more.", "Release one.")
-        nodes = self._patch(self._place(vertex, point), radius)
-        return self.hold(Grasp.of_nodes(self.model.mesh, nodes, mode))
+        return self.hold(Grasp.at(self.model.mesh, self._place(vertex, point), radius, mode))
 
     def hold(self, grasp: Grasp) -> int:
         """Hold a patch that is known already; as :meth:`grab`."""
@@ -145,20 +143,18 @@ class HeldBranch:
         self.grasps[number] = replace(held, goal=pose)
 
     def set_gravity(self, on: bool) -> None:
-        """Let the branch bear its weight, or not; its unloaded shape stays.
+        """Let the branch bear its weight, or not: without it, it rises from where it hangs.
 
         Raises:
             InputError: it was loaded without weight, so there is none to switch on.
         """
-        if on and not np.any(self._weight):
+        if on and self.model.hanging is None:
             raise InputError("The branch has no weight.", "The session was started without it.",
                              "Start it without --no-gravity.")
         self.gravity_on = on
-        self.model = self.model.with_parameters(
-            gravity=tuple(self._weight) if on else (0.0, 0.0, 0.0))
 
     def set_young(self, young: np.ndarray) -> None:
-        """Set Young's modulus at the control points [Pa]; the unloaded shape stays.
+        """Set Young's modulus at the control points [Pa]; the branch hangs as it was scanned.
 
         Raises:
             InputError: another number of values.
@@ -168,6 +164,7 @@ class HeldBranch:
                              f"The branch has {len(self.young)} control points.", "")
         self.young = young
         self.model = self.model.with_young(self.weights @ young)
+        self._carried = carried_strain(self.model)
 
     def set_loads(self, loads: list[Load]) -> None:
         """Hang dead loads on the branch, instead of those before.
@@ -178,8 +175,17 @@ class HeldBranch:
         forces = np.zeros_like(self.model.mesh.nodes)
         for load in loads:
             place = self._place(load.vertex, load.point)
-            forces[np.linalg.norm(self.hanging - place, axis=1).argmin()] += load.force_n
-        self.loads = forces if loads else None
+            forces[np.linalg.norm(self.model.mesh.nodes - place, axis=1).argmin()] += load.force_n
+        self._hung = forces if loads else None
+
+    @property
+    def loads(self) -> np.ndarray | None:
+        """Forces on the nodes besides what the hanging branch carries [N], None where there are
+        none, shape [node_count, 3]."""
+        if self.gravity_on or self.model.hanging is None:
+            return self._hung
+        lifted = -self.model.mass_load[:, None] * self.model.gravity
+        return lifted if self._hung is None else lifted + self._hung
 
     def way(self, number: int) -> float:
         """Return how far a grasp is from where it is wanted [m]; turns count as lengths."""
@@ -218,7 +224,7 @@ class HeldBranch:
                            is_reached=False, is_trusted=False, message=result.message)
         held = tuple(HeldAt(number, self.grasps[number].pose, force, torque)
                      for number, force, torque in zip(self.grasps, forces, torques, strict=False))
-        self._last = Answer(self.displacement, held, result.strain_energy,
+        self._last = Answer(self.displacement, held, result.energy,
                             is_reached=part == 1.0, is_trusted=part == 1.0)
         return self._last
 
@@ -228,13 +234,11 @@ class HeldBranch:
 
     def target_positions(self, answer: Answer) -> np.ndarray:
         """Return where the targets are [m], shape [t, 3]."""
-        moved = self.model.mesh.nodes + answer.displacement
-        return np.array([weights @ moved[nodes] for nodes, weights in self.targets.values()]
-                        ).reshape(-1, 3)
+        return self.loaded.target_positions(answer.displacement)
 
     def strain(self, answer: Answer) -> tuple[np.ndarray, float, np.ndarray]:
         """Return strain about the vertices [v], the largest of all, and where it is [m]."""
-        strains = self.model.largest_principal_strains(answer.displacement)
+        strains = self.model.largest_principal_strains(answer.displacement, self._carried)
         worst = int(strains.argmax())
         corners = self.model.mesh.tets[worst, :4]
         place = (self.model.mesh.nodes[corners] + answer.displacement[corners]).mean(axis=0)
@@ -246,17 +250,7 @@ class HeldBranch:
         if vertex >= len(self.surface):
             raise InputError(f"There is no vertex {vertex}.",
                              f"The surface has {len(self.surface)}.", "")
-        return self.hanging[self.surface[vertex]]
-
-    def _patch(self, place: np.ndarray, radius: float) -> np.ndarray:
-        distance = np.linalg.norm(self.hanging - place, axis=1)
-        nodes = np.flatnonzero(distance <= radius) if radius > 0 else distance.argmin()[None]
-        if not len(nodes):
-            raise InputError(
-                f"No node lies within {radius:g} m of ({', '.join(f'{x:.4g}' for x in place)}) m;"
-                f" the nearest is {distance.min():.4g} m away.", "The gripper would hold nothing.",
-                "Grasp at a point of the branch, or with a larger radius.")
-        return nodes
+        return self.model.mesh.nodes[self.surface[vertex]]
 
 
 class _AtVertices:

@@ -25,7 +25,7 @@ _CHECK_INTERVAL = 1.0
 class Learnt:
     """A reduced model that is ready, with what a frame needs of it; ``key`` says of what."""
 
-    key: tuple[str, bytes, bool]
+    key: tuple[str, bytes]
     model: ReducedModel
     event: dict[str, Any]
 
@@ -34,15 +34,15 @@ class Learnt:
 class Checked:
     """A comparison with the full model at a pose [m, rad]."""
 
-    key: tuple[str, bytes, bool]
+    key: tuple[str, bytes]
     pose: np.ndarray
     good: bool
     event: dict[str, Any]
 
 
-def key_of(grasp: Grasp, gravity_on: bool) -> tuple[str, bytes, bool]:
-    """Return what tells apart what a session learns: patch, how it is held, and weight."""
-    return grasp.mode, grasp.nodes.tobytes(), gravity_on
+def key_of(grasp: Grasp) -> tuple[str, bytes]:
+    """Return what tells apart what a session learns: the patch, and how it is held."""
+    return grasp.mode, grasp.nodes.tobytes() + grasp.weights.tobytes()
 
 
 class Learning:
@@ -50,14 +50,14 @@ class Learning:
 
     Args:
         folder, settings: Of the session.
-        grasp, gravity_on: What to learn.
+        grasp: What to learn.
         tell: Gets :class:`Learnt` and :class:`Checked`, from another thread.
         say: Gets the trainer's other events.
     """
 
-    def __init__(self, folder: Path, settings: SessionSettings, grasp: Grasp, gravity_on: bool,
+    def __init__(self, folder: Path, settings: SessionSettings, grasp: Grasp,
                  tell: Callable[[Learnt | Checked], object], say: Callable[..., None]):
-        self.key = key_of(grasp, gravity_on)
+        self.key = key_of(grasp)
         self.has_failed = False
         self._tell, self._say = tell, say
         self._last_check = 0.0
@@ -69,7 +69,8 @@ class Learning:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             # Windows has no `nice` that the trainer could call itself.
             creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0))
-        self._write({"nodes": grasp.nodes.tolist(), "mode": grasp.mode, "gravity_on": gravity_on})
+        self._write({"nodes": grasp.nodes.tolist(), "weights": grasp.weights.tolist(),
+                     "mode": grasp.mode})
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 

@@ -1,9 +1,9 @@
 """The branch a session starts from, and what its reduced model is made of."""
 
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
+from limber.mechanics.loaded import hang
 from limber.mechanics.reduced.state import ReducedSettings
 from limber.mechanics.reduced.training import TrainingSettings
 from limber.session.held import HeldBranch
@@ -19,12 +19,13 @@ def reduced_settings(settings: SessionSettings) -> ReducedSettings:
                            vibration_count=1 if settings.young_spread == 1 else 0)
 
 
-def load_held(folder: Path, settings: SessionSettings) -> HeldBranch:
+def load_held(folder: Path, settings: SessionSettings,
+              warn: Callable[[str], None] = lambda _message: None) -> HeldBranch:
     """Return the branch of a folder as it hangs, nothing held yet.
 
     Raises:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
     """
+    branch = Branch.open(folder)
     gravity = {} if settings.gravity else {"gravity": None}
-    model = load_model(Branch.open(folder), **gravity)
-    return HeldBranch(model, np.zeros_like(model.mesh.nodes))
+    return HeldBranch(hang(load_model(branch, **gravity), warn=warn))

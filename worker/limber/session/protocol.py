@@ -38,7 +38,7 @@ class _Command(BaseModel):
 
 
 class _OnBranch(BaseModel):
-    """A place on the branch: a vertex of the surface, or a point of the hanging branch [m]."""
+    """A place on the branch: a vertex of the surface, or a point of the branch as scanned [m]."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 

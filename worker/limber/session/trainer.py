@@ -3,9 +3,9 @@
 It holds the full model, so that the session never waits for it. JSON lines, as in
 :mod:`limber.session.worker`:
 
-- on standard input first ``{"nodes", "mode", "gravity_on"}``: which patch of the branch is held and
-  how, and whether the branch bears its weight; then ``{"pose", "young_pa"}``: compare the
-  reduced model with the full one there. The end of input ends it;
+- on standard input first ``{"nodes", "weights", "mode"}``: which patch of the branch is held
+  and how; then ``{"pose", "young_pa"}``: compare the reduced model with the full one there. The
+  end of input ends it;
 - on standard output ``{"progress", "message"}``, ``{"event": "model", "path", "size", "seconds"}``
   whenever a model is ready, and ``{"event": "check", "position_error", "energy_error", "certain",
    "good", "learned"}``.
@@ -72,9 +72,8 @@ def _warn(message: str) -> None:
 def _serve(folder: Path, settings: SessionSettings, cache: ReducedCache) -> None:
     wanted = json.loads(sys.stdin.readline())
     held = load_held(folder, settings)
-    if held.gravity_on != wanted["gravity_on"]:
-        held.set_gravity(wanted["gravity_on"])
-    grasp = Grasp.of_nodes(held.model.mesh, np.array(wanted["nodes"]), wanted["mode"])
+    nodes, shares = np.array(wanted["nodes"]), np.array(wanted["weights"])
+    grasp = Grasp(nodes, shares, shares @ held.model.mesh.nodes[nodes], wanted["mode"])
     weights, young = as_control_points(held.model)
     about, began = reduced_settings(settings), time.perf_counter()
     key = model_key(held.model, grasp, weights, young, about)

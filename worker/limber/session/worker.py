@@ -10,17 +10,18 @@ Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each 
 - ``{"command": "hello", "protocol": 2}``: say which protocol the client speaks; an error if it is
   not this one.
 - ``{"command": "grasp", "vertex": 17, "mode": "pinned", "radius_m": 0.01}``: hold the branch there,
-  where it is now; ``"point": [x, y, z]`` instead of a vertex is a place on the branch as it hung at
-  the start [m]. The reply says ``grasp`` (a number) and ``pose``. Eight at once, at most.
+  where it is now; ``"point": [x, y, z]`` instead of a vertex is a place on the branch as it was
+  scanned [m]. The reply says ``grasp`` (a number) and ``pose``. Eight at once, at most.
 - ``{"command": "release", "grasp": 2}``: let go; without ``grasp``, of all.
 - ``{"command": "move", "grasp": 2, "pose": [x, y, z, rx, ry, rz]}``: that grasp (the first, if not
   named) to this pose [m, rad]. The newest pose wins: poses that come while one is being solved
   replace each other. It has no reply but its frame.
 - ``{"command": "loads", "loads": [{"vertex": 17, "force_n": [0, 0, -1]}]}``: forces that hang on
   the branch, instead of those before.
-- ``{"command": "gravity", "on": false}``: let the branch bear its weight, or not.
-- ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points; the unloaded
-  shape stays.
+- ``{"command": "gravity", "on": false}``: let the branch bear its weight, or not. It hangs where it
+  was scanned; without weight it rises from there.
+- ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points; the
+  branch hangs as it was scanned.
 - ``{"command": "dynamics", "on": true}``: let the branch move in time (about 60 steps a second, one
   as soon as a pose comes) instead of answering with equilibria. Needs the reduced model. The grasp
   follows at two lengths of the branch a second at most.
@@ -37,7 +38,8 @@ Events, one JSON object a line on standard output; a client may leave them unrea
 - ``{"event": "progress", "progress", "message"}``: a reduced model of what is held is being made.
   Meanwhile the full model answers, a few times a second, on the way to the wanted pose.
 - ``{"event": "model", "size", "seconds", "snapshots", "refreshes", "from_cache"}``: a reduced model
-  took over. There is one where one grasp holds; of none or several the full model answers.
+  took over. There is one where one grasp holds; where none or several do, under loads and
+  without weight, the full model answers.
 - ``{"event": "check", "position_error", "energy_error", "good", "learned"}``: the reduced model was
   compared with the full one at a pose that was asked; where it was off it has learned.
 - ``{"event": "warning", "message"}``, ``{"event": "failed", "message"}`` (it did not start),
@@ -89,9 +91,10 @@ class Session:
     """
 
     def __init__(self, folder: Path, settings: SessionSettings):
-        self.held = load_held(folder, settings)
         self.inbox = Inbox()
         self.events = Events(self.inbox.close)
+        self.held = load_held(folder, settings, lambda message: self.events.say(
+            event="warning", message=message))
         self.answering = Answering(folder, settings, self.held, self.inbox.put, self.events.say)
         if settings.grasp:
             self.answering.hold_marked(settings.mode)
@@ -101,7 +104,7 @@ class Session:
             os.close(handle)
             path = Path(name)
         self.frames = FrameWriter(path, self.held.faces, len(self.held.surface),
-                                  len(self.held.targets))
+                                  len(self.held.loaded.targets))
         self._ended = threading.Event()
         self._asked = (0, time.monotonic())
 
@@ -213,7 +216,7 @@ class Session:
             targets=held.target_positions(answer), id=move_id,
             status=self.answering.status(answer), is_trusted=answer.is_trusted,
             is_converged=answer.is_converged, is_reached=answer.is_reached,
-            is_reduced=answer.is_reduced, energy_j=answer.strain_energy,
+            is_reduced=answer.is_reduced, energy_j=answer.energy,
             kinetic_energy_j=answer.kinetic_energy, time_s=answer.time,
             greatest_strain=greatest, gravity_on=held.gravity_on,
             min_det_f=held.model.internal(answer.displacement).min_det_f,
@@ -223,7 +226,8 @@ class Session:
         first = min(self.held.grasps, default=None)
         return {"event": "hello", "protocol": protocol.PROTOCOL, "limber": VERSION,
                 "positions": str(self.frames.path), "vertex_count": len(self.held.surface),
-                "control_count": len(self.held.young), "targets": list(self.held.targets),
+                "control_count": len(self.held.young),
+                "targets": [target.name for target in self.held.loaded.targets],
                 "rest_pose": None if first is None else self.held.grasps[first].pose,
                 "extent_m": self.held.model.extent, **self._about()}
 

@@ -8,12 +8,14 @@ from limber.mechanics.elements.stiffness_pairs import LANES
 
 
 @compiled
-def largest_principal_strains(displacement, mean_gradients, nodes, out):
+def largest_principal_strains(displacement, mean_gradients, nodes, carried, out):
     """Write each element's largest principal Green-Lagrange strain of its mean deformation.
 
     Args:
         displacement: [m], shape [node_count, 3].
         mean_gradients, nodes: From limber.mechanics.elements.forces.ForceLayout.
+        carried: Strain that each element has in the mesh's shape already, [tet_count, 6] (00 11 22
+            01 02 12), or no rows.
         out: Shape [tet_count].
     """
     node_count = nodes.shape[1]
@@ -24,6 +26,9 @@ def largest_principal_strains(displacement, mean_gradients, nodes, out):
         deformation(local, flat[batch], node_count, F)
         green_strain(F, E)
         for l in range(min(LANES, len(out) - batch * LANES)):
+            if len(carried):
+                for k in range(6):
+                    E[k * LANES + l] += carried[batch * LANES + l, k]
             e01, e02, e12 = E[3 * LANES + l], E[4 * LANES + l], E[5 * LANES + l]
             mean = (E[l] + E[LANES + l] + E[2 * LANES + l]) / 3.0
             x, y, z = E[l] - mean, E[LANES + l] - mean, E[2 * LANES + l] - mean

@@ -53,8 +53,10 @@ def model_key(model: BranchModel, grasp: Grasp, weights: np.ndarray, control_you
         f" {model.lumped_mass} {sorted(map(repr, model.point_masses))}".encode())
     digest.update(model.mesh.geometry_digest().encode())
     for array in (weights, control_young, model.poisson, model.density, model.gravity,
-                  grasp.nodes, model.fixed):
+                  grasp.nodes, grasp.weights, model.fixed):
         digest.update(np.ascontiguousarray(array).tobytes())
+    if model.hanging is not None:
+        digest.update(np.ascontiguousarray(model.hanging.total.stress).tobytes())
     return digest.hexdigest()[:32]
 
 
