@@ -1,4 +1,7 @@
-"""Young's modulus along a branch from its pulls: fit, judgement and what it is sure of."""
+"""Young's modulus along a branch from its pulls: fit, judgement and what it is sure of.
+
+What of it is written is in :mod:`limber.estimation.summary`.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -16,12 +19,7 @@ from limber.estimation.identifiability import (
     link_unresolved,
     require_scale,
 )
-from limber.estimation.model_error import (
-    ModelError,
-    geometry_error,
-    mesh_error,
-    total_interval,
-)
+from limber.estimation.model_error import ModelError, geometry_error, mesh_error
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.parameters import ParameterSpace, Values
@@ -85,6 +83,15 @@ class Estimate:
     @property
     def values(self) -> Values:
         return self.objective.space.unpack(self.fit.evaluation.free)
+
+    @property
+    def deviations(self) -> dict[str, Any]:
+        """Relative standard deviations of the moduli by where they come from."""
+        groups = list(self.objective.space.groups)
+        sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
+        error = self.model_error
+        return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
+                "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
@@ -352,7 +359,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         error = replace(error, mesh=mesh_error(model, grasp_on(subject.mesh, grasp), inside,
                                                subject.weights, found.values.young))
     found.model_error = error
-    _tell_largest_part(_deviations(found), progress.warn)
+    _tell_largest_part(found.deviations, progress.warn)
 
 
 def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
@@ -368,15 +375,6 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
     return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
 
 
-def _deviations(found: Estimate) -> dict[str, Any]:
-    """Relative standard deviations of the moduli by where they come from."""
-    groups = list(found.objective.space.groups)
-    sensor = np.minimum(np.sqrt(np.diag(found.uncertainty.covariance))[groups], 35.0)
-    error = found.model_error
-    return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-            "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
-
-
 def _tell_largest_part(deviations: dict[str, Any], tell: Callable[[str], None]) -> None:
     """Say what would narrow a wide interval: the part that makes up most of its variance."""
     total = deviations["total"]
@@ -389,76 +387,3 @@ def _tell_largest_part(deviations: dict[str, Any], tell: Callable[[str], None]) 
     each = ", ".join(f"{name} {100 * part:.0f} %" for name, part in parts.items())
     tell(f"E at control point {worst + 1} has a standard deviation of {100 * total[worst]:.0f} % "
          f"({each}). {ADVICE[largest]}")
-
-
-def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
-    """Return the stage's result: DESIGN's keys and more."""
-    values, sure = found.values, found.uncertainty
-    return {
-        "method": settings.method, "young_pa": values.young,
-        "young_interval_pa": total_interval(values.young, sure.young_interval,
-                                            found.model_error),
-        "young_interval_sensor_pa": sure.young_interval,
-        "young_deviation": _deviations(found), "poisson": values.poisson,
-        "density": values.density, "loss_m2": found.fit.evaluation.loss,
-        "forward_count": found.objective.forward_count, "converged": found.fit.converged,
-        "stopped": found.stopped, "held_out": found.held_out,
-        "variance_factor": sure.variance_factor, "warnings": found.warnings,
-        "forward": settings.forward} | _reduced_error(found)
-
-
-def _reduced_error(found: Estimate) -> dict[str, Any]:
-    """What the reduced model was off by before its correction by the full one."""
-    errors = [error for forward in found.objective.forwards
-              if (error := forward.reduction_error) is not None]
-    if not errors:
-        return {}
-    position, force = np.max(errors, axis=0)
-    return {"reduced_error_m": position, "reduced_error_force_share": force}
-
-
-def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, Any]:
-    """Return what ``estimate.json`` has beside the summary."""
-    evaluation, objective = found.fit.evaluation, found.objective
-    told: dict[str, Any] = {
-        "control_points_m": subject.control_points,
-        "fractions": _fractions(subject), "parameters": objective.space.names,
-        "groups": objective.space.groups, "links": objective.space.links,
-        "covariance": found.uncertainty.covariance,
-        "correlation": found.uncertainty.correlation,
-        "singular_values": found.identifiability.singular_values,
-        "deviations_before_fit": found.identifiability.deviations,
-        "reason": found.fit.reason,
-        "outliers": outliers(evaluation, objective),
-        "history": [{"evaluation": number + 1, "parameters": entry.parameters,
-                     "objective": entry.objective, "loss_m2": entry.loss,
-                     "seconds": entry.seconds}
-                    for number, entry in enumerate(objective.log.entries)],
-        "pulls": [_pull_details(number, objective, evaluation)
-                  for number in range(len(objective.forwards))]}
-    first = told["pulls"][0]
-    told |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
-                "simulated_m": first["simulated_m"]}
-    truth = next((pull.entry.truth for pull in pulls if pull.entry.truth), None)
-    if truth:
-        told["truth"] = truth
-    return told
-
-
-def _pull_details(number: int, objective: Objective, evaluation: Evaluation) -> dict[str, Any]:
-    forward, simulated = objective.forwards[number], evaluation.pulls[number]
-    frames = forward.frames
-    shown = np.unique(np.linspace(0, len(frames) - 1, 6).round().astype(int))
-    points, forces = objective.scored(evaluation)[number]
-    return {"name": forward.name, "times_s": frames.times[shown],
-            "observed_m": frames.positions[shown], "simulated_m": simulated.positions[shown],
-            "measured_force_n": frames.wrenches[:, :3], "simulated_force_n": simulated.forces,
-            "all_times_s": frames.times, "point_residual": points, "force_residual": forces}
-
-
-def _fractions(subject: Subject) -> list[float]:
-    path = subject.skeleton.main_path()
-    along = subject.skeleton.arc_length[path]
-    nearest = [np.argmin(np.linalg.norm(subject.skeleton.nodes[path] - point, axis=1))
-               for point in subject.control_points]
-    return [float(along[index] / along[-1]) for index in nearest]

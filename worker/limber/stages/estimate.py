@@ -8,17 +8,11 @@ import numpy as np
 
 from limber.errors import Cancelled, LimberError
 from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.fit import (
-    Estimate,
-    details,
-    fit_branch,
-    foretell,
-    judge_model,
-    summary,
-)
+from limber.estimation.fit import Estimate, fit_branch, foretell, judge_model
 from limber.estimation.online.follow import follow as follow_pull
 from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.summary import details, summary
 from limber.geometry.cloud.cloud import read_cloud
 from limber.plain import plain
 from limber.progress import SILENT, Progress

@@ -1,0 +1,86 @@
+"""What an estimate writes: the stage's result, and the whole of ``estimate.json``."""
+
+from typing import Any
+
+import numpy as np
+
+from limber.estimation.fit import Estimate
+from limber.estimation.model_error import total_interval
+from limber.estimation.objective import Evaluation, Objective
+from limber.estimation.preparation import Subject
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.uncertainty import outliers
+from limber.recordings.recording import Pull
+
+
+def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
+    """Return the stage's result: DESIGN's keys and more."""
+    values, sure = found.values, found.uncertainty
+    return {
+        "method": settings.method, "young_pa": values.young,
+        "young_interval_pa": total_interval(values.young, sure.young_interval,
+                                            found.model_error),
+        "young_interval_sensor_pa": sure.young_interval,
+        "young_deviation": found.deviations, "poisson": values.poisson,
+        "density": values.density, "loss_m2": found.fit.evaluation.loss,
+        "forward_count": found.objective.forward_count, "converged": found.fit.converged,
+        "stopped": found.stopped, "held_out": found.held_out,
+        "variance_factor": sure.variance_factor, "warnings": found.warnings,
+        "forward": settings.forward} | _reduced_error(found)
+
+
+def _reduced_error(found: Estimate) -> dict[str, Any]:
+    """What the reduced model was off by before its correction by the full one."""
+    errors = [error for forward in found.objective.forwards
+              if (error := forward.reduction_error) is not None]
+    if not errors:
+        return {}
+    position, force = np.max(errors, axis=0)
+    return {"reduced_error_m": position, "reduced_error_force_share": force}
+
+
+def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, Any]:
+    """Return what ``estimate.json`` has beside the summary."""
+    evaluation, objective = found.fit.evaluation, found.objective
+    told: dict[str, Any] = {
+        "control_points_m": subject.control_points,
+        "fractions": _fractions(subject), "parameters": objective.space.names,
+        "groups": objective.space.groups, "links": objective.space.links,
+        "covariance": found.uncertainty.covariance,
+        "correlation": found.uncertainty.correlation,
+        "singular_values": found.identifiability.singular_values,
+        "deviations_before_fit": found.identifiability.deviations,
+        "reason": found.fit.reason,
+        "outliers": outliers(evaluation, objective),
+        "history": [{"evaluation": number + 1, "parameters": entry.parameters,
+                     "objective": entry.objective, "loss_m2": entry.loss,
+                     "seconds": entry.seconds}
+                    for number, entry in enumerate(objective.log.entries)],
+        "pulls": [_pull_details(number, objective, evaluation)
+                  for number in range(len(objective.forwards))]}
+    first = told["pulls"][0]
+    told |= {"times_s": first["times_s"], "observed_m": first["observed_m"],
+             "simulated_m": first["simulated_m"]}
+    truth = next((pull.entry.truth for pull in pulls if pull.entry.truth), None)
+    if truth:
+        told["truth"] = truth
+    return told
+
+
+def _pull_details(number: int, objective: Objective, evaluation: Evaluation) -> dict[str, Any]:
+    forward, simulated = objective.forwards[number], evaluation.pulls[number]
+    frames = forward.frames
+    shown = np.unique(np.linspace(0, len(frames) - 1, 6).round().astype(int))
+    points, forces = objective.scored(evaluation)[number]
+    return {"name": forward.name, "times_s": frames.times[shown],
+            "observed_m": frames.positions[shown], "simulated_m": simulated.positions[shown],
+            "measured_force_n": frames.wrenches[:, :3], "simulated_force_n": simulated.forces,
+            "all_times_s": frames.times, "point_residual": points, "force_residual": forces}
+
+
+def _fractions(subject: Subject) -> list[float]:
+    path = subject.skeleton.main_path()
+    along = subject.skeleton.arc_length[path]
+    nearest = [np.argmin(np.linalg.norm(subject.skeleton.nodes[path] - point, axis=1))
+               for point in subject.control_points]
+    return [float(along[index] / along[-1]) for index in nearest]
