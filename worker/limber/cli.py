@@ -1,10 +1,12 @@
 """The command ``limber``: finds the commands, and gives each the same way of running.
 
-A command is a module in ``limber/commands`` with an object ``command`` made by
-:func:`stage_command`. All of them take ``--json`` and ``--progress``, end with the exit codes of
-``limber.errors`` and, with ``--json``, print one JSON object as their last line.
+A stage's command is made from its description (:mod:`limber.stages.registry`); any other command
+is a module in ``limber/commands`` with an object ``command``, its docstring the help. Those made
+here take ``--json`` and ``--progress``, end with the exit codes of ``limber.errors`` and, with
+``--json``, print one JSON object as their last line.
 """
 
+import ast
 import functools
 import importlib
 import json
@@ -12,41 +14,20 @@ import signal
 import sys
 import time
 import traceback
-import types
-import typing
 from collections.abc import Callable
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
-from pydantic import BaseModel
 
 from limber.errors import LimberError
-from limber.plain import plain
 from limber.progress import BarSink, JsonSink, Progress, Sink
-from limber.settings import checked_settings
+from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
 from limber.terminal import result_lines, table_lines
 from limber.version import VERSION
 
-# Command name to what `limber --help` says of it. Modules are imported when they are called:
-# `limber --help` must not wait for the numerical packages.
-COMMANDS = {
-    "reconstruct": "Scan to tetrahedra: skeleton, radii, surface, mesh.",
-    "mesh": "Closed surface (STL, PLY, OBJ) to tetrahedra.",
-    "generate": "A generated branch with known truth, scanned as a scanner would.",
-    "simulate": "Pull a branch by a pose or a force; writes motion, energy and forces.",
-    "import-pull": "Bring a recording of a pull into the branch folder.",
-    "virtual-pull": "Simulate a pull with a known Young's modulus and sensor noise.",
-    "estimate": "Young's modulus along the branch, from pulls.",
-    "predict": "Where a branch rests under another load, with its estimated modulus.",
-    "energy": "Energy field over grasp poses.",
-    "plan": "Paths to a goal: RRT* and deformation-aware D-RRT*, compared.",
-    "session": "A branch held in a process that other programs bend, by JSON lines.",
-    "report": "One self-contained HTML page with figures and tables of all results.",
-    "scene": "A Blender scene with the branch, its motion and paths.",
-    "demo": "The whole pipeline on one branch.",
-    "doctor": "What is installed, what is missing and what then does not work.",
-}
-
+if TYPE_CHECKING:
+    from limber.stages.registry import StageDescription
 
 # Designed, not built: named so that nobody looks for them in vain.
 NOT_YET = {
@@ -57,25 +38,41 @@ NOT_YET = {
 }
 
 
+def command_summaries() -> dict[str, str]:
+    """Return what each command does in one line, by name; imports none of them.
+
+    `limber --help` must not wait for the numerical packages.
+    """
+    found = {}
+    for path in sorted((Path(__file__).parent / "commands").glob("*.py")):
+        if path.stem != "__init__":
+            told = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            found[path.stem.replace("_", "-")] = told.split("\n\n")[0].replace("\n", " ")
+    return stage_summaries() | found
+
+
 class _Commands(click.Group):
     """Loads each command's module only when that command is asked for."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return list(command_summaries())
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name in NOT_YET:
             raise click.UsageError(f"`limber {name}` is not there yet: {NOT_YET[name]}.")
-        if name not in COMMANDS:
+        if name in stage_summaries():
+            return command_of(stage_description(name), stage_module(name).__doc__)
+        if name not in command_summaries():
             return None
-        module = importlib.import_module(f"limber.commands.{name.replace('-', '_')}")
-        return module.command
+        return importlib.import_module(f"limber.commands.{name.replace('-', '_')}").command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
-        with formatter.section("Not there yet"):
-            formatter.write_dl(list(NOT_YET.items()))
+        stages = stage_summaries()
+        others = {name: told for name, told in command_summaries().items() if name not in stages}
+        for title, commands in (("Stages", stages), ("Other commands", others),
+                                ("Not there yet", NOT_YET)):
+            with formatter.section(title):
+                formatter.write_dl(list(commands.items()))
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -127,27 +124,47 @@ def stage_command(name: str) -> Callable[[Callable[..., dict[str, Any]]], click.
         decorated = click.option(
             "--json", "as_json", is_flag=True,
             help="Print the result as one JSON object, the last line.")(decorated)
-        return click.command(name)(decorated)
+        return click.command(name, cls=_grouped_command())(decorated)
     return wrap
 
 
-def settings_options(model: type[BaseModel]) -> Callable[[Callable], Callable]:
-    """Add one option for each field of a settings model; the function gets ``settings=model(...)``.
+def command_of(stage: "StageDescription", help_text: str) -> click.Command:
+    """Make the command of a stage: its inputs, settings and options become options."""
+    from limber.options import settings_options
 
-    A field's description is its help text, its default the option's. ``bool`` fields become
-    ``--name/--no-name``, ``tuple[float, float, float]`` take three values, a tuple of
-    such tuples may be given several times (``json_schema_extra={"metavar": ...}`` names them).
-    """
-    def wrap(function: Callable) -> Callable:
-        @functools.wraps(function)
-        def body(*args: Any, **options: Any) -> Any:
-            given = {name: options.pop(name) for name in model.model_fields}
-            values = {name: value for name, value in given.items() if value is not None}
-            return function(*args, settings=checked_settings(model, values), **options)
-        for name, field in reversed(model.model_fields.items()):
-            body = _option(name, field)(body)
-        return body
-    return wrap
+    @stage_command(stage.name)
+    @click.option("--schema", is_flag=True, is_eager=True, expose_value=False,
+                  callback=functools.partial(_show_schema, stage.name),
+                  help="Print what the stage takes as a JSON schema, and exit.")
+    @settings_options(stage.inputs, "inputs")
+    @settings_options(stage.settings, "settings")
+    @settings_options(stage.options, "options")
+    def command(run: Run, inputs: Any, settings: Any, options: Any) -> dict[str, Any]:
+        result = stage.run(inputs, settings, options, run.progress)
+        for title, rows in stage.tables(_plain(result)) if stage.tables else ():
+            run.show(title, rows)
+        return result
+    command.help = help_text
+    return command
+
+
+def _grouped_command() -> type[click.Command]:
+    from limber.options import GroupedCommand
+
+    return GroupedCommand
+
+
+def _show_schema(name: str, ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if wanted:
+        click.echo(json.dumps(stage_schema(name), indent=1))
+        ctx.exit()
+
+
+def _plain(value: Any) -> Any:
+    # Loads numpy and pydantic: not for `limber --help`.
+    from limber.plain import plain
+
+    return plain(value)
 
 
 def run(arguments: list[str] | None = None) -> None:
@@ -212,79 +229,14 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
 
 def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], as_json: bool) -> None:
     if as_json:
-        print(json.dumps(plain(outcome | result), allow_nan=False), flush=True)
+        print(json.dumps(_plain(outcome | result), allow_nan=False), flush=True)
     if outcome["error"]:
         click.echo(f"error: {outcome['error']}", err=True)
     elif not as_json:
         # Warnings were said when they came up.
-        for line in result_lines({k: v for k, v in plain(result).items() if k != "warnings"}):
+        for line in result_lines({k: v for k, v in _plain(result).items() if k != "warnings"}):
             click.echo(line)
         click.echo(f"{outcome['command']}: done in {outcome['seconds']:.1f} s")
-
-
-def _option(name: str, field: Any) -> Callable:
-    kind, optional = _plain_type(field.annotation)
-    flag = "--" + name.replace("_", "-")
-    hidden = field.is_required() or optional
-    default = None if hidden else field.get_default(call_default_factory=True)
-    common = {"default": None, "help": _help(name, field, kind, default)}
-    if kind is bool:
-        return click.option(f"{flag}/--no-{name.replace('_', '-')}", name, **common)
-    if typing.get_origin(kind) is Literal:
-        return click.option(flag, name, type=click.Choice(typing.get_args(kind)), **common)
-    if typing.get_origin(kind) is tuple:
-        items = typing.get_args(kind)
-        metavar = (field.json_schema_extra or {}).get("metavar")
-        if items[-1] is Ellipsis and typing.get_origin(items[0]) is tuple:
-            parts = typing.get_args(items[0])
-            return click.option(flag, name, nargs=len(parts), type=parts[0], multiple=True,
-                                metavar=metavar, **common)
-        if items[-1] is Ellipsis:
-            # Given twice it adds up: the last one alone would drop the others without a word.
-            return click.option(flag, name, callback=_listed, metavar="A,B,...", multiple=True,
-                                **common)
-        if len(items) == 3:
-            metavar = "X Y Z"
-        return click.option(flag, name, nargs=len(items), type=items[0], metavar=metavar, **common)
-    return click.option(flag, name, type=kind, **common)
-
-
-def _listed(_ctx: click.Context, _param: click.Parameter, texts: tuple[str, ...]) -> Any:
-    return tuple(part.strip() for text in texts for part in text.split(",")) or None
-
-
-def _plain_type(annotation: Any) -> tuple[Any, bool]:
-    if typing.get_origin(annotation) in (typing.Union, types.UnionType):
-        kinds = [kind for kind in typing.get_args(annotation) if kind is not type(None)]
-        return kinds[0], len(kinds) < len(typing.get_args(annotation))
-    return annotation, False
-
-
-def _help(name: str, field: Any, kind: Any, default: Any) -> str:
-    """A field's description, then its default and range as they are typed."""
-    told = []
-    if default is not None and default != ():
-        if kind is bool:
-            shown = name if default else f"no_{name}"
-            told.append(f"default: --{shown.replace('_', '-')}")
-        elif isinstance(default, tuple):
-            # Lists of any length are typed with commas, vectors with spaces.
-            between = "," if typing.get_args(kind)[-1] is Ellipsis else " "
-            told.append(f"default: {between.join(map(_shown, default))}")
-        else:
-            told.append(f"default: {_shown(default)}")
-    told += _bounds(field)
-    return f"{field.description or ''}  [{'; '.join(told)}]" if told else field.description or ""
-
-
-def _bounds(field: Any) -> list[str]:
-    words = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
-    return [f"{word} {_shown(float(limit))}" for key, word in words.items()
-            for part in field.metadata if (limit := getattr(part, key, None)) is not None]
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _terminate_like_interrupt() -> None:

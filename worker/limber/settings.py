@@ -1,12 +1,63 @@
-"""Settings that a user chose: checked, and refused with words that name the option."""
+"""Settings that a user chooses: what all models of them share, and how a refused value is told.
 
-from typing import Any, TypeVar
+A model is the one source of an option's name, type, range, default and help; of its place in
+``--help``, in the JSON schema and in the add-on's panel; and of what a manifest remembers. The
+unit of a value stands in its description in square brackets.
+"""
 
-from pydantic import BaseModel, ValidationError
+import re
+from typing import Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from limber.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+Groups = dict[str, tuple[str, ...]]
+"""Title to the names of the fields that stand under it."""
+
+_UNIT = re.compile(r"\[([^\[\]]+)\]")
+
+
+class Settings(BaseModel):
+    """Base of all settings and inputs: frozen, and closed to names that it does not know.
+
+    Attributes:
+        groups: Title to the names of the fields that stand under it; a model that inherits adds
+            to those of its bases.
+        experts: Fields that only ``--help-all`` shows.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    groups: ClassVar[Groups] = {}
+    experts: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def group_of(cls, name: str) -> str:
+        """Return the title that a field stands under."""
+        for base in cls.__mro__:
+            for title, names in vars(base).get("groups", {}).items():
+                if name in names:
+                    return title
+        return "options"
+
+    @classmethod
+    def is_expert(cls, name: str) -> bool:
+        """Whether a field is shown to experts only."""
+        return any(name in vars(base).get("experts", ()) for base in cls.__mro__)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core_schema: Any, handler: Any) -> dict[str, Any]:
+        schema = handler.resolve_ref_schema(handler(core_schema))
+        for name, content in schema.get("properties", {}).items():
+            content["title"] = name.replace("_", " ").capitalize()
+            content["group"] = cls.group_of(name)
+            content["expert"] = cls.is_expert(name)
+            if unit := _UNIT.search(content.get("description", "")):
+                content["unit"] = unit.group(1)
+        return schema
 
 
 def checked_settings(model: type[Model], values: dict[str, Any]) -> Model:

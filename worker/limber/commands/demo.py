@@ -1,4 +1,4 @@
-"""``limber demo``: every stage on one branch, as processes, with progress and a closing table."""
+"""The whole pipeline on one branch: every stage as a process, and a closing table."""
 
 import time
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""``limber doctor``: what is installed, what is missing, and what then does not work."""
+"""What is installed, what is missing and what then does not work."""
 
 import importlib
 import importlib.util

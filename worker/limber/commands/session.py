@@ -1,11 +1,11 @@
-"""``limber session``: a branch in a process that other programs bend, by JSON lines."""
+"""A branch held in a process that other programs bend, by JSON lines."""
 
 import sys
 from pathlib import Path
 
 import click
 
-from limber.cli import settings_options
+from limber.options import settings_options
 from limber.session.settings import SessionSettings
 
 

@@ -4,28 +4,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError, WorkError
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import Subject
+from limber.estimation.settings import PredictSettings
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
 from limber.recordings.recording import PullEntry
-
-
-class PredictSettings(BaseModel):
-    """A load on a branch whose Young's modulus has been estimated."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    pull: str | None = Field(
-        None, description="The pull whose points, grasp and gravity are taken; without it the "
-        "first one.")
-    weight: float | None = Field(None, ge=0, description="A hung weight [N].")
-    load: tuple[float, float, float] | None = Field(
-        None, description="A steady force in any direction, branch frame [N].")
 
 
 def require_one_load(settings: PredictSettings) -> None:

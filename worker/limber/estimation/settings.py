@@ -1,14 +1,25 @@
-"""Options of an estimate."""
+"""Settings of estimates, of virtual pulls and of predictions; they load nothing heavy."""
 
-from typing import Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from limber.settings import Groups, Settings
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
-class EstimateSettings(BaseModel):
+class EstimateSettings(Settings):
     """How Young's modulus is found from pulls."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    groups: ClassVar[Groups] = {
+        "input": ("pull", "drive", "motion", "fractions"),
+        "material": ("young", "poisson", "density", "fit_poisson", "fit_density", "fit_damping"),
+        "solver": ("method", "forward", "key_frames", "evaluations", "delta_m2", "robust"),
+        "uncertainty": ("hold_out", "mesh_check", "shapes"),
+    }
+    experts = ("key_frames", "evaluations", "delta_m2", "robust", "mesh_check", "shapes")
 
     pull: tuple[str, ...] = Field((), description="Names of the pulls to use; without it all.")
     method: Literal["gauss-newton", "nelder-mead"] = Field(
@@ -46,3 +57,88 @@ class EstimateSettings(BaseModel):
     shapes: int = Field(
         16, ge=0, description="At the end, pull so many branches that the scan allows as well; "
         "how they differ enters the interval. 0: the radii's deviation alone, the axis as exact.")
+
+
+class VirtualPullSettings(Settings):
+    """A simulated pull."""
+
+    groups: ClassVar[Groups] = {
+        "material": ("young", "poisson", "density", "damping", "gravity"),
+        "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
+            "reach", "turn", "phase"),
+        "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
+    }
+    experts = ("damping", "phase", "turn", "outliers")
+
+    young: tuple[float, ...] = Field(
+        (), description="True Young's modulus at the control points [Pa]; without it that of a "
+        "generated branch, or a gradient from 160 to 40 MPa.")
+    poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
+    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
+    motion: Literal["quasi_static", "dynamic"] = Field(
+        "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
+        "the branch; with --drive force it pulls and lets go.")
+    drive: Literal["pose", "force"] = Field(
+        "pose", description="What is said to move the branch; force: its force, as in the paper.")
+    weight: float | None = Field(
+        None, gt=0, description="Hang a growing weight of at last so many newtons on the grasp "
+        "instead of pulling sideways (slow, driven by force).")
+    damping: tuple[float, float] = Field(
+        (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
+    frames: int | None = Field(
+        None, ge=2, description="Number of recorded frames; without it 24, or 60 of a dynamic "
+        "pull.")
+    duration: float | None = Field(
+        None, gt=0, description="Length of the recording [s]; without it 6, or 1.5 of a dynamic "
+        "pull.")
+    grasp_fraction: float = Field(
+        0.92, gt=0, le=1, description="Where the branch is held. Past the last control point: "
+        "what lies beyond the grasp is not bent and cannot be estimated.")
+    mode: Literal["clamped", "pinned"] = Field(
+        "pinned", description="pinned: held in a loop that lets the branch turn; clamped: turned "
+        "less than it would turn by itself, so that a torque acts.")
+    reach: float = Field(
+        0.35, gt=0, le=0.8, description="Sideways travel of the grasp over its arc length.")
+    turn: float = Field(2.0, description="How far the pull's direction turns on the way [rad].")
+    phase: float | None = Field(
+        None, description="Direction in which it starts [rad]; without it drawn from the seed.")
+    position_noise: float = Field(1e-3, ge=0, description="Noise of observed points [m].")
+    force_noise: float = Field(
+        0.02, ge=0, description="Noise of the force over its largest size.")
+    torque_noise: float = Field(
+        0.02, ge=0, description="Noise of the torque over its largest size (clamped).")
+    gravity: bool = Field(
+        False, description="Let gravity bend the branch out of its scanned shape; without it "
+        "the scanned shape carries it already.")
+    camera: bool = Field(
+        False, description="Record depth images of a simulated D455 instead of points.")
+    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")
+    seed: int = Field(0, ge=0, description="Seed of all that is random.")
+
+    @property
+    def frame_count(self) -> int:
+        return self.frames or (60 if self.motion == "dynamic" else 24)
+
+    @property
+    def times(self) -> "np.ndarray":
+        """Time stamps [s], shape [frame_count]."""
+        import numpy as np
+
+        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
+        return np.linspace(0.0, duration, self.frame_count)
+
+
+class PredictSettings(Settings):
+    """A load on a branch whose Young's modulus has been estimated."""
+
+    groups: ClassVar[Groups] = {
+        "input": ("pull",),
+        "grasp and loads": ("weight", "load"),
+    }
+
+    pull: str | None = Field(
+        None, description="The pull whose points, grasp and gravity are taken; without it the "
+        "first one.")
+    weight: float | None = Field(None, ge=0, description="A hung weight [N].")
+    load: tuple[float, float, float] | None = Field(
+        None, description="A steady force in any direction, branch frame [N].")

@@ -8,14 +8,13 @@ that an estimate can be scored; nothing that estimates reads it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.settings import VirtualPullSettings
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import base_nodes
@@ -40,67 +39,6 @@ from limber.recordings.recording import (
 
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
-
-
-class VirtualPullSettings(BaseModel):
-    """A simulated pull."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    young: tuple[float, ...] = Field(
-        (), description="True Young's modulus at the control points [Pa]; without it that of a "
-        "generated branch, or a gradient from 160 to 40 MPa.")
-    poisson: float = Field(0.35, ge=0, lt=0.5, description="True Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="True density [kg/m^3].")
-    motion: Literal["quasi_static", "dynamic"] = Field(
-        "quasi_static", description="dynamic: fast, with inertia and damping. The gripper shakes "
-        "the branch; with --drive force it pulls and lets go.")
-    drive: Literal["pose", "force"] = Field(
-        "pose", description="What is said to move the branch; force: its force, as in the paper.")
-    weight: float | None = Field(
-        None, gt=0, description="Hang a growing weight of at last so many newtons on the grasp "
-        "instead of pulling sideways (slow, driven by force).")
-    damping: tuple[float, float] = Field(
-        (0.5, 0.002), description="True Rayleigh damping of a dynamic pull [1/s, s].")
-    frames: int | None = Field(
-        None, ge=2, description="Number of recorded frames; without it 24, or 60 of a dynamic "
-        "pull.")
-    duration: float | None = Field(
-        None, gt=0, description="Length of the recording [s]; without it 6, or 1.5 of a dynamic "
-        "pull.")
-    grasp_fraction: float = Field(
-        0.92, gt=0, le=1, description="Where the branch is held. Past the last control point: "
-        "what lies beyond the grasp is not bent and cannot be estimated.")
-    mode: Literal["clamped", "pinned"] = Field(
-        "pinned", description="pinned: held in a loop that lets the branch turn; clamped: turned "
-        "less than it would turn by itself, so that a torque acts.")
-    reach: float = Field(
-        0.35, gt=0, le=0.8, description="Sideways travel of the grasp over its arc length.")
-    turn: float = Field(2.0, description="How far the pull's direction turns on the way [rad].")
-    phase: float | None = Field(
-        None, description="Direction in which it starts [rad]; without it drawn from the seed.")
-    position_noise: float = Field(1e-3, ge=0, description="Noise of observed points [m].")
-    force_noise: float = Field(
-        0.02, ge=0, description="Noise of the force over its largest size.")
-    torque_noise: float = Field(
-        0.02, ge=0, description="Noise of the torque over its largest size (clamped).")
-    gravity: bool = Field(
-        False, description="Let gravity bend the branch out of its scanned shape; without it "
-        "the scanned shape carries it already.")
-    camera: bool = Field(
-        False, description="Record depth images of a simulated D455 instead of points.")
-    outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")
-    seed: int = Field(0, ge=0, description="Seed of all that is random.")
-
-    @property
-    def frame_count(self) -> int:
-        return self.frames or (60 if self.motion == "dynamic" else 24)
-
-    @property
-    def times(self) -> np.ndarray:
-        """Time stamps [s], shape [frame_count]."""
-        duration = self.duration or (1.5 if self.motion == "dynamic" else 6.0)
-        return np.linspace(0.0, duration, self.frame_count)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,32 @@
+"""Geometry of a branch: from points to skeleton, surface and tetrahedra.
+
+A generated branch and its scan, with the truth beside it:
+
+>>> from limber.geometry import generate_branch
+>>> branch = generate_branch(1, length=0.3, fork_count=0)
+>>> branch.skeleton.branch_count, len(branch.cloud) > 1000, branch.young.shape
+(1, True, (4,))
+"""
+
+from limber.lazy import exports
+
+_PLACES = {
+    "BranchSpec": "settings",
+    "Cloud": "cloud.cloud",
+    "MeshSurfaceSettings": "settings",
+    "ReconstructSettings": "settings",
+    "Reconstruction": "reconstruct",
+    "Skeleton": "skeleton.skeleton",
+    "Surface": "surface.surface",
+    "TetMesh": "tets.tet_mesh",
+    "control_points": "skeleton.control_points",
+    "generate_branch": "generated",
+    "mesh_body": "mesh_surface",
+    "mesh_branch": "tets.tetrahedra",
+    "read_points": "cloud.files",
+    "reconstruct_cloud": "reconstruct",
+    "straight_beam": "tets.cylinder_mesh",
+}
+
+__getattr__, __dir__ = exports(__name__, _PLACES)
+__all__ = list(_PLACES)

@@ -1,13 +1,12 @@
 """Generated branches: true axes, radii and Young's modulus, and a scan of them with faults."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.settings import BranchSpec
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.surface import Surface
@@ -15,28 +14,6 @@ from limber.geometry.surface.sweep import frames, tangents
 from limber.settings import checked_settings
 
 _STEP = 0.004  # [m] between nodes of the true axes
-
-
-class BranchSpec(BaseModel):
-    """What a generated branch is like and how it is scanned."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    length: float = Field(0.9, gt=0.05, description="Length of the main axis [m].")
-    radius_root: float = Field(0.009, gt=0, description="Radius at the root [m].")
-    radius_tip: float = Field(0.004, gt=0, description="Radius at the tip [m].")
-    bend: float = Field(0.6, ge=0, description="Turn of the main axis from root to tip [rad].")
-    fork_count: int = Field(3, ge=0, le=12, description="Number of side twigs.")
-    noise: float = Field(0.001, ge=0, description="Standard deviation of the points [m].")
-    point_spacing: float = Field(0.002, gt=0, description="Mean distance of the points [m].")
-    unevenness: float = Field(0.4, ge=0, lt=1, description="How much the density varies, 0 to 1.")
-    occlusion: float = Field(0.1, ge=0, lt=0.6, description="Share of the surface in holes.")
-    view: Literal["round", "one-sided"] = Field(
-        "round", description="Scanned from all around, or from one side as a depth camera does.")
-    gap_count: int = Field(0, ge=0, le=5, description="Stretches without any point.")
-    gap_length: float = Field(0.02, gt=0, description="Length of such a stretch [m].")
-    outlier_share: float = Field(0.0, ge=0, lt=0.3, description="Share of stray points.")
-    young_mean: float = Field(1e8, gt=0, description="Typical Young's modulus [Pa].")
 
 
 @dataclass(frozen=True)

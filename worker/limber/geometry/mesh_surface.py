@@ -1,47 +1,24 @@
 """From the closed surface of any slender body to tetrahedra with axis, base and grasp."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.alignment import Alignment
 from limber.errors import InputError, MeshingError
 from limber.geometry.reconstruct import gravity_after, peak_memory_mb
+from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.upright import shortest_turn
 from limber.geometry.surface.surface import Surface
-from limber.geometry.tets.marks import GRASP_FRACTION, mark
+from limber.geometry.tets.marks import mark
 from limber.geometry.tets.quality import measure_quality
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, tetrahedralise
 from limber.progress import SILENT, Progress
-
-
-class MeshSurfaceSettings(BaseModel):
-    """What a closed surface becomes."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
-    up: tuple[float, float, float] = Field(
-        (0.0, 0.0, 1.0), description="Which way is up in the file's axes.")
-    root: tuple[float, float, float] | None = Field(
-        None, description="A point near the end that is held, in the file's coordinates; else "
-        "the thicker end.")
-    upright: bool = Field(True, description="Turn the long axis to z; gravity is turned with it.")
-    elements_across: float = Field(
-        3.0, gt=0.2, le=20, description="Elements across the body's thickness.")
-    mesh_time_limit: float = Field(120.0, gt=0, description="fTetWild's time limit [s].")
-    mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
-    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
-    poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="Density [kg/m^3].")
-    grasp_fraction: float = Field(
-        GRASP_FRACTION, gt=0, le=1, description="Where the body is held, along its axis.")
 
 
 @dataclass(frozen=True)

@@ -1,52 +1,31 @@
 """From a scan to tetrahedra: skeleton, surface and mesh of a branch, in its own frame."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from limber.alignment import Alignment
 from limber.constants import STANDARD_GRAVITY
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.preparation import PreparationSettings, Prepared, prepare
+from limber.geometry.cloud.preparation import Prepared, prepare
+from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
-from limber.geometry.skeleton.skeletonise import SkeletonResult, SkeletonSettings, skeletonise
+from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
 from limber.geometry.skeleton.upright import upright_rotation
 from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.tubes import branch_surface
-from limber.geometry.tets.marks import GRASP_FRACTION, mark
+from limber.geometry.tets.marks import mark
 from limber.geometry.tets.quality import measure_quality
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.geometry.tets.tetrahedra import MeshResult, MeshSettings, mesh_branch
+from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
 from limber.progress import SILENT, Progress
-
-
-class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
-    """Everything that decides what a scan becomes."""
-
-    unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
-    up: tuple[float, float, float] = Field(
-        (0.0, 0.0, 1.0), description="Which way is up in the file's axes.")
-    root: tuple[float, float, float] | None = Field(
-        None, description="A point near the root, in the file's coordinates; else the thick end.")
-    upright: bool = Field(
-        True, description="Turn the branch so that it grows along z; gravity is turned with it.")
-    twig_radius: float = Field(
-        0.0, ge=0, description="Leave out twigs thinner than that [m], keep their mass.")
-    twig_order: int = Field(
-        9, ge=0, le=9, description="Leave out twigs of a higher branching order, keep their mass.")
-    young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
-    poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
-    density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
-    grasp_fraction: float = Field(
-        GRASP_FRACTION, gt=0, le=1, description="Where the branch is held, along its main path.")
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,39 @@
-"""Mechanics of a branch: finite elements, statics, dynamics, sensitivities."""
+"""Mechanics of a branch: finite elements, statics, dynamics, sensitivities.
 
-from limber.mechanics.dynamics.simulate import DynamicResult, NewmarkSettings, simulate_dynamics
-from limber.mechanics.grasp import Grasp
-from limber.mechanics.materials import Material, RayleighDamping
-from limber.mechanics.model import BranchModel, PointMass
-from limber.mechanics.sensitivities import (
-    ParameterSet,
-    StaticSensitivities,
-    static_sensitivities,
-)
-from limber.mechanics.statics.solve import StaticResult, StaticSettings, follow_poses, solve_static
-from limber.mechanics.young_field import young_weights
+A beam of 20 cm, its end pushed aside by a centimetre:
 
-__all__ = [
-    "BranchModel", "DynamicResult", "Grasp", "Material", "NewmarkSettings", "ParameterSet",
-    "PointMass", "RayleighDamping", "StaticResult", "StaticSensitivities", "StaticSettings",
-    "follow_poses", "simulate_dynamics", "solve_static", "static_sensitivities", "young_weights",
-]
+>>> from limber.geometry import straight_beam
+>>> from limber.mechanics import BranchModel, Grasp, solve_static
+>>> mesh = straight_beam(0.2, 0.004, 0.003, slice_count=6)
+>>> model = BranchModel(mesh, young=1e8, poisson=0.35, density=900.0, gravity=None)
+>>> grasp = Grasp.from_mesh(mesh, mode="pinned")
+>>> pose = grasp.rest_pose + [0.01, 0, 0, 0, 0, 0]
+>>> result = solve_static(model, grasp=grasp, pose=pose).require()
+>>> result.converged, bool(result.strain_energy > 0)
+(True, True)
+"""
+
+from limber.lazy import exports
+
+_PLACES = {
+    "BranchModel": "model",
+    "DynamicResult": "dynamics.simulate",
+    "Grasp": "grasp",
+    "Material": "materials",
+    "NewmarkSettings": "dynamics.simulate",
+    "ParameterSet": "sensitivities",
+    "PointMass": "model",
+    "RayleighDamping": "materials",
+    "StaticResult": "statics.solve",
+    "StaticSensitivities": "sensitivities",
+    "StaticSettings": "statics.solve",
+    "follow_poses": "statics.solve",
+    "simulate_dynamics": "dynamics.simulate",
+    "solve_static": "statics.solve",
+    "static_sensitivities": "sensitivities",
+    "unloaded_rest_shape": "statics.rest_shape",
+    "young_weights": "young_field",
+}
+
+__getattr__, __dir__ = exports(__name__, _PLACES)
+__all__ = list(_PLACES)

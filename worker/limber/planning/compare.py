@@ -1,10 +1,8 @@
 """Two paths to the same goal region on one field: the shortest, and the gentle one."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError, NoPathError
 from limber.planning.cost import STEP, CostWeights
@@ -12,36 +10,8 @@ from limber.planning.field import EnergyField, FieldArrays
 from limber.planning.goals import Goal, allowed_points, goal_points
 from limber.planning.ompl_engine import ompl_missing
 from limber.planning.rrt_star import FoundPath, PathProblem, Search, plan_path
+from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
-
-
-class PlanSettings(BaseModel):
-    """From where to where, what counts and what is not allowed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
-        "chosen and named."))
-    tip_goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the branch's tip (its flower) shall be, in the branch's frame [m]."))
-    goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
-    start: tuple[float, float, float] | None = Field(None, description=(
-        "Where the grasp starts [m]; default the rest pose."))
-    start_seed: int | None = Field(None, ge=0, description=(
-        "Start from a random deformed configuration instead, as in the paper's trials."))
-    deformation_weight: float = Field(1.0, ge=0, description=(
-        "Weight of deformation, the paper's alpha_def."))
-    distance_weight: float = Field(1.5, gt=0, description=(
-        "Weight of distance, the paper's alpha_dis."))
-    max_energy: float | None = Field(None, gt=0, description=(
-        "Deformation energy that no pose may exceed [J]."))
-    max_force: float | None = Field(None, gt=0, description=(
-        "Force of the gripper that no pose may exceed [N]."))
-    iterations: int = Field(3000, ge=100, le=200_000, description="Samples of each planner.")
-    engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
-        "OMPL's RRT* or our own; auto: OMPL where it is installed."))
-    seed: int = Field(0, ge=0, description="Of both planners.")
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,9 @@ import re
 import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.alignment import Alignment
 from limber.constants import GRAVITY
@@ -31,6 +30,7 @@ from limber.recordings.recording import (
     write_pull,
 )
 from limber.recordings.registration import Registration, read_nominal, register
+from limber.recordings.settings import ImportSettings
 from limber.recordings.streams import Stream
 from limber.recordings.tables import (
     LENGTH_UNITS_M,
@@ -40,63 +40,6 @@ from limber.recordings.tables import (
     split_title,
     with_columns,
 )
-
-Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement"]
-
-
-class ImportSettings(BaseModel):
-    """How to read a recording."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    kind: Kind = Field("auto", description="What SOURCE is; auto goes by its name and content.")
-    robot: str | None = Field(None, description="CSV of the gripper: time, pose and wrench.")
-    unit: Literal["m", "cm", "mm"] | None = Field(
-        None, description="Unit of positions in SOURCE; without it that of the columns' names, "
-        "else metres.")
-    force_unit: Literal["N", "gf", "mN", "lbf", "kgf", "kN"] | None = Field(
-        None, description="Unit of forces; without it that of the columns' names, else newtons.")
-    rate_hz: float | None = Field(
-        None, gt=0, description="Frames a second, where SOURCE has no time stamps.")
-    nominal: str | None = Field(
-        None, description="CSV label,x_m,y_m,z_m: the markers' places on the branch at rest; the "
-        "recording's first frames are fitted to it rigidly.")
-    coordinates: Literal["branch", "scan"] = Field(
-        "branch", description="Frame of --nominal, --grasp-point and --load: the branch folder's, "
-        "or that of the file it was made from.")
-    grasp_point: tuple[float, float, float] | None = Field(
-        None, description="Where the gripper holds or the load hangs, at rest [m]; else the "
-        "robot's first pose.")
-    grasp_radius: float = Field(0.01, gt=0, description="Radius of the grasp patch [m].")
-    grasp_mode: Literal["clamped", "pinned"] = Field(
-        "clamped", description="clamped: the gripper also turns the branch.")
-    weight: float | None = Field(
-        None, ge=0, description="No robot, but a weight of so many newtons that hangs at "
-        "--grasp-point: SOURCE shows the branch without it first, at rest under it last.")
-    load: tuple[float, float, float] | None = Field(
-        None, description="The same for a steady force in any direction [N].")
-    own_weight: bool = Field(
-        False, description="The branch's own weight is not in its shape at rest (it was held up, "
-        "or scanned lying): it acts as well.")
-    drive: Literal["pose", "force"] = Field(
-        "pose", description="What drives the simulation; the other is compared with it.")
-    motion: Literal["quasi_static", "dynamic"] = Field(
-        "quasi_static", description="dynamic where inertia matters.")
-    time_offset: float | None = Field(
-        None, description="Added to SOURCE's time stamps [s]; without it, it is estimated.")
-    position_sigma: float | None = Field(
-        None, gt=0, description="Noise of positions [m]; without it 1 mm, under a steady load "
-        "what the recording shows.")
-    force_sigma: float = Field(0.1, gt=0, description="Noise of forces [N].")
-    torque_sigma: float | None = Field(
-        None, gt=0, description="Noise of torques about the pose's position [N m]; a clamped "
-        "gripper's torque is used only where this is known.")
-    yolo_weights: str | None = Field(
-        None, description="Weights file of a YOLO segmentation model of your own, for masks of "
-        "an RGB-D folder's colour images (needs ultralytics).")
-    yolo_prompt: str | None = Field(
-        None, description="What it shall look for, for open-vocabulary models.")
-    yolo_class: str | None = Field(None, description="Which of its classes is the branch.")
 
 
 @dataclass(frozen=True)

@@ -1,32 +1,41 @@
 """Young's modulus along the branch, from pulls."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from limber.errors import Cancelled, LimberError
-from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.fit import Estimate, fit_branch, foretell, judge_model
-from limber.estimation.online.follow import follow as follow_pull
-from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.summary import details, summary
-from limber.geometry.cloud.cloud import read_cloud
 from limber.plain import plain
 from limber.progress import SILENT, Progress
-from limber.stages.loading import (
-    known_pulls,
-    load_pulls,
-    load_subject,
-    pull_names,
-    pulls_digest,
-)
+from limber.settings import Groups
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.estimation.fit import Estimate
+    from limber.estimation.preparation import Subject
+
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
 """Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
+
+
+class EstimateOptions(RunOptions):
+    """How an estimate is run."""
+
+    groups: ClassVar[Groups] = {"running": ("follow", "pace")}
+
+    follow: bool = Field(
+        False, description="Estimate frame by frame while a pull is recorded, or replay one.",
+        json_schema_extra={"switch": True})
+    pace: float = Field(1.0, ge=0, description="Speed of a replay; 0: as fast as it goes.")
 
 
 def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
@@ -44,6 +53,11 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
         WorkError: the simulation finds no equilibrium.
         Cancelled: after the best so far was kept.
     """
+    from limber.estimation.evaluations import EvaluationLog
+    from limber.estimation.fit import fit_branch, judge_model
+    from limber.estimation.summary import details, summary
+    from limber.stages.loading import load_pulls, load_subject, pull_names, pulls_digest
+
     branch = Branch.open(branch_folder)
     names = pull_names(branch, settings)
     subject = load_subject(branch, settings)
@@ -107,6 +121,9 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     Raises:
         InputError: no such pull, or one without markers.
     """
+    from limber.estimation.online.follow import follow as follow_pull
+    from limber.stages.loading import load_subject
+
     branch = Branch.open(branch_folder)
     name = _followed(branch, settings)
     subject = load_subject(branch, settings)
@@ -123,18 +140,25 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
 
 def _followed(branch: Branch, settings: EstimateSettings) -> str:
     """The pull to follow; one that a recorder writes is not in the branch's manifest."""
+    from limber.stages.loading import pull_names
+
     if settings.pull and (branch.folder / "pulls" / settings.pull[0] / "pull.toml").is_file():
         return settings.pull[0]
     return pull_names(branch, settings)[0]
 
 
 def _cloud(branch: Branch) -> np.ndarray | None:
+    from limber.geometry.cloud.cloud import read_cloud
+
     return read_cloud(branch.path("cloud.ply")).points if branch.has("cloud.ply") else None
 
 
 def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,
                      settings: EstimateSettings, progress: Progress) -> None:
     """Score the branch's pulls that this estimate was not asked to use."""
+    from limber.estimation.fit import foretell
+    from limber.stages.loading import known_pulls, load_pulls
+
     for name in [name for name in known_pulls(branch) if name not in names]:
         try:
             pull = load_pulls(branch, [name], subject, settings)[0]
@@ -142,3 +166,26 @@ def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: 
         except LimberError as error:
             progress.warn(
                 f"{name}, which the estimate did not use, could not be scored: {error}")
+
+
+def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    if options.follow:
+        return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
+    return estimate(inputs.branch_folder, settings, force=options.force, progress=progress)
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    from limber.report.tables import held_out_rows, modulus_rows
+
+    tables = [("Young's modulus", modulus_rows(result, None))]
+    if held_out := held_out_rows(result):
+        tables.append(("Pulls foretold by a fit that did not see them: RMS errors", held_out))
+    return tables
+
+
+STAGE = StageDescription(
+    "estimate", 70, run, BranchInputs, EstimateSettings, EstimateOptions, key="estimate",
+    reads=("mesh.vtu", "skeleton.swc", "pulls/"), writes=("estimate.json", "mesh.vtu"),
+    tables=_tables)

@@ -1,14 +1,40 @@
 """A generated branch with known truth, scanned as a scanner would."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
 
 from limber.errors import InputError
 from limber.files import file_digest, write_atomically
-from limber.geometry.generated import BranchSpec, GeneratedBranch, generate_branch
+from limber.geometry.settings import BranchSpec
 from limber.plain import plain
 from limber.progress import SILENT, Progress
+from limber.settings import Groups, Settings
+from limber.stages.inputs import NoOptions, argument
+from limber.stages.registry import StageDescription
+
+if TYPE_CHECKING:
+    from limber.geometry.generated import GeneratedBranch
+
+
+class GenerateInputs(Settings):
+    """Where the scan and its truth go."""
+
+    groups: ClassVar[Groups] = {"output": ("folder",)}
+
+    folder: Path = argument("The folder to make.")
+
+
+class GenerateSettings(BranchSpec):
+    """A generated branch and its seed."""
+
+    groups: ClassVar[Groups] = {"shape": ("seed",)}
+
+    seed: int = Field(0, description="Seed of all that is random.")
 
 
 def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
@@ -18,6 +44,8 @@ def generate(folder: Path, settings: BranchSpec, *, seed: int = 0,
     Raises:
         InputError: the folder cannot be written to.
     """
+    from limber.geometry.generated import generate_branch
+
     progress(0.1, "generating")
     return write_generated(generate_branch(seed, **settings.model_dump()), folder)
 
@@ -45,3 +73,14 @@ def write_generated(branch: GeneratedBranch, folder: Path) -> dict[str, Any]:
     return {"cloud": str(folder / "cloud.ply"), "point_count": len(branch.cloud),
             "branch_count": branch.skeleton.branch_count, "length_m": branch.skeleton.length,
             "young_pa": branch.young, "surface_volume_m3": branch.surface.volume}
+
+
+def run(inputs: GenerateInputs, settings: GenerateSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    spec = BranchSpec(**settings.model_dump(exclude={"seed"}))
+    return generate(inputs.folder, spec, seed=settings.seed, progress=progress)
+
+
+STAGE = StageDescription(
+    "generate", 10, run, GenerateInputs, GenerateSettings, NoOptions)

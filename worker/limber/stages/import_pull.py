@@ -1,15 +1,33 @@
 """Bring a recording of a pull into the branch folder."""
 
+from __future__ import annotations
+
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import Field
 
 from limber.errors import InputError
 from limber.files import file_digest
 from limber.progress import SILENT, Progress
-from limber.recordings.importing import BranchFrame, ImportSettings, import_recording, kind_of
-from limber.stages.loading import load_mesh
+from limber.recordings.settings import ImportSettings
+from limber.settings import Groups
+from limber.stages.inputs import BranchInputs, RunOptions, argument
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.recordings.importing import BranchFrame
+
+
+class ImportInputs(BranchInputs):
+    """A branch folder, a recording, and the name it gets."""
+
+    groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",)}
+
+    source: Path = argument("Marker CSV, C3D, folder of PLY or RGB-D, force table.")
+    name: str = Field(description="Name of the pull.")
 
 
 def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
@@ -22,6 +40,8 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     Raises:
         InputError: SOURCE cannot be read as what it is said to be.
     """
+    from limber.recordings.importing import import_recording, kind_of
+
     source = Path(source)
     if not source.exists():
         raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
@@ -46,6 +66,9 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
 
 
 def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:
+    from limber.recordings.importing import BranchFrame
+    from limber.stages.loading import load_mesh
+
     if kind == "force-displacement":
         return BranchFrame()
     loaded = settings.weight is not None or settings.load is not None
@@ -61,3 +84,15 @@ def _digest(path: Path) -> str:
         if file.is_file():
             joined.update(file.relative_to(path).as_posix().encode() + file_digest(file).encode())
     return joined.hexdigest()
+
+
+def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return import_pull(inputs.branch_folder, inputs.source, inputs.name, settings,
+                       force=options.force, progress=progress)
+
+
+STAGE = StageDescription(
+    "import-pull", 50, run, ImportInputs, ImportSettings, RunOptions, key="pull:{name}",
+    writes=("pulls/{name}/",))

@@ -1,15 +1,27 @@
 """Closed surface (STL, PLY, OBJ) to tetrahedra."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+from pydantic import Field
 
 from limber.files import file_digest, require_file
-from limber.geometry.mesh_surface import MeshSurfaceSettings, mesh_body
-from limber.geometry.skeleton.files import UNIT_METRES
-from limber.geometry.surface.input import usable_surface
-from limber.geometry.surface.surface import Surface
+from limber.geometry.settings import MeshSurfaceSettings
 from limber.progress import SILENT, Progress
+from limber.settings import Groups, Settings
+from limber.stages.inputs import RunOptions, argument
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+
+class MeshInputs(Settings):
+    """A closed surface, and the branch folder to make."""
+
+    groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
+
+    surface: Path = argument("STL, PLY, OBJ or OFF.")
+    output: Path = Field(description="The branch folder to make.",
+                         json_schema_extra={"short": "-o"})
 
 
 def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None = None, *,
@@ -28,6 +40,11 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
             :func:`limber.geometry.surface.input.usable_surface`.
         MeshingError: fTetWild failed.
     """
+    from limber.geometry.mesh_surface import mesh_body
+    from limber.geometry.skeleton.files import UNIT_METRES
+    from limber.geometry.surface.input import usable_surface
+    from limber.geometry.surface.surface import Surface
+
     settings = settings or MeshSurfaceSettings()
     surface, warnings = usable_surface(Surface.read(
         require_file(path, "A surface"), scale=UNIT_METRES[settings.unit]), path)
@@ -49,3 +66,15 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         stage.result.update(made.numbers | {"warnings": warnings})
         progress(1.0, "meshed", tets=made.mesh.tet_count)
     return branch.manifest.stages["mesh"].result
+
+
+def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return mesh_surface(inputs.surface, inputs.output, settings, force=options.force,
+                        progress=progress)
+
+
+STAGE = StageDescription(
+    "mesh", 30, run, MeshInputs, MeshSurfaceSettings, RunOptions, key="mesh",
+    writes=("skeleton.swc", "surface.ply", "mesh.vtu"))

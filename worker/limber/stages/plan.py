@@ -4,33 +4,45 @@ The field serves to search. Every energy, force and strain that is reported come
 elements along the found paths; how far the field was off is reported beside them.
 """
 
+from __future__ import annotations
+
 import csv
 import io
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from limber.errors import BranchFolderError, InputError
-from limber.mechanics.frames import write_pc2
 from limber.plain import plain
-from limber.planning.compare import PlanSettings
-from limber.planning.cost import arc_lengths
-from limber.planning.field import EnergyField
-from limber.planning.grasp_model import GraspModel
-from limber.planning.plan import PlannedMotion, plan_motion
-from limber.planning.resolve import ResolvedPath
-from limber.planning.sampling import energy_inputs
+from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
-from limber.scene.data import at_nodes
-from limber.stages.loading import load_grasp_model
+from limber.settings import Groups
+from limber.stages.inputs import BranchInputs, ParallelOptions
+from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
+
+if TYPE_CHECKING:
+    from limber.planning.field import EnergyField
+    from limber.planning.grasp_model import GraspModel
+    from limber.planning.plan import PlannedMotion
+    from limber.planning.resolve import ResolvedPath
+
 
 _FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
 _COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
             "strain")
+
+
+class PlanInputs(BranchInputs):
+    """A branch folder, and the plan's name."""
+
+    groups: ClassVar[Groups] = {"output": ("name",)}
+
+    name: str = Field("path", description="Name of the plan's files.")
 
 
 def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: int = 2,
@@ -44,6 +56,11 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
         InputError: a name that is none, a start that is not allowed, or two goals.
         NoPathError: no path; the message says why.
     """
+    from limber.planning.field import EnergyField
+    from limber.planning.plan import plan_motion
+    from limber.planning.sampling import energy_inputs
+    from limber.stages.loading import load_grasp_model
+
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith("-baseline"):
         raise InputError(f"--name {name!r} cannot name a plan.",
                          "It becomes part of file names, and -baseline is the other path's.",
@@ -74,6 +91,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
 
 def _write(stage: Stage, name: str, grasp_model: GraspModel, field: EnergyField,
            found: PlannedMotion) -> None:
+    from limber.mechanics.frames import write_pc2
+    from limber.scene.data import at_nodes
+
     detailed = dict(found.summary)
     baseline, plan = found.baseline, found.plan
     for key, path in (("baseline", baseline), ("plan", plan)):
@@ -101,6 +121,8 @@ def _write(stage: Stage, name: str, grasp_model: GraspModel, field: EnergyField,
 
 
 def _table(path: ResolvedPath) -> str:
+    from limber.planning.cost import arc_lengths
+
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(_COLUMNS)
@@ -108,3 +130,24 @@ def _table(path: ResolvedPath) -> str:
     rows = np.column_stack([along, path.poses, path.energies, path.forces, path.strains])
     writer.writerows([f"{value:.9g}" for value in row] for row in rows)
     return text.getvalue()
+
+
+def run(inputs: PlanInputs, settings: PlanSettings, options: ParallelOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return plan(inputs.branch_folder, settings, name=inputs.name, workers=options.workers,
+                force=options.force, progress=progress)
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    from limber.report.tables import comparison_rows
+
+    return [("Both paths, on the full model", comparison_rows(result))]
+
+
+STAGE = StageDescription(
+    "plan", 100, run, PlanInputs, PlanSettings, ParallelOptions, key="plan:{name}",
+    reads=("mesh.vtu", "energy.npz"),
+    writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
+            "frames/{name}.pc2", "frames/{name}.json", "frames/{name}.npz"),
+    tables=_tables)

@@ -1,19 +1,23 @@
 """Where a branch rests under another load, with its estimated modulus."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from limber.errors import InputError
-from limber.estimation.predict import PredictSettings, predict_rest, require_one_load
-from limber.estimation.settings import EstimateSettings
+from limber.estimation.settings import EstimateSettings, PredictSettings
 from limber.plain import plain
 from limber.progress import SILENT, Progress
-from limber.recordings.recording import PullEntry, read_entry
-from limber.stages.loading import known_pulls, load_subject
+from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.recordings.recording import PullEntry
 
 
 def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progress = SILENT,
@@ -27,6 +31,9 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
         InputError: no load, nothing estimated yet, or no such pull.
         WorkError: the branch finds no equilibrium under the load.
     """
+    from limber.estimation.predict import predict_rest, require_one_load
+    from limber.stages.loading import load_subject
+
     require_one_load(settings)
     branch = Branch.open(branch_folder)
     known = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
@@ -37,9 +44,23 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
 
 
 def _entry(branch: Branch, name: str | None) -> PullEntry:
+    from limber.recordings.recording import read_entry
+    from limber.stages.loading import known_pulls
+
     names = known_pulls(branch)
     if not names or (name is not None and name not in names):
         raise InputError(f"{branch.folder} has no pull {name or ''}.",
                          f"It has {', '.join(names)}." if names else "It has none.",
                          "Bring one in with `limber import-pull`.")
     return read_entry(branch.path(f"pulls/{name or names[0]}/pull.toml"))
+
+
+def run(inputs: BranchInputs, settings: PredictSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return predict(inputs.branch_folder, settings, progress=progress)
+
+
+STAGE = StageDescription(
+    "predict", 80, run, BranchInputs, PredictSettings, NoOptions,
+    reads=("mesh.vtu", "skeleton.swc", "estimate.json", "pulls/"))

@@ -1,22 +1,45 @@
 """Scan to tetrahedra: skeleton, radii, surface, mesh."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from limber.alignment import Alignment
 from limber.errors import Cancelled, InputError, LimberError, WorkError
 from limber.files import file_digest, require_file
-from limber.geometry.cloud.depth_files import read_depth
-from limber.geometry.cloud.files import READERS, read_points
-from limber.geometry.reconstruct import Reconstruction, ReconstructSettings, reconstruct_cloud
-from limber.geometry.skeleton.files import UNIT_METRES, read_skeleton, write_cylinders
-from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.surface.surface import Surface
+from limber.geometry.settings import ReconstructSettings
 from limber.progress import SILENT, Progress
+from limber.settings import Groups, Settings
+from limber.stages.inputs import RunOptions, argument
+from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
+
+if TYPE_CHECKING:
+    from limber.geometry.reconstruct import Reconstruction
+
+
+class ReconstructInputs(Settings):
+    """A scan, what is known of it, and the branch folder to make."""
+
+    groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "camera", "mask"),
+                               "output": ("output",)}
+
+    cloud: Path = argument("A point cloud file, or a folder of them: then each becomes a branch "
+                           "folder in the output folder, and a bad one does not stop the others.")
+    output: Path = Field(
+        description="The branch folder to make; with a folder of scans, where to make them.",
+        json_schema_extra={"short": "-o"})
+    skeleton: Path | None = Field(
+        None, description="Your own skeleton (SWC or cylinder CSV) in the cloud's coordinates.")
+    camera: Path | None = Field(
+        None, description="camera.toml: then CLOUD is a depth image.")
+    mask: Path | None = Field(
+        None, description="With --camera: an image that is over 0 on the branch.")
 
 
 def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
@@ -43,6 +66,11 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         InputError: the scan, the skeleton or the folder cannot be used.
         WorkError: the work failed; the folder is as it was.
     """
+    from limber.geometry.cloud.depth_files import read_depth
+    from limber.geometry.cloud.files import read_points
+    from limber.geometry.reconstruct import reconstruct_cloud
+    from limber.geometry.skeleton.files import UNIT_METRES, read_skeleton
+
     settings = settings or ReconstructSettings()
     raw = read_points(cloud_path) if camera_path is None else read_depth(
         cloud_path, camera_path, mask_path)
@@ -88,6 +116,8 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
         InputError: there is no scan.
         WorkError: all of them failed.
     """
+    from limber.geometry.cloud.files import READERS
+
     paths = sorted(p for p in Path(clouds).iterdir() if p.suffix.lower() in READERS)
     if not paths:
         raise InputError(f"{clouds} has no point clouds.",
@@ -111,6 +141,8 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
 
 
 def _write(stage: Stage, made: Reconstruction) -> None:
+    from limber.geometry.skeleton.files import write_cylinders
+
     meshed = made.meshed
     made.cloud.write_ply(stage.path("cloud.ply"))
     meshed.skeleton.write_swc(stage.path("skeleton.swc"))
@@ -134,6 +166,9 @@ def _eye(camera_path: Path | None) -> np.ndarray | None:
 
 def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
+    from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.geometry.surface.surface import Surface
+
     source = cloud_path.parent / "truth.json"
     skeleton_path = cloud_path.parent / "truth_skeleton.swc"
     if not (source.is_file() and skeleton_path.is_file()):
@@ -153,3 +188,20 @@ def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     else:
         stage.remove("truth/surface.ply")
     return True
+
+
+def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    if inputs.cloud.is_dir():
+        return reconstruct_folder(inputs.cloud, inputs.output, settings, force=options.force,
+                                  progress=progress)
+    return reconstruct(inputs.cloud, inputs.output, settings, skeleton_path=inputs.skeleton,
+                       camera_path=inputs.camera, mask_path=inputs.mask, force=options.force,
+                       progress=progress)
+
+
+STAGE = StageDescription(
+    "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
+    writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
+            "point_masses.json", "truth/"))

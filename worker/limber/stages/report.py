@@ -1,11 +1,24 @@
 """One self-contained HTML page with figures and tables of all results."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+from pydantic import Field
 
 from limber.progress import SILENT, Progress
-from limber.report.page import draw_page
+from limber.settings import Groups
+from limber.stages.inputs import BranchInputs, NoOptions, NoSettings
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+
+class ReportInputs(BranchInputs):
+    """A branch folder, and a picture of it."""
+
+    groups: ClassVar[Groups] = {"input": ("picture",)}
+
+    picture: Path | None = Field(
+        None, description="A PNG to open the page with, such as the render of `limber scene`.")
 
 
 def write_report(folder: Path, *, picture: Path | None = None, progress: Progress = SILENT,
@@ -19,6 +32,8 @@ def write_report(folder: Path, *, picture: Path | None = None, progress: Progres
     Returns:
         ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``.
     """
+    from limber.report.page import draw_page
+
     branch = Branch.open(folder)
     html, page = draw_page(branch, picture=picture, progress=progress)
     with branch.stage("report", {"picture": bool(picture)}) as stage:
@@ -29,3 +44,14 @@ def write_report(folder: Path, *, picture: Path | None = None, progress: Progres
             missing=[section.title for section in page if section.missing])
     progress(1.0, "written")
     return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
+
+
+def run(inputs: ReportInputs, _settings: NoSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return write_report(inputs.branch_folder, picture=inputs.picture, progress=progress)
+
+
+STAGE = StageDescription(
+    "report", 110, run, ReportInputs, NoSettings, NoOptions, key="report",
+    writes=("report.html",))

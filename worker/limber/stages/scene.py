@@ -2,13 +2,41 @@
 
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
 
 from limber.errors import InputError, WorkError
 from limber.progress import SILENT, Progress
-from limber.scene.blender import make_scene
-from limber.scene.data import scene_data
+from limber.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+
+class SceneInputs(BranchInputs):
+    """A branch folder, and the files to make of it."""
+
+    groups: ClassVar[Groups] = {"output": ("output", "render", "data")}
+
+    output: Path | None = Field(None, description="The .blend to write.",
+                                json_schema_extra={"short": "-o"})
+    render: Path | None = Field(
+        None, description="Also render a picture (PNG) of the end of the path.")
+    data: Path | None = Field(
+        None, description="Write only what a scene shows, as arrays (.npz): what the add-on opens.")
+
+
+class SceneSettings(Settings):
+    """What a scene shows."""
+
+    groups: ClassVar[Groups] = {"picture": ("width", "color", "plan")}
+
+    width: int = Field(1120, ge=160, le=8192, description=(
+        "Of the picture [pixels]; its height is three quarters of it."))
+    color: Literal["young", "strain_energy"] = Field(
+        "young", description="What the branch's colours mean.")
+    plan: str | None = Field(None, description="Which path to show; without it the newest.")
 
 
 def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | None = None,
@@ -29,6 +57,9 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         InputError: not one of output and data, or nothing to show.
         WorkError: Blender failed.
     """
+    from limber.scene.blender import make_scene
+    from limber.scene.data import scene_data
+
     if (output is None) == (data_path is None):
         raise InputError("Neither or both of --output and --data were given.",
                          "One says what to make.", "Give -o scene.blend.")
@@ -60,3 +91,15 @@ def _writable(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"{path.parent} cannot be written to ({error.strerror}).",
                          "The result goes there.", "Choose another place.") from error
+
+
+def run(inputs: SceneInputs, settings: SceneSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return scene(inputs.branch_folder, output=inputs.output, picture=inputs.render,
+                 data_path=inputs.data, width=settings.width, color=settings.color,
+                 plan=settings.plan, progress=progress)
+
+
+STAGE = StageDescription("scene", 120, run, SceneInputs, SceneSettings, NoOptions,
+                         reads=("mesh.vtu",))

@@ -1,31 +1,41 @@
 """Pull a branch by a pose or a force; writes motion, energy and forces."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from limber.errors import ConvergenceError
 from limber.files import write_atomically
-from limber.mechanics.dynamics.load_case import SimulatedMotion
-from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
-from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import BranchModel
-from limber.mechanics.pose_table import PoseTable
-from limber.mechanics.simulate import (
-    SimulateSettings,
-    largest_strains,
-    load_case_of,
-    loaded_model,
-    motion_of,
-    require_one_drive,
-)
+from limber.mechanics.settings import SimulateSettings
 from limber.progress import SILENT, Progress
-from limber.stages.loading import load_model
+from limber.settings import Groups
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
+if TYPE_CHECKING:
+    from limber.mechanics.dynamics.load_case import SimulatedMotion
+    from limber.mechanics.model import BranchModel
+    from limber.mechanics.pose_table import PoseTable
+
+
 KEY = "simulate"
+
+
+class SimulateInputs(BranchInputs):
+    """A branch folder, and the grasp's way."""
+
+    groups: ClassVar[Groups] = {"motion": ("along",)}
+
+    along: Path | None = Field(
+        None, description="The grasp moves as the poses of a table do, from where it is: a "
+        "recording's robot.csv, or a plan's plans/NAME.csv, which takes --duration.",
+        json_schema_extra={"metavar": "FILE"})
 
 
 def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
@@ -46,6 +56,8 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         InputError: options that do not fit. ConvergenceError: the branch could not follow; the
             frames up to there are written.
     """
+    from limber.mechanics.simulate import loaded_model, motion_of, require_one_drive
+
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
     require_one_drive(settings, along)
@@ -75,6 +87,9 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
 
 
 def _scanned_model(branch: Branch, settings: SimulateSettings) -> BranchModel:
+    from limber.mechanics.materials import RayleighDamping
+    from limber.stages.loading import load_model
+
     gravity = branch.gravity if settings.gravity else None
     return load_model(
         branch, young=settings.young, material=settings.material, gravity=gravity,
@@ -84,6 +99,9 @@ def _scanned_model(branch: Branch, settings: SimulateSettings) -> BranchModel:
 
 def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
            motion: SimulatedMotion) -> dict[str, Any]:
+    from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
+    from limber.mechanics.simulate import largest_strains
+
     displacement = motion.displacement
     nodes = surface_nodes(model.mesh)
     write_pc2(stage.path(f"frames/{settings.name}.pc2"),
@@ -110,3 +128,34 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         "grasp_force_n": motion.grasp_force[-1].tolist(),
         "tip_displacement_m": (displacement[-1, tip] - displacement[0, tip]).tolist(),
         "min_det_f": float(motion.min_det_f.min())}
+
+
+def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    along = _poses(inputs.along, settings.duration, progress) if inputs.along else None
+    return simulate(inputs.branch_folder, settings, along=along, force=options.force,
+                    progress=progress)
+
+
+def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
+    from limber.mechanics.pose_table import PoseTable
+    from limber.recordings.recording import POSE_COLUMNS
+    from limber.recordings.tables import read_table, robot_stream, time_column, with_columns
+
+    table = read_table(path)
+    timed = time_column(table) is not None
+    rate = None if timed else max(len(table.values) - 1, 1) / duration
+    stream = robot_stream(path, rate_hz=rate)
+    for message in stream.warnings:
+        progress.warn(message)
+    poses = with_columns(stream, POSE_COLUMNS).values
+    if np.isnan(poses[:, 3:]).all():
+        poses[:, 3:] = 0.0  # a table of positions alone
+    known = np.isfinite(poses).all(axis=1)
+    return PoseTable(stream.times[known], poses[known])
+
+
+STAGE = StageDescription(
+    "simulate", 40, run, SimulateInputs, SimulateSettings, RunOptions, key=KEY,
+    reads=("mesh.vtu",), writes=("frames/{name}.pc2", "frames/{name}.json"))

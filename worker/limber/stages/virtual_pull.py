@@ -1,23 +1,32 @@
 """Simulate a pull with a known Young's modulus and sensor noise."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from limber.constants import GRAVITY
-from limber.estimation.virtual_pull import (
-    TrueBranch,
-    VirtualPullSettings,
-    simulate_pull,
-    true_branch,
-    write_depth_frames,
-)
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.estimation.settings import VirtualPullSettings
 from limber.progress import SILENT, Progress
-from limber.recordings.recording import write_pull
+from limber.settings import Groups
+from limber.stages.inputs import BranchInputs, RunOptions
+from limber.stages.registry import StageDescription
 from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.estimation.virtual_pull import TrueBranch
+
+
+class VirtualPullInputs(BranchInputs):
+    """A branch folder, and the pull's name."""
+
+    groups: ClassVar[Groups] = {"output": ("name",)}
+
+    name: str = Field("pull-1", description="Name of the pull.")
 
 
 def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, *,
@@ -32,6 +41,9 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
         InputError: the branch has no skeleton, or the settings do not fit it.
         WorkError: the branch cannot be pulled like that.
     """
+    from limber.estimation.virtual_pull import simulate_pull, write_depth_frames
+    from limber.recordings.recording import write_pull
+
     branch = Branch.open(branch_folder)
     branch.require("skeleton.swc", "reconstruct")
     key = f"pull:{name}"
@@ -61,6 +73,9 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
 
 def _truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     """The truth of a branch folder: that of its generator, or its own skeleton's."""
+    from limber.estimation.virtual_pull import true_branch
+    from limber.geometry.skeleton.skeleton import Skeleton
+
     known: dict[str, Any] = {}
     where = "skeleton.swc"
     if branch.has("truth/truth.json"):
@@ -71,3 +86,15 @@ def _truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     # An upright turn of the scan turns gravity with it.
     gravity = tuple((made.result.get("gravity_m_s2") if made else None) or GRAVITY)
     return true_branch(Skeleton.read_swc(branch.path(where)), settings, gravity=gravity, **known)
+
+
+def run(inputs: VirtualPullInputs, settings: VirtualPullSettings, options: RunOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return virtual_pull(inputs.branch_folder, inputs.name, settings, force=options.force,
+                        progress=progress)
+
+
+STAGE = StageDescription(
+    "virtual-pull", 60, run, VirtualPullInputs, VirtualPullSettings, RunOptions,
+    key="pull:{name}", reads=("skeleton.swc",), writes=("pulls/{name}/",))

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.sheets import find_sheet
 from limber.geometry.cloud.sight import find_sight, flying_pixels
+from limber.geometry.settings import PreparationSettings
 from limber.geometry.skeleton.silhouette import View
 
 POINT_MINIMUM = 50
@@ -18,40 +18,6 @@ _SMALLEST_EXTENT = 0.02
 _SHEET_LEAST = 0.08  # share of points that makes a wall or the ground
 _SHEETS_MOST = 6  # a box has no more
 _COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
-
-
-class PreparationSettings(BaseModel):
-    """How the cloud is cleaned."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    crop_low: tuple[float, float, float] | None = Field(
-        None, description="Lower corner of the part to keep, in the file's coordinates.")
-    crop_high: tuple[float, float, float] | None = Field(
-        None, description="Upper corner of the part to keep.")
-    camera_at: tuple[float, float, float] | None = Field(
-        None, description="Where the one depth camera stood, in the file's coordinates; else the "
-        "origin, if the cloud looks like an image from there.")
-    flying_angle: float = Field(
-        78.0, ge=0, lt=90, description="Depth camera: a step between neighbouring pixels is no "
-        "surface if that would be seen at more than so many degrees; 0 keeps flying pixels.")
-    flying_speck: int = Field(
-        20, ge=1, description="Depth camera: groups of fewer pixels than that are dropped as "
-        "flying.")
-    silhouette_reach: float = Field(
-        1.5, ge=0, description="Depth camera: a twig stays if, as the camera saw it, it reaches "
-        "so many radii of its carrier beyond the carrier's axis; 0 keeps all.")
-    keep_sheets: bool = Field(
-        False, description="Keep walls and ground: wide flat sheets are else cut out.")
-    outlier_ratio: float = Field(
-        5.0, ge=0, description="Drop points whose neighbours are so many times as far as is usual "
-        "around them; 0 keeps all.")
-    outlier_neighbours: int = Field(8, ge=2, le=64, description="Neighbours that are looked at.")
-    outlier_radius: float = Field(
-        0.0, ge=0, description="Drop points with fewer neighbours than that within this radius "
-        "[m]; 0: off.")
-    voxel: float = Field(
-        0.0, ge=0, description="Keep one point a cell of this size [m]; 0 keeps all.")
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
+from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.axis_fit import (
     AxisFit,
     attached,
@@ -41,28 +41,6 @@ FIT_POINT_LIMIT = 60_000
 
 LEAF_SHARE = 0.5
 """Share of points over two radii off their axis from which a scan shows leaves, not branches."""
-
-
-class SkeletonSettings(BaseModel):
-    """How the skeleton is made."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    contraction_points: int = Field(
-        12_000, ge=50, description="Contract at most so many points (thinned evenly).")
-    gap_factor: float = Field(
-        3.0, gt=1, description="The paper's gamma: longer than so many median steps is a gap.")
-    bridge_limit: float = Field(
-        0.15, ge=0, le=1, description="Bridge gaps up to this share of the cloud's diagonal.")
-    prune: float = Field(
-        2.5, ge=0, description="A twig stays if it reaches so many radii of its carrier beyond "
-        "the carrier's axis.")
-    plants: Literal["refuse", "largest", "joined"] = Field(
-        "refuse", description="Two plants in one cloud: refuse, take the largest, or join them.")
-    radius_low: float = Field(
-        5e-4, ge=0, description="Radii are limited from below at this share of the diagonal.")
-    radius_high: float = Field(
-        0.1, gt=0, le=1, description="Radii are limited from above at this share.")
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
+from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 
-GRASP_FRACTION = 2.0 / 3.0
 """Where a branch is held unless told otherwise: two thirds along its main path."""
 
 

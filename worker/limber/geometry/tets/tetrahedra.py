@@ -4,12 +4,11 @@ import hashlib
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import MeshingError, MissingDependencyError
+from limber.geometry.settings import MeshSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -18,22 +17,6 @@ from limber.progress import SILENT, Progress
 
 _CACHE_VERSION = 1
 _LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTetWild's time
-
-
-class MeshSettings(BaseModel):
-    """How the tetrahedra are made."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    mesher: Literal["auto", "ftetwild", "sweep"] = Field(
-        "auto", description="auto: sweep along the axes, and fTetWild where that cannot join a "
-        "twig; ftetwild falls back to the sweep.")
-    mesh_sides: int = Field(
-        8, ge=4, le=24, description="Sides of the sections that fTetWild fills; the sweep has 6.")
-    mesh_spacing: float = Field(
-        2.5, gt=0.3, le=8, description="Distance of cross-sections in local radii.")
-    mesh_time_limit: float = Field(60.0, gt=0, description="fTetWild's time limit [s].")
-    mesh_memory_limit_mb: float = Field(4000.0, gt=0, description="fTetWild's memory limit [MB].")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,17 @@
+"""What every stage takes and makes, as JSON schemas for programs that run them."""
+
+import json
+
+import click
+
+from limber.stages.registry import all_schemas
+
+
+@click.command("schema")
+def command() -> None:
+    """Print what every stage takes, reads and writes as JSON.
+
+    A stage's inputs, settings and options are JSON schemas with titles, groups and units: the
+    add-on's panels and batch jobs are made from them. `limber STAGE --schema` prints one.
+    """
+    click.echo(json.dumps(all_schemas(), indent=1))

@@ -1,0 +1,24 @@
+"""What a package exports, loaded when it is asked for: `limber --help` waits for no package."""
+
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def exports(package: str, places: Mapping[str, str],
+            ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` of a package (PEP 562).
+
+    Args:
+        package: Its name.
+        places: Name to the module, relative to the package, that defines it.
+    """
+    def get(name: str) -> Any:
+        if name not in places:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{places[name]}"), name)
+
+    def names() -> list[str]:
+        return sorted(places)
+
+    return get, names

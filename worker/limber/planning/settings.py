@@ -1,0 +1,62 @@
+"""Settings of the energy field and of paths; they load nothing heavy."""
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from limber.settings import Groups, Settings
+
+
+class EnergySettings(Settings):
+    """How the energy field is sampled."""
+
+    groups: ClassVar[Groups] = {
+        "samples": ("samples", "deflection", "stretch", "seed"),
+        "material": ("gravity",),
+    }
+    experts = ("stretch",)
+
+    samples: int = Field(150, ge=30, description="Grasp positions to solve.")
+    deflection: float = Field(0.4, gt=0, le=1.0, description=(
+        "Largest distance from rest, as a share of the branch's length up to the grasp."))
+    stretch: float = Field(0.2, ge=0, le=1.0, description=(
+        "How far out of its curve the branch may be pulled straight: 0 the distance between base "
+        "and grasp at rest, 1 the length of branch between them."))
+    gravity: bool = Field(False, description=(
+        "Let the branch bear its own weight; the scanned shape is then the one it hangs in. "
+        "Otherwise it has no weight, and the scanned shape is free of stress."))
+    seed: int = Field(0, ge=0, description="Of the sampled positions.")
+
+
+class PlanSettings(Settings):
+    """From where to where, what counts and what is not allowed."""
+
+    groups: ClassVar[Groups] = {
+        "start and goal": ("goal", "tip_goal", "goal_tolerance", "start", "start_seed"),
+        "weights and limits": ("deformation_weight", "distance_weight", "max_energy", "max_force"),
+        "solver": ("iterations", "engine", "seed"),
+    }
+    experts = ("start_seed", "iterations", "engine")
+
+    goal: tuple[float, float, float] | None = Field(None, description=(
+        "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
+        "chosen and named."))
+    tip_goal: tuple[float, float, float] | None = Field(None, description=(
+        "Where the branch's tip (its flower) shall be, in the branch's frame [m]."))
+    goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
+    start: tuple[float, float, float] | None = Field(None, description=(
+        "Where the grasp starts [m]; default the rest pose."))
+    start_seed: int | None = Field(None, ge=0, description=(
+        "Start from a random deformed configuration instead, as in the paper's trials."))
+    deformation_weight: float = Field(1.0, ge=0, description=(
+        "Weight of deformation, the paper's alpha_def."))
+    distance_weight: float = Field(1.5, gt=0, description=(
+        "Weight of distance, the paper's alpha_dis."))
+    max_energy: float | None = Field(None, gt=0, description=(
+        "Deformation energy that no pose may exceed [J]."))
+    max_force: float | None = Field(None, gt=0, description=(
+        "Force of the gripper that no pose may exceed [N]."))
+    iterations: int = Field(3000, ge=100, le=200_000, description="Samples of each planner.")
+    engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
+        "OMPL's RRT* or our own; auto: OMPL where it is installed."))
+    seed: int = Field(0, ge=0, description="Of both planners.")

@@ -1,0 +1,46 @@
+"""Inputs and options that several stages share."""
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from limber.settings import Groups, Settings
+
+
+def argument(description: str) -> Any:
+    """Return the field of an input that is given without its name."""
+    return Field(description=description, json_schema_extra={"argument": True})
+
+
+class BranchInputs(Settings):
+    """A branch folder."""
+
+    groups: ClassVar[Groups] = {"input": ("branch_folder",)}
+
+    branch_folder: Path = argument("The branch folder.")
+
+
+class RunOptions(Settings):
+    """How a stage is run; none of it changes the result."""
+
+    groups: ClassVar[Groups] = {"running": ("force",)}
+
+    force: bool = Field(False, description="Run again even if nothing has changed.",
+                        json_schema_extra={"switch": True})
+
+
+class ParallelOptions(RunOptions):
+    """For stages that work in several processes."""
+
+    groups: ClassVar[Groups] = {"running": ("workers",)}
+
+    workers: int = Field(2, ge=1, le=64, description="Processes that work side by side.")
+
+
+class NoOptions(Settings):
+    """For stages that have nothing to choose about how they run."""
+
+
+class NoSettings(Settings):
+    """For stages that have nothing to set."""

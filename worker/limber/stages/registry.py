@@ -1,0 +1,105 @@
+"""The registry of stages: the one source of commands, options, schemas and job tables.
+
+A stage is a module of this folder that assigns ``STAGE = StageDescription("name", ...)``. Its
+docstring is the command's help, the first line what ``limber --help`` says of it. The names are
+found without importing anything, so that ``limber --help`` waits for no package.
+"""
+
+import ast
+import importlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from limber.progress import Progress
+
+if TYPE_CHECKING:
+    from limber.settings import Settings
+
+FORMAT = 1
+"""Of the schemas that :func:`all_schemas` returns."""
+
+
+@dataclass(frozen=True)
+class StageDescription:
+    """What a stage is; everything that must know it reads it here.
+
+    Attributes:
+        name: The command's.
+        position: Where it stands in ``limber --help``, in the order in which stages run.
+        run: Called with inputs, settings, options of the run and progress; returns the result.
+        inputs: Files, folders and names: where from and where to.
+        settings: What the result depends on beside the inputs; the manifest remembers them.
+        options: How it is run, which does not change the result.
+        key: Its entry in the manifest; ``{name}`` stands for that input or setting. Empty: it
+            makes none.
+        reads: Names of the branch folder's files that it reads; ``{name}`` as in ``key``.
+        writes: Names of those that it writes.
+        tables: Titles and rows to show a person beside the result, the first row the header.
+    """
+
+    name: str
+    position: int
+    run: "Callable[[Any, Any, Any, Progress], dict[str, Any]]"
+    inputs: "type[Settings]"
+    settings: "type[Settings]"
+    options: "type[Settings]"
+    key: str = ""
+    reads: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
+    tables: "Callable[[dict[str, Any]], list[tuple[str, Sequence[Sequence[str]]]]] | None" = None
+
+
+@cache
+def stage_summaries() -> dict[str, str]:
+    """Return what each stage does in one line, by name, in the order in which they run."""
+    found = []
+    for path in Path(__file__).parent.glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in tree.body:
+            if (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call)
+                    and getattr(node.targets[0], "id", "") == "STAGE"):
+                name, position = (ast.literal_eval(part) for part in node.value.args[:2])
+                summary = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
+                found.append((position, name, summary))
+    return {name: summary for _position, name, summary in sorted(found)}
+
+
+def stage_module(name: str) -> Any:
+    """Return the module of a stage."""
+    return importlib.import_module(f"limber.stages.{name.replace('-', '_')}")
+
+
+def stage_description(name: str) -> StageDescription:
+    """Return the description of a stage.
+
+    Raises:
+        KeyError: there is no such stage.
+    """
+    if name not in stage_summaries():
+        raise KeyError(name)
+    return stage_module(name).STAGE
+
+
+def stage_schema(name: str) -> dict[str, Any]:
+    """Return what a program must know to run a stage, as plain JSON.
+
+    ``inputs``, ``settings`` and ``options`` are JSON schemas; their properties also have
+    ``group`` (the title under which they stand), ``expert`` and, where they have one, ``unit``.
+    An input with ``argument`` is given without its name; ``short`` is its short option.
+    """
+    stage = stage_description(name)
+    return {
+        "name": name, "summary": stage_summaries()[name], "key": stage.key,
+        "reads": list(stage.reads), "writes": list(stage.writes),
+        "inputs": stage.inputs.model_json_schema(),
+        "settings": stage.settings.model_json_schema(),
+        "options": stage.options.model_json_schema()}
+
+
+def all_schemas() -> dict[str, Any]:
+    """Return the schemas of all stages by name, with the format's version."""
+    return {"format": FORMAT,
+            "stages": {name: stage_schema(name) for name in stage_summaries()}}
