@@ -107,6 +107,6 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
     with branch.stage("mesh") as stage:
         small_mesh.write(stage.path("mesh.vtu"))
         small_skeleton.write_swc(stage.path("skeleton.swc"))
-    sample_energy_field(folder, EnergySettings(samples=60, workers=1))
+    sample_energy_field(folder, EnergySettings(samples=60), workers=1)
     plan_paths(folder, PlanSettings(iterations=800, start_seed=3), name="there", workers=1)
     return folder

@@ -20,7 +20,7 @@ from limber.stages.energy import EnergySettings, sample_energy_field
 from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
 
-ENERGY = EnergySettings(samples=60, workers=1)
+ENERGY = EnergySettings(samples=60)
 QUICK = {"iterations": 500, "start_seed": 3}
 
 
@@ -93,7 +93,7 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
     before = branch.manifest.stages["plan:there"].finished, branch.digest("plans/there.json")
     field = EnergyField.read(branch.path("energy.npz"))
     assert field.energy(field.rest)[0] < 1e-3 * field.samples.energies.max()
-    sample_energy_field(copied, ENERGY)
+    sample_energy_field(copied, ENERGY, workers=1)
     plan_paths(copied, PlanSettings(iterations=800, start_seed=3), name="there")
     again = Branch.open(copied)
     assert (again.manifest.stages["plan:there"].finished,

@@ -56,7 +56,12 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         InputError: options that do not fit. ConvergenceError: the branch could not follow; the
             frames up to there are written.
     """
-    from limber.mechanics.simulate import loaded_model, motion_of, require_one_drive
+    from limber.mechanics.simulate import (
+        load_case_of,
+        loaded_model,
+        motion_of,
+        require_one_drive,
+    )
 
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
