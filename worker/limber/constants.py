@@ -1,4 +1,4 @@
-"""Physical constants, each once."""
+"""Physical constants and what units are in SI, each once."""
 
 STANDARD_GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""

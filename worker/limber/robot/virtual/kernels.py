@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from limber.compiled import compiled
+from limber.constants import STANDARD_GRAVITY
 from limber.robot.kinematics import _forward, _jacobian
 
 
@@ -73,7 +74,7 @@ def weight_wrench(mass: float, centre: np.ndarray, rotation: np.ndarray) -> np.n
     """
     wrench = np.empty(6)
     for k in range(3):
-        wrench[k] = -mass * 9.80665 * rotation[2, k]
+        wrench[k] = -mass * STANDARD_GRAVITY * rotation[2, k]
     wrench[3:] = crossed(centre, wrench[:3])
     return wrench
 
