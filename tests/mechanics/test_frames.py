@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
-from limber.mechanics.frames import read_pc2, write_pc2
+from limber.mechanics.frames import read_pc2, surface_fields, surface_nodes, write_pc2
+from limber.mechanics.strain import strain_state
 
 
 def test_pc2_layout(tmp_path):
@@ -36,3 +37,23 @@ def test_cut_off_file_is_refused(tmp_path):
         (tmp_path / "a.pc2").write_bytes(wrong)
         with pytest.raises(InputError, match=r"a\.pc2"):
             read_pc2(tmp_path / "a.pc2")
+
+
+def test_surface_fields_of_a_known_deformation():
+    """Uniform stretch: strain, stress, energy density and det F are the formulas', everywhere."""
+    mesh = straight_beam(0.2, 0.01, slice_count=4)
+    model = BranchModel(mesh, young=1e7, poisson=0.0, density=900.0, gravity=None)
+    states = []
+    for stretch in (1.0, 1.02):
+        displacement = np.zeros_like(mesh.nodes)
+        displacement[:, 2] = (stretch - 1) * mesh.nodes[:, 2]
+        states.append(strain_state(model, displacement))
+    fields = surface_fields(mesh, states)
+    strain = (1.02**2 - 1) / 2
+    expected = {"principal_strain": strain, "strain_energy_density_j_m3": 0.5 * 1e7 * strain**2,
+                "principal_stress_pa": 1e7 * strain * 1.02, "det_f": 1.02}
+    assert set(fields) == set(expected)
+    for name, value in expected.items():
+        assert fields[name].shape == (2, len(surface_nodes(mesh)))
+        np.testing.assert_allclose(fields[name][1], value, rtol=1e-4)
+        np.testing.assert_allclose(fields[name][0], 1.0 if name == "det_f" else 0.0, atol=1e-5)

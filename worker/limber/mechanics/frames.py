@@ -1,15 +1,17 @@
 """Motion on disk: PC2 caches for Blender, VTU series for ParaView."""
 
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sp
 
 from limber.errors import InputError
 from limber.files import write_atomically
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
-from limber.mechanics.strain import strain_state
+from limber.mechanics.strain import StrainState, strain_state
 
 _PC2_HEADER = struct.Struct("<12siiffi")
 
@@ -52,6 +54,46 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
                          "Write it again.")
     body = np.frombuffer(data, "<f4", offset=_PC2_HEADER.size)
     return body.reshape(frames, count, 3), start, rate
+
+
+def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np.ndarray]:
+    """Return what a surface can be coloured by in each frame, for ``frames/NAME.npz``.
+
+    Averages by volume of the tetrahedra about a vertex; for det F the least of them.
+
+    Args:
+        states: One a frame, from :func:`limber.mechanics.strain.strain_state`.
+
+    Returns:
+        ``strain_energy_density_j_m3``, ``principal_strain`` (the largest),
+        ``principal_stress_pa`` (the largest) and ``det_f``, each [frames, vertices], single
+        precision, vertices as in PC2 files.
+    """
+    nodes = surface_nodes(mesh)
+    average = node_average(mesh)[nodes]
+    least = [_least_at_nodes(mesh, state.det_f)[nodes] for state in states]
+    fields = {
+        "strain_energy_density_j_m3": [average @ state.energy_density for state in states],
+        "principal_strain": [average @ state.principal_strain[:, -1] for state in states],
+        "principal_stress_pa": [average @ state.principal_stress[:, -1] for state in states],
+        "det_f": least}
+    return {name: np.array(values, np.float32) for name, values in fields.items()}
+
+
+def node_average(mesh: TetMesh) -> sp.csr_matrix:
+    """Return the matrix that averages values of tetrahedra at each node by volume, [n, tets]."""
+    count, width = mesh.tets.shape
+    volume = np.repeat(np.abs(mesh.volumes), width)
+    matrix = sp.csr_matrix((volume, (mesh.tets.ravel(), np.repeat(np.arange(count), width))),
+                           (mesh.node_count, count))
+    total = np.asarray(matrix.sum(axis=1)).ravel()
+    return (sp.diags(1 / np.maximum(total, np.finfo(float).tiny)) @ matrix).tocsr()
+
+
+def _least_at_nodes(mesh: TetMesh, values: np.ndarray) -> np.ndarray:
+    least = np.full(mesh.node_count, np.inf)
+    np.minimum.at(least, mesh.tets.ravel(), np.repeat(values, mesh.tets.shape[1]))
+    return least
 
 
 def write_pvd_series(folder: Path, name: str, model: BranchModel, times: np.ndarray,

@@ -18,7 +18,6 @@ from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.settings import Point, SimulateSettings
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics.solve import solve_static
-from limber.mechanics.strain import strain_state
 from limber.progress import SILENT, Progress
 
 _PROBE = 1e-6
@@ -136,11 +135,3 @@ def _way(pose: np.ndarray, changes: np.ndarray, mode: str) -> np.ndarray:
         pose = np.concatenate([pose[:3], np.zeros(3)])
     turned = Rotation.from_rotvec(changes[:, 3:]) * Rotation.from_rotvec(pose[3:])
     return np.hstack([pose[:3] + changes[:, :3], turned.as_rotvec()])
-
-
-def largest_strains(model: BranchModel, displacement: np.ndarray,
-                    ) -> tuple[list[float], list[float]]:
-    """Return the largest principal strain and stress [Pa] of each frame."""
-    states = [strain_state(model, frame) for frame in displacement]
-    return ([float(s.principal_strain[:, -1].max()) for s in states],
-            [float(s.principal_stress[:, -1].max()) for s in states])

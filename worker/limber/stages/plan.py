@@ -91,8 +91,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
 
 def _write(stage: Stage, name: str, grasp_model: GraspModel, field: EnergyField,
            found: PlannedMotion) -> None:
-    from limber.mechanics.frames import write_pc2
-    from limber.scene.data import at_nodes
+    from limber.mechanics.frames import surface_fields, write_pc2
+    from limber.mechanics.strain import strain_state
 
     detailed = dict(found.summary)
     baseline, plan = found.baseline, found.plan
@@ -114,10 +114,8 @@ def _write(stage: Stage, name: str, grasp_model: GraspModel, field: EnergyField,
         encoding="utf-8")
     # What the scene can colour the surface by, at the vertices and in the order of the frames.
     model, mesh = grasp_model.model, grasp_model.mesh
-    densities = [at_nodes(mesh, model.internal(u).tet_energy / mesh.volumes)[vertices]
-                 for u in plan.displacements]
-    np.savez_compressed(stage.path(f"frames/{name}.npz"),
-                        strain_energy_density_j_m3=np.array(densities, np.float32))
+    states = [strain_state(model, u) for u in plan.displacements]
+    np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
 
 
 def _table(path: ResolvedPath) -> str:

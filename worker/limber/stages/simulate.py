@@ -104,8 +104,13 @@ def _scanned_model(branch: Branch, settings: SimulateSettings) -> BranchModel:
 
 def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
            motion: SimulatedMotion) -> dict[str, Any]:
-    from limber.mechanics.frames import surface_nodes, write_pc2, write_pvd_series
-    from limber.mechanics.simulate import largest_strains
+    from limber.mechanics.frames import (
+        surface_fields,
+        surface_nodes,
+        write_pc2,
+        write_pvd_series,
+    )
+    from limber.mechanics.strain import strain_state
 
     displacement = motion.displacement
     nodes = surface_nodes(model.mesh)
@@ -116,7 +121,9 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         write_pvd_series(folder, settings.name, model, motion.times, displacement)
     tip = int(np.linalg.norm(model.mesh.nodes - model.mesh.nodes[model.fixed].mean(axis=0),
                              axis=1).argmax())
-    strain, stress = largest_strains(model, displacement)
+    states = [strain_state(model, moved) for moved in displacement]
+    np.savez_compressed(stage.path(f"frames/{settings.name}.npz"),
+                        **surface_fields(model.mesh, states))
     frames = {
         "frame_count": len(displacement), "rate": settings.frame_rate,
         "times_s": motion.times.tolist(), "energies_j": motion.energy.tolist(),
@@ -125,7 +132,9 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
         "grasp_torques_nm": motion.grasp_torque.tolist(),
         "hold_forces_n": motion.hold_forces.tolist(), "min_det_f": motion.min_det_f.tolist(),
         "converged": motion.converged,
-        "largest_principal_strains": strain, "largest_principal_stresses_pa": stress}
+        "largest_principal_strains": [float(s.principal_strain[:, -1].max()) for s in states],
+        "largest_principal_stresses_pa": [
+            float(s.principal_stress[:, -1].max()) for s in states]}
     write_atomically(stage.path(f"frames/{settings.name}.json"), json.dumps(frames, indent=1))
     return {
         "converged": motion.converged, "frame_count": len(displacement),
