@@ -58,9 +58,8 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     scene = bpy.context.scene
     scene.name = data.info["name"]
     scene.unit_settings.system = "METRIC"
+    scene.render.fps = _frame_rate(data.info.get("frames"))
     shown = scenes.show_branch(scene, data, color)
-    # A path has a few dozen poses, one a frame: slow enough to follow.
-    scene.render.fps = min(max(round(shown.frame_count / _PLAY_SECONDS), 5), 24)
     camera = studio.set_up_studio(scene, data, studio.Picture(width))
     legend.add_legend(scene, camera, data, shown)
     _say(progress=0.2, message="scene built")
@@ -74,6 +73,15 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
         bpy.ops.render.render(write_still=True)
     return {"object_count": len(scene.objects), "frame_count": shown.frame_count,
             "blender": bpy.app.version_string}
+
+
+def _frame_rate(frames: dict | None) -> int:
+    """Return frames a second: a motion's own, up to 60; a path's so that it can be followed."""
+    if not frames:
+        return 24
+    if frames["is_timed"]:
+        return min(max(round(frames["rate_hz"]), 1), 60)
+    return min(max(round(frames["count"] / _PLAY_SECONDS), 5), 24)
 
 
 def main(arguments: list[str]) -> int:

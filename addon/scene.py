@@ -1,6 +1,7 @@
 """A branch in a Blender scene: its surface coloured and moving, paths, goal and other marks."""
 
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,8 @@ SCAN_KEY = "limber_scan_sha256"
 NAME_KEY = "limber_name"
 INFO_KEY = "limber_info"
 ENERGY_KEY = "limber_energy_j"
+OFFSET_KEY = "limber_map_offset"
+"""The branch's origin in the scan's coordinates, in double precision: a viewport has single."""
 
 # Linear colours. Those of the marks stand apart from the colour map of the branch.
 COLORS = {
@@ -24,6 +27,7 @@ COLORS = {
     "goal": (0.02, 0.42, 0.08),
     "grasp": (0.95, 0.25, 0.0),
     "control_points": (0.62, 0.02, 0.55),
+    "targets": (0.75, 0.45, 0.0),
     "base": (0.10, 0.075, 0.06),
     "rest": (0.22, 0.22, 0.22),
 }
@@ -53,6 +57,7 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     """
     shown = _new_branch(scene, data, scalar)
     _add_paths(shown, data)
+    _add_skeleton(shown, data)
     _add_points(shown, data)
     _add_goal(shown, data)
     _add_base(shown, data)
@@ -113,6 +118,8 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     surface = add_object(collection, name, mesh)
     # Not the folder: it may move, and the file with it.
     surface[INFO_KEY] = json.dumps({**data.info, "folder": None})
+    if "map_offset" in data.info:
+        surface[OFFSET_KEY] = [float(value) for value in data.info["map_offset"]]
     for key in data.info["scalars"]:
         meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
         meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])
@@ -146,8 +153,26 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
         shown.objects[name] = [add_object(shown.collection, f"{title} path", curve, material)]
 
 
+def _add_skeleton(shown: ShownBranch, data: SceneData) -> None:
+    """Add the centreline with its radii, hidden: it lies inside the branch."""
+    if "skeleton" not in data.arrays:
+        return
+    parents = data.arrays["skeleton_parent"]
+    nodes = np.flatnonzero(parents >= 0)
+    mesh = meshes.new_lines("Skeleton", data.arrays["skeleton"],
+                            np.column_stack([parents[nodes], nodes]))
+    meshes.set_scalars(mesh, "radius", data.arrays["skeleton_radius"])
+    meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
+    meshes.set_integers(mesh, "flags", data.arrays["skeleton_flags"])
+    thing = add_object(shown.collection, "Skeleton", mesh)
+    thing.hide_viewport = thing.hide_render = True
+    thing.show_in_front = True
+    shown.objects["skeleton"] = [thing]
+
+
 def _add_points(shown: ShownBranch, data: SceneData) -> None:
-    for name, title in (("control_points", "Control point"), ("grasp", "Grasp")):
+    for name, title in (("control_points", "Control point"), ("grasp", "Grasp"),
+                        ("targets", "Target")):
         points = data.arrays.get(name, np.empty((0, 3)))
         if len(points) == 0:
             continue
@@ -202,14 +227,19 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     # In the viewport, lines: the moving branch stays in sight.
     ghost.display_type = "WIRE"
     shown.objects["rest"] = [ghost]
-    header = animation.attach_cache(shown.surface, data.folder / frames["file"])
+    # A motion keeps its own time in the user's frame rate; a path has none, and plays pose by pose.
+    speed = frames["rate_hz"] * scene.render.fps_base / scene.render.fps if (
+        frames["is_timed"]) else 1.0
+    header = animation.attach_cache(shown.surface, data.folder / frames["file"], speed=speed)
     shown.frame_count = header.frame_count
-    scene.frame_start, scene.frame_end = 1, header.frame_count
-    scene.frame_set(1)
+    scene.frame_start = 1
+    scene.frame_end = max(1, 1 + math.ceil((header.frame_count - 1) / speed - 1e-6))
     if "grasp_motion" in data.arrays and "grasp" in shown.objects:
-        animation.move_along(shown.objects["grasp"][0], data.arrays["grasp_motion"])
-    if "control_points_motion" in data.arrays:
-        for number, thing in enumerate(shown.objects["control_points"]):
-            animation.move_along(thing, data.arrays["control_points_motion"][:, number])
+        animation.move_along(shown.objects["grasp"][0], data.arrays["grasp_motion"], speed=speed)
+    for name in ("control_points", "targets"):
+        for number, thing in enumerate(shown.objects.get(name, ())):
+            animation.move_along(thing, data.arrays[f"{name}_motion"][:, number], speed=speed)
+    # Last: what was keyed stands where it is at the first frame, not at its last key.
+    scene.frame_set(1)
     if "frame_energy" in data.arrays:
         shown.surface[ENERGY_KEY] = [float(value) for value in data.arrays["frame_energy"]]

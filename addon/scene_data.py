@@ -1,13 +1,43 @@
-"""Reads what the worker says is to be shown of a branch: one .npz file, nothing pickled."""
+"""Reads what the worker says is to be shown of a branch: one .npz file, nothing pickled.
+
+The file comes from another process, perhaps of another version or cut short: no size, shape or
+index in it is believed before it is checked.
+"""
 
 import json
+import re
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-FORMAT = 1
+FORMAT = 2
+_LARGEST_BYTES = 4 << 30
+_MOST_ARRAYS = 500
+
+# Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
+# points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
+# seen, p points of a path (each path has its own). i: whole numbers, b: truth values, r: real.
+_SHAPES = {
+    "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
+    "frame_times": "s r", "frame_energy": "s r", "frame_kinetic_energy": "s r",
+    "frame_min_det_f": "s r", "frame_strain": "s r", "frame_bounds": "23 r",
+    "cloud": "c3 r", "cloud_color": "c4 r",
+    "skeleton": "n3 r", "skeleton_parent": "n i", "skeleton_radius": "n r",
+    "skeleton_radius_sigma": "n r", "skeleton_order": "n i", "skeleton_flags": "n i",
+    "control_points": "k3 r", "control_points_radius": "k r", "control_points_motion": "sk3 r",
+    "grasp": "13 r", "grasp_radius": "1 r", "grasp_motion": "s3 r",
+    "targets": "t3 r", "targets_radius": "t r", "targets_motion": "st3 r",
+    "path": "p3 r", "path_pose": "p6 r", "path_energy": "p r", "path_force": "p r",
+    "path_strain": "p r", "path_color": "p4 r",
+    "observation": "om3 r", "observation_visible": "om b", "observation_times": "o r",
+    "observation_grasp": "g3 r", "observation_grasp_times": "g r",
+    "view_points": "w3 r", "view_direction": "3 r"}
+_NEEDED = ("vertices", "faces", "view_points", "view_direction")
+_NEEDED_INFO = {"name": str, "folder": str, "scalars": dict, "paths": dict, "notes": list,
+                "source": dict, "alignment": list}
 
 
 class SceneDataError(ValueError):
@@ -31,16 +61,108 @@ def read_scene_data(path: Path) -> SceneData:
     """Read the file that ``limber scene --data FILE`` wrote.
 
     Raises:
-        SceneDataError: not such a file, or of another version of Limber.
+        SceneDataError: not such a file, cut short, of another version of Limber, or one whose
+            arrays do not fit each other.
     """
     try:
-        with np.load(path, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
+        arrays = _arrays(Path(path))
         info = json.loads(str(arrays.pop("info")))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, MemoryError,
+            NotImplementedError, zipfile.BadZipFile) as error:
         raise SceneDataError(f"{path} cannot be shown ({error}).") from error
-    if info.get("format") != FORMAT:
+    if not isinstance(info, dict) or info.get("format") != FORMAT:
+        found = info.get("format") if isinstance(info, dict) else None
         raise SceneDataError(
-            f"The worker's data has format {info.get('format')}, this add-on shows {FORMAT}. "
+            f"The worker's data has format {found}, this add-on shows {FORMAT}. "
             "Install the add-on and the worker of one version of Limber.")
+    trouble = _info_trouble(info) or _arrays_trouble(arrays) or _pairs_trouble(arrays, info)
+    if trouble:
+        raise SceneDataError(f"{path} cannot be shown ({trouble}).")
     return SceneData(arrays, info)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file whose members hold what their headers say."""
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if len(members) > _MOST_ARRAYS or sum(m.file_size for m in members) > _LARGEST_BYTES:
+            raise ValueError("it is too large")
+        for member in members:
+            if member.compress_type != zipfile.ZIP_STORED:
+                # What is stored as it is cannot grow while it is read.
+                raise ValueError(f"{member.filename} is compressed")
+            with archive.open(member) as stream:
+                version = np.lib.format.read_magic(stream)
+                read = {(1, 0): np.lib.format.read_array_header_1_0,
+                        (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+                if read is None:
+                    raise ValueError(f"{member.filename} is of an unknown version")
+                shape, _, kind = read(stream)
+                size = kind.itemsize
+                for count in shape:
+                    size *= count
+                if kind.hasobject or size + stream.tell() != member.file_size:
+                    raise ValueError(f"{member.filename} is not what its header says")
+    with np.load(path, allow_pickle=False) as content:
+        return {name: content[name] for name in content.files}
+
+
+def _info_trouble(info: dict[str, Any]) -> str:
+    for name, kind in _NEEDED_INFO.items():
+        if not isinstance(info.get(name), kind):
+            return f"its {name} is missing"
+    if np.shape(info["alignment"]) != (4, 4):
+        return "its alignment is no matrix"
+    return ""
+
+
+def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
+    """Return which array is missing or of a wrong shape or kind, or nothing.
+
+    Arrays that this version does not know are let through: nothing draws them.
+    """
+    missing = [name for name in _NEEDED if name not in arrays]
+    if missing:
+        return f"{missing[0]} is missing"
+    sizes: dict[str, int] = {}
+    for name, array in arrays.items():
+        kind, _, key = name.partition(":")
+        if kind not in _SHAPES:
+            continue
+        wanted, number = _SHAPES[kind].split()
+        letters = [f"p:{key}" if letter == "p" else letter
+                   for letter in re.findall(r"\d|[a-z]", wanted)]
+        fits = len(letters) == array.ndim and all(
+            count == (int(letter) if letter.isdigit() else sizes.setdefault(letter, count))
+            for letter, count in zip(letters, array.shape, strict=True))
+        if not fits:
+            return f"{name} has the shape {array.shape}"
+        if array.dtype.kind not in {"r": "f", "i": "iu", "b": "b"}[number]:
+            return f"{name} holds {array.dtype}"
+        if number == "r" and not np.isfinite(array).all():
+            return f"{name} holds values that are not finite"
+    faces, count = arrays["faces"], len(arrays["vertices"])
+    if len(faces) and (faces.min() < 0 or faces.max() >= count):
+        return f"faces do not index {count} vertices"
+    parents = arrays.get("skeleton_parent")
+    if parents is not None and len(parents) and (
+            parents.min() < -1 or (parents >= np.arange(len(parents))).any()):
+        return "skeleton_parent is no tree"
+    return ""
+
+
+def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
+    """Return what ``info`` speaks of that the arrays do not have, or nothing."""
+    wanted = [f"{kind}:{name}" for name in info["scalars"] for kind in ("scalar", "color")]
+    wanted += [f"path:{name}" for name in info["paths"]]
+    wanted += [f"frame_scalar:{name}" for name in info.get("frame_scalars") or {}]
+    wanted += ["control_points_radius"] * ("control_points" in arrays)
+    wanted += ["grasp_radius"] * ("grasp" in arrays)
+    missing = [name for name in wanted if name not in arrays]
+    if missing:
+        return f"{missing[0]} is missing"
+    frames = info.get("frames")
+    times = arrays.get("frame_times")
+    if frames and (times is None or len(times) != frames.get("count")):
+        return "the frames' times do not fit their number"
+    return ""

@@ -44,8 +44,12 @@ def read_header(path: Path) -> CacheHeader:
     return CacheHeader(vertex_count, frame_count)
 
 
-def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1) -> CacheHeader:
+def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1, *,
+                 speed: float = 1.0) -> CacheHeader:
     """Let the PC2 file at ``path`` move ``target``, its first frame at ``frame_start``.
+
+    ``speed`` is how many frames of the file a frame of the scene goes on: at 2.5 a motion at 60 Hz
+    plays in its own time in a scene of 24 frames a second.
 
     The path is kept relative to the .blend where that is saved, so that both can move together.
 
@@ -60,7 +64,9 @@ def attach_cache(target: bpy.types.Object, path: Path, frame_start: int = 1) -> 
     modifier = target.modifiers.get(MODIFIER) or target.modifiers.new(MODIFIER, "MESH_CACHE")
     modifier.cache_format = "PC2"
     modifier.filepath = shown_path(path)
-    modifier.frame_start = frame_start
+    modifier.frame_scale = speed
+    # Blender takes the start off after it has scaled the frame.
+    modifier.frame_start = speed * frame_start
     modifier.interpolation = "LINEAR"
     return header
 
@@ -98,8 +104,23 @@ def relative_path(path: str, folder: Path) -> str:
         return path
 
 
-def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 1) -> None:
-    """Key the place of ``target`` frame by frame to ``points`` [m], shape [frames, 3]."""
-    for number, point in enumerate(np.asarray(points, float)):
+def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 1, *,
+               speed: float = 1.0) -> None:
+    """Key the place of ``target`` to ``points`` [m], shape [frames, 3]; ``speed`` as for the cache.
+
+    It is left at its first place, where it stands at ``frame_start``.
+    """
+    points = np.asarray(points, float)
+    for number, point in enumerate(points):
         target.location = point
-        target.keyframe_insert("location", frame=frame_start + number)
+        target.keyframe_insert("location", frame=frame_start + number / speed)
+    if len(points):
+        target.location = points[0]
+
+
+def cache_frame(target: bpy.types.Object, frame: float) -> float:
+    """Return which frame of its cache, from 0, ``target`` shows at a frame of the scene."""
+    modifier = target.modifiers.get(MODIFIER)
+    if modifier is None:
+        return 0.0
+    return modifier.frame_scale * frame - modifier.frame_start

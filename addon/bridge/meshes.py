@@ -26,6 +26,22 @@ def new_mesh(name: str, vertices: np.ndarray, faces: np.ndarray | None = None) -
     return mesh
 
 
+def new_lines(name: str, vertices: np.ndarray, edges: np.ndarray) -> bpy.types.Mesh:
+    """Make a mesh of lines between ``vertices`` [m], shape [v, 3]; ``edges`` [e, 2] are indices.
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, or indices out of range.
+    """
+    edges = np.asarray(edges).reshape(-1, 2)
+    if len(edges) and (edges.min() < 0 or edges.max() >= len(vertices)):
+        raise ValueError(f"edges do not index {len(vertices)} vertices")
+    mesh = new_mesh(name, vertices)
+    mesh.edges.add(len(edges))
+    mesh.edges.foreach_set("vertices", np.ascontiguousarray(edges, np.int32).ravel())
+    mesh.update()
+    return mesh
+
+
 def _add_faces(mesh: bpy.types.Mesh, faces: np.ndarray, vertex_count: int) -> None:
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0 or faces.max() >= vertex_count:
         raise ValueError(f"faces of shape {faces.shape} do not index {vertex_count} vertices")
@@ -76,6 +92,14 @@ def scalars(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
     values = np.empty(len(mesh.vertices), np.float32)
     mesh.attributes[name].data.foreach_get("value", values)
     return values
+
+
+def set_integers(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
+    """Write one whole number a vertex as INT attribute ``name``; shape [v]."""
+    values = _checked(values, None, name)
+    _attribute(mesh, name, "INT", len(values)).data.foreach_set(
+        "value", np.ascontiguousarray(values, np.int32))
+    mesh.update_tag()
 
 
 def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:

@@ -23,10 +23,12 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
         self.layout.operator("limber.play", text="Stop" if playing else "Play",
                              icon="PAUSE" if playing else "PLAY")
         self.layout.prop(context.scene, "frame_current", text="Frame")
-        energies = scene.find_surface(context.scene).get(scene.ENERGY_KEY)
+        surface = scene.find_surface(context.scene)
+        energies = surface.get(scene.ENERGY_KEY)
         if energies is not None:
             last = len(energies) - 1
-            number = min(max(context.scene.frame_current - context.scene.frame_start, 0), last)
+            shown = round(animation.cache_frame(surface, context.scene.frame_current))
+            number = min(max(shown, 0), last)
             self.layout.label(text=f"Energy {1000 * energies[number]:.3g} mJ")
 
 

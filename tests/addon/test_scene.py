@@ -27,7 +27,7 @@ def positions(bpy):
     return at
 
 
-def _scene_in_process(addon, branch, path, bpy):
+def _scene_in_process(addon, branch, path, bpy, motion=None):
     """Build the scene here, as the process of `limber scene` does, without rendering."""
     from limber.scene.data import scene_data
     from limber.store import Branch
@@ -35,7 +35,7 @@ def _scene_in_process(addon, branch, path, bpy):
     scenes = importlib.import_module("limber_addon.scene")
     reader = importlib.import_module("limber_addon.scene_data")
     data_path = path.parent / "scene.npz"
-    scene_data(Branch.open(branch)).write(data_path)
+    scene_data(Branch.open(branch), motion=motion).write(data_path)
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(data_path))
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
@@ -92,6 +92,60 @@ def test_content(bpy, addon, beam, tmp_path):
         assert thing.location.x == pytest.approx(thing.location.z ** 2, abs=0.01)
     np.testing.assert_allclose(objects["Grasp 1"].location, beam.path[-1], atol=1e-6)
     assert objects["Fixed base"].location.z < 0.01
+
+
+def test_marks_stand_at_their_first_place_on_the_first_frame(bpy, addon, beam, tmp_path):
+    """Opened, without a frame played: control points and grasp are at rest, not at the end."""
+    shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
+    assert bpy.context.scene.frame_current == 1
+    np.testing.assert_allclose(shown.objects["grasp"][0].location, beam.path[0], atol=1e-6)
+    for thing in shown.objects["control_points"]:
+        assert abs(thing.location.x) < 1e-3
+
+
+@pytest.mark.parametrize("fps", [24, 60, 25])
+def test_a_motion_plays_in_its_own_time(bpy, addon, beam, write_pc2, positions, tmp_path, fps):
+    """A simulation at 60 Hz in a scene of another frame rate, which stays as the user set it."""
+    from limber.store import Branch
+
+    times = [number / 60 for number in range(len(beam.frames))]
+    branch = Branch.open(beam.folder)
+    with branch.stage("simulate", reads=["mesh.vtu"]) as stage:
+        write_pc2(stage.path("frames/swing.pc2"), beam.frames)
+        stage.path("frames/swing.json").write_text(json.dumps({"rate": 60.0, "times_s": times}))
+    bpy.context.scene.render.fps = fps
+    shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy, motion="swing")
+    scene = bpy.context.scene
+    assert scene.render.fps == fps
+    for number in (0, 1, 3, 5):
+        frame = 1 + times[number] * fps
+        whole = int(frame + 1e-9)
+        found = positions("beam", whole, frame - whole)
+        np.testing.assert_allclose(found, beam.frames[number], atol=1e-5)
+        grasp = shown.objects["grasp"][0].location
+        assert grasp.x == pytest.approx(beam.path[number][0], abs=4e-3), "carried, and in step"
+    assert scene.frame_end >= 1 + times[-1] * fps > scene.frame_end - 1
+
+
+def test_skeleton_is_drawn_with_its_radii(bpy, addon, beam, tmp_path):
+    """Lines from each node to its parent, radii as attribute, hidden until they are wanted."""
+    from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.store import Branch
+
+    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    nodes = np.array([[0, 0, 0], [0, 0, 0.3], [0, 0, 0.6], [0.1, 0, 0.4]])
+    skeleton = Skeleton.from_edges(nodes, np.array([-1, 0, 1, 1]), np.array([.01, .01, .005, .004]))
+    with Branch.open(beam.folder).stage("reconstruct") as stage:
+        beam.mesh.write(stage.path("mesh.vtu"))
+        skeleton.write_swc(stage.path("skeleton.swc"))
+    shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
+    (thing,) = shown.objects["skeleton"]
+    np.testing.assert_allclose(meshes.positions(thing.data), skeleton.nodes, atol=1e-6)
+    np.testing.assert_allclose(meshes.scalars(thing.data, "radius"), skeleton.radius, rtol=1e-6)
+    assert {tuple(sorted(edge.vertices)) for edge in thing.data.edges} == {
+        tuple(sorted((child, parent))) for child, parent in enumerate(skeleton.parent)
+        if parent >= 0}
+    assert thing.hide_viewport and thing.hide_render
 
 
 def test_paths_are_relative(bpy, addon, beam, tmp_path):

@@ -9,7 +9,8 @@ import pytest
 from limber.alignment import Alignment
 from limber.errors import BranchFolderError, InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.scene.data import at_nodes, scene_data
+from limber.mechanics.frames import node_average
+from limber.scene.data import scene_data
 from limber.store import Branch
 
 
@@ -66,10 +67,10 @@ def test_alignment_takes_the_scan_to_the_branch(tmp_path, mesh):
 
 def test_values_at_nodes_keep_constants_and_integrals(mesh):
     """A constant stays itself; a value in one tetrahedron reaches its own nodes alone."""
-    np.testing.assert_allclose(at_nodes(mesh, np.full(mesh.tet_count, 3.5)), 3.5)
+    np.testing.assert_allclose(node_average(mesh) @ np.full(mesh.tet_count, 3.5), 3.5)
     one = np.zeros(mesh.tet_count)
     one[0] = 1.0
-    found = at_nodes(mesh, one)
+    found = node_average(mesh) @ one
     assert set(np.flatnonzero(found)) == set(mesh.tets[0])
 
 
@@ -137,5 +138,126 @@ def test_the_file_reads_without_pickle(tmp_path, mesh):
     with np.load(tmp_path / "data.npz", allow_pickle=False) as content:
         info = json.loads(str(content["info"]))
         assert {"vertices", "faces", "view_points"} <= set(content.files)
-    assert info["format"] == 1
+    assert info["format"] == 2
     assert info["unit"] == "m"
+
+
+def _bending(surface, count):
+    """Frames that bend towards x by the square of the height, more with each."""
+    frames = np.repeat(surface[None], count, axis=0)
+    frames[:, :, 0] += np.linspace(0, 1, count)[:, None] * surface[:, 2] ** 2
+    return frames
+
+
+def test_a_simulation_has_its_own_times_and_moves_its_marks(tmp_path, mesh):
+    """Frames of a simulation: rate, times, fields of each frame, grasp and control points along."""
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    marks = np.full(mesh.node_count, -1)
+    marks[np.abs(mesh.nodes - [0, 0, 0.25]).sum(axis=1).argmin()] = 0
+    mesh = mesh.with_data(point_data={"control_point": marks})
+    frames = _bending(surface, 4)
+    fields = np.arange(4.0)[:, None] * np.ones(len(surface))
+    import io
+
+    npz = io.BytesIO()
+    np.savez(npz, strain_energy_density_j_m3=fields, principal_strain=0.01 * fields,
+             det_f=1 - 0.01 * fields, principal_stress_pa=fields[:2])
+    about = {"rate": 60.0, "times_s": [0, 1 / 60, 2 / 60, 3 / 60], "energies_j": [0, 1, 2, 3],
+             "min_det_f": [1, 0.9, 0.8, 0.7]}
+    branch = _branch(tmp_path / "a.branch", mesh, simulate={
+        "frames/s.pc2": _pc2(frames), "frames/s.json": json.dumps(about),
+        "frames/s.npz": npz.getvalue()})
+    data = scene_data(branch)
+    about = data.info["frames"]
+    assert (about["name"], about["rate_hz"], about["is_timed"]) == ("s", 60.0, True)
+    np.testing.assert_allclose(data.arrays["frame_times"], np.arange(4) / 60)
+    np.testing.assert_allclose(data.arrays["frame_min_det_f"], [1, 0.9, 0.8, 0.7])
+    # Of the stress there are fewer frames than of the motion: it is left out.
+    assert set(data.info["frame_scalars"]) == {"strain_energy", "strain", "det_f"}
+    np.testing.assert_allclose(data.arrays["frame_scalar:strain"], 0.01 * fields)
+    np.testing.assert_allclose(data.arrays["scalar:det_f"], 0.97, rtol=1e-6)
+    assert data.info["scalars"]["strain"]["ticks"][2] in {"0.03", "0.045"}
+    for name, height in (("grasp", 0.5 * 0.67), ("control_points", 0.25)):
+        moved = data.arrays[f"{name}_motion"].reshape(4, 3)
+        np.testing.assert_allclose(moved[0], data.arrays[name][0], atol=1e-6)
+        assert moved[-1, 0] - moved[0, 0] == pytest.approx(height**2, rel=0.15)
+
+
+def test_motions_are_named(tmp_path, mesh):
+    """Of several motions the plan's is shown, or the one that is named; another name is refused."""
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    plan = _plan({}, [[0.0, 0.0, 0.3]]) | {"frames/p.pc2": _pc2(_bending(surface, 2))}
+    branch = _branch(tmp_path / "a.branch", mesh, plan__p=plan,
+                     simulate={"frames/s.pc2": _pc2(_bending(surface, 3))})
+    assert scene_data(branch).info["frames"]["name"] == "p"
+    assert scene_data(branch).info["motions"] == ["p", "s"]
+    named = scene_data(branch, motion="s")
+    assert named.info["frames"]["count"] == 3
+    assert not named.info["frames"]["is_timed"]
+    with pytest.raises(BranchFolderError, match="There are: p, s"):
+        scene_data(branch, motion="q")
+
+
+def test_scan_skeleton_and_path_energy(tmp_path, mesh):
+    """The cloud with linear colours, the centreline with radii and flags, energy along paths."""
+    from limber.geometry.cloud.cloud import Cloud
+    from limber.geometry.skeleton.files import write_cylinders
+    from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
+
+    nodes = np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.5], [0.1, 0, 0.3]], float)
+    skeleton = Skeleton.from_edges(nodes, np.array([-1, 0, 1, 1]), np.array([.01, .01, .005, .004]),
+                                   radius_sigma=np.array([0, 1e-4, 2e-4, 3e-4]),
+                                   radius_state=np.array([0, 0, LIMITED, 0]))
+    branch = Branch.create(tmp_path / "a.branch")
+    points = np.random.default_rng(0).random((7, 3))
+    colour = np.array([[255, 0, 0]] * 6 + [[188, 188, 188]])
+    with branch.stage("reconstruct") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+        Cloud(points, {"color": colour}).write_ply(stage.path("cloud.ply"))
+        skeleton.write_swc(stage.path("skeleton.swc"))
+        write_cylinders(skeleton, stage.path("skeleton.csv"))
+    rows = ("s_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,energy_j\n"
+            "0,0,0,0.3,0,0,0,0\n1,0.1,0,0.3,0,1,0,0.5\n")
+    with branch.stage("plan:p") as stage:
+        stage.path("plans/p.json").write_text("{}")
+        stage.path("plans/p.csv").write_text(rows)
+    data = scene_data(Branch.open(tmp_path / "a.branch"))
+    arrays = data.arrays
+    np.testing.assert_allclose(arrays["cloud"], points, atol=1e-7)
+    np.testing.assert_allclose(arrays["cloud_color"][[0, 6], 0], [1.0, 0.5029], atol=1e-3)
+    np.testing.assert_allclose(arrays["skeleton"], skeleton.nodes)
+    by_place = {tuple(np.round(node, 3)): number for number, node in enumerate(arrays["skeleton"])}
+    fork, tip, root = by_place[0, 0, 0.2], by_place[0, 0, 0.5], by_place[0, 0, 0]
+    flags = arrays["skeleton_flags"]
+    assert (flags[root], flags[fork], flags[tip]) == (1, 2, 4 + 8)
+    assert arrays["skeleton_radius_sigma"][tip] == pytest.approx(2e-4)
+    np.testing.assert_allclose(arrays["path_energy:plan"], [0, 0.5])
+    np.testing.assert_allclose(arrays["path_pose:plan"][1], [0.1, 0, 0.3, 0, 1, 0])
+    assert data.info["path_energy"]["high"] == 0.5
+    assert arrays["path_color:plan"][1, 0] > arrays["path_color:plan"][0, 0]
+
+
+def test_what_was_measured_over_time(tmp_path, mesh):
+    """Observed points of a pull; one not seen stands where it was last and is flagged."""
+    pull = {
+        "pulls/a/pull.toml": "observation = 'markers'\n[grasp]\npoint_m = [0.0, 0.0, 0.3]\n"
+                             "radius_m = 0.01\n",
+        "pulls/a/robot.csv": "t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n0,0,0,0.3,0,0,0\n"
+                             "1,0.1,0,0.3,0,0,0\n",
+        "pulls/a/markers.csv": "t_s,m0_x_m,m0_y_m,m0_z_m\n0,0,0,0.5\n0.5,,,\n1,0.2,0,0.5\n"}
+    data = scene_data(_branch(tmp_path / "a.branch", mesh, pull__a=pull))
+    assert data.info["observation"] == {"pull": "a"}
+    np.testing.assert_allclose(data.arrays["observation"][:, 0, 0], [0, 0, 0.2])
+    np.testing.assert_array_equal(data.arrays["observation_visible"][:, 0], [True, False, True])
+    np.testing.assert_allclose(data.arrays["observation_grasp"][:, 0], [0, 0.1])
+
+
+def test_the_map_offset_is_kept_in_double_precision(tmp_path, mesh):
+    """A scan in map coordinates: where the branch's origin is there, to the micrometre."""
+    branch = Branch.create(tmp_path / "a.branch")
+    with branch.stage("reconstruct") as stage:
+        mesh.write(stage.path("mesh.vtu"))
+        stage.manifest.alignment = Alignment(origin=(32612345.678901, 5812345.123456, 71.5))
+    data = scene_data(branch)
+    np.testing.assert_allclose(data.info["map_offset"], [32612345.678901, 5812345.123456, 71.5],
+                               rtol=0, atol=1e-6)

@@ -30,18 +30,22 @@ class SceneInputs(BranchInputs):
 class SceneSettings(Settings):
     """What a scene shows."""
 
-    groups: ClassVar[Groups] = {"picture": ("width", "color", "plan")}
+    groups: ClassVar[Groups] = {"picture": ("width", "color", "plan", "motion")}
 
     width: int = Field(1120, ge=160, le=8192, description=(
         "Of the picture [pixels]; its height is three quarters of it."))
-    color: Literal["young", "strain_energy"] = Field(
-        "young", description="What the branch's colours mean.")
+    color: Literal["young", "strain_energy", "strain", "stress", "det_f"] = Field(
+        "young", description="What the branch's colours mean; all but young: the worst of all "
+        "frames.")
     plan: str | None = Field(None, description="Which path to show; without it the newest.")
+    motion: str | None = Field(
+        None, description="Which frames to play; without it the path's, else the newest.")
 
 
 def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | None = None,
           width: int = 1120, color: str = "young", plan: str | None = None,
-          data_path: Path | None = None, progress: Progress = SILENT) -> dict[str, Any]:
+          motion: str | None = None, data_path: Path | None = None,
+          progress: Progress = SILENT) -> dict[str, Any]:
     """Make a Blender scene of a branch, or only what it shows, as arrays.
 
     Args:
@@ -49,8 +53,10 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         output: The .blend to write.
         picture: A PNG to render of the end of the path, or None.
         width: Of the picture [pixels].
-        color: What the branch's colours mean: ``young`` or ``strain_energy``.
+        color: What the branch's colours mean: ``young``, or the worst of all frames:
+            ``strain_energy``, ``strain``, ``stress``, ``det_f``.
         plan: Which path to show; default the newest.
+        motion: Which frames to play; default the plan's, else the newest.
         data_path: The .npz to write instead of ``output``.
 
     Raises:
@@ -64,9 +70,11 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         raise InputError("Neither or both of --output and --data were given.",
                          "One says what to make.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
-    data = scene_data(Branch.open(branch_folder), plan)
+    data = scene_data(Branch.open(branch_folder), plan, motion)
     if color not in data.info["scalars"]:
-        raise InputError(f"The branch has no {color} to show.", "", "Run `limber plan` first.")
+        raise InputError(f"The branch has no {color} to show.",
+                         f"It has: {', '.join(data.info['scalars'])}.",
+                         "Run `limber plan` or `limber simulate` first.")
     if data_path is not None:
         data.write(_writable(data_path))
         return {"data": data_path, "vertex_count": len(data.arrays["vertices"])}
@@ -98,7 +106,7 @@ def run(inputs: SceneInputs, settings: SceneSettings, _options: NoOptions,
     """Run the stage."""
     return scene(inputs.branch_folder, output=inputs.output, picture=inputs.render,
                  data_path=inputs.data, width=settings.width, color=settings.color,
-                 plan=settings.plan, progress=progress)
+                 plan=settings.plan, motion=settings.motion, progress=progress)
 
 
 STAGE = StageDescription("scene", 120, run, SceneInputs, SceneSettings, NoOptions,

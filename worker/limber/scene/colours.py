@@ -1,0 +1,66 @@
+"""What colours mean: scales with units, ticks in words, and the colours themselves."""
+
+from typing import Any
+
+import numpy as np
+
+# Colours as sRGB, evenly spaced; both maps keep their order when seen in grey.
+_COLOUR_MAPS = {
+    "viridis": ("#440154", "#472d7b", "#3b528b", "#2c728e", "#21918c", "#28ae80", "#5ec962",
+                "#addc30", "#fde725"),
+    "inferno": ("#1b0c41", "#4a0c6b", "#781c6d", "#a52c60", "#cf4446", "#ed6925", "#fb9b06",
+                "#f7d13d", "#fcffa4"),
+}
+_MOST_DECADES = 1e3  # a logarithmic scale spans at most this; what is below has its first colour
+_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
+
+
+def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dict[str, Any]:
+    """Return a scale that spans ``values``: title, unit, low, high, log, ticks, stops.
+
+    Args:
+        colours: ``viridis`` or ``inferno``.
+    """
+    low, high = float(values.min()), float(values.max())
+    if high - low <= 1e-6 * abs(high):
+        # One value everywhere: put it in the middle, so that it has a colour and a label.
+        low, high = (0.5 * low, 1.5 * low) if low > 0 else (low - 0.5, low + 0.5)
+    log = low > 0 and high / low > 10.0
+    if log:
+        low = max(low, high / _MOST_DECADES)
+    middle = float(np.sqrt(low * high)) if log else 0.5 * (low + high)
+    ticks = [_with_unit(value, unit, value if log else high) for value in (low, middle, high)]
+    return {"title": title, "unit": unit, "low": low, "high": high, "log": log, "ticks": ticks,
+            "stops": _stops(colours)}
+
+
+def colours_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
+    """Return linear colours of values by a scale, shape [n, 4]."""
+    low, high = scale["low"], scale["high"]
+    if scale["log"]:
+        values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
+    place = np.clip((values - low) / (high - low), 0.0, 1.0)
+    stops = np.array(scale["stops"])
+    channels = [np.interp(place, stops[:, 0], stops[:, channel]) for channel in (1, 2, 3)]
+    return np.column_stack([*channels, np.ones_like(place)])
+
+
+def linear_of(srgb: np.ndarray) -> np.ndarray:
+    """Return linear values of sRGB ones between 0 and 1, as Blender wants colours."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _with_unit(value: float, unit: str, size: float) -> str:
+    """Return ``value`` in words, with the prefix that suits ``size``."""
+    if not unit:
+        return f"{value:.3g}"
+    # What rounds up to a prefix gets it: 1 MPa, not 1e+03 kPa.
+    factor, prefix = next((p for p in _PREFIXES if 1.0005 * abs(size) >= p[0]), (1.0, ""))
+    return f"{value / factor:.3g} {prefix}{unit}"
+
+
+def _stops(name: str) -> list[list[float]]:
+    """Return rows ``[position 0..1, red, green, blue]``, linear."""
+    colours = [linear_of(np.array([int(text[i:i + 2], 16) / 255 for i in (1, 3, 5)])).tolist()
+               for text in _COLOUR_MAPS[name]]
+    return [[number / (len(colours) - 1), *colour] for number, colour in enumerate(colours)]

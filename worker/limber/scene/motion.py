@@ -1,0 +1,176 @@
+"""What moves in a scene: frames with their values, marks along them, and what was observed."""
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import BranchFolderError, InputError
+from limber.mechanics.frames import read_pc2
+from limber.recordings.recording import read_pull
+from limber.scene.arrays import SceneData
+from limber.scene.colours import colour_scale
+from limber.scene.shape import add_scalar
+from limber.store import Branch
+
+_STILL_RATE = 24.0
+_FRAME_SCALARS = {
+    "strain_energy_density_j_m3": ("strain_energy", "strain energy density", "J/m³", "inferno"),
+    "principal_strain": ("strain", "largest principal strain", "", "inferno"),
+    "principal_stress_pa": ("stress", "largest principal stress", "Pa", "inferno"),
+    "det_f": ("det_f", "volume relative to that at rest", "", "viridis")}
+"""Arrays of ``frames/NAME.npz`` [frames, vertices]: name in the scene, title, unit, colours."""
+_FRAME_VALUES = {"energies_j": "frame_energy", "kinetic_energies_j": "frame_kinetic_energy",
+                 "min_det_f": "frame_min_det_f", "largest_principal_strains": "frame_strain"}
+"""Lists of ``frames/NAME.json`` with a number a frame, and the arrays they become."""
+
+
+def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | None) -> None:
+    """Add the frames of ``motion``, of the plan by default, else the newest there are.
+
+    Raises:
+        BranchFolderError: no such frames, or of another mesh.
+    """
+    names = [name.removesuffix(".pc2") for name in branch.names("frames") if name.endswith(".pc2")]
+    data.info["motions"] = names
+    if motion is not None and motion not in names:
+        raise BranchFolderError(f"There are no frames {motion!r}.",
+                                f"There are: {', '.join(names) or 'none'}.",
+                                "Name one of them, or run `limber simulate`.")
+    name = motion or (plan if plan in names else None)
+    if name is None and plan is None and names:
+        name = max(names, key=lambda each: branch.path(f"frames/{each}.pc2").stat().st_mtime)
+    if name is None:
+        return
+    positions = _read_frames(branch.path(f"frames/{name}.pc2"), len(data.arrays["vertices"]))
+    about = _about(branch, name)
+    _add_times(data, name, about, len(positions))
+    data.arrays["frame_bounds"] = np.array(
+        [bound(positions.reshape(-1, 3), axis=0) for bound in (np.min, np.max)], float)
+    _add_values(data, branch, name, about, positions)
+    _add_carried(data, positions, name == plan)
+
+
+def add_observation(data: SceneData, branch: Branch, shown: str | None) -> None:
+    """Add what was measured in the pull that is shown, or in the newest: points over time.
+
+    ``observation`` [t, m, 3] m (the last place seen where ``observation_visible`` [t, m] is
+    false), ``observation_times`` [t] s; ``observation_grasp`` [g, 3] m of the gripper, and
+    ``observation_grasp_times`` [g] s, on the same clock.
+    """
+    pulls = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
+    data.info["pulls"] = pulls
+    name = shown if shown in pulls else (pulls[-1] if pulls else None)
+    if name is None:
+        return
+    try:
+        pull = read_pull(branch.path(f"pulls/{name}"))
+    except (InputError, OSError, tomllib.TOMLDecodeError) as error:
+        data.info["notes"].append(f"pull {name} cannot be shown: {error}")
+        return
+    data.info["observation"] = {"pull": name}
+    data.arrays["observation_grasp"] = pull.poses[:, :3]
+    data.arrays["observation_grasp_times"] = pull.times
+    if pull.observations is not None and pull.observations.visible.any():
+        seen = pull.observations
+        data.arrays["observation"] = _held_on(seen.positions, seen.visible)
+        data.arrays["observation_visible"] = seen.visible
+        data.arrays["observation_times"] = seen.times + pull.entry.time_offset_s
+
+
+def _held_on(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
+    """Return positions with those not seen where the point was seen last, or first."""
+    found = positions.copy()
+    found[~visible] = 0.0
+    for point in range(positions.shape[1]):
+        seen = np.flatnonzero(visible[:, point])
+        if len(seen):
+            last = np.searchsorted(seen, np.arange(len(positions)), side="right") - 1
+            found[:, point] = positions[seen[np.maximum(last, 0)], point]
+    return found
+
+
+def _about(branch: Branch, name: str) -> dict[str, Any]:
+    if not branch.has(f"frames/{name}.json"):
+        return {}
+    about = json.loads(branch.path(f"frames/{name}.json").read_text(encoding="utf-8"))
+    return about if isinstance(about, dict) else {}
+
+
+def _add_times(data: SceneData, name: str, about: dict[str, Any], count: int) -> None:
+    """Say when each frame is; a path without times plays one pose a frame."""
+    times = about.get("times_s")
+    is_timed = isinstance(times, list) and len(times) == count
+    rate = float(about.get("rate") or _STILL_RATE)
+    data.arrays["frame_times"] = np.asarray(times, float) if is_timed else np.arange(count) / rate
+    data.info["frames"] = {"name": name, "file": f"frames/{name}.pc2", "count": count,
+                           "rate_hz": rate, "is_timed": is_timed}
+
+
+def _add_values(data: SceneData, branch: Branch, name: str, about: dict[str, Any],
+                positions: np.ndarray) -> None:
+    count, vertex_count = positions.shape[:2]
+    for key, array in _FRAME_VALUES.items():
+        if len(about.get(key) or ()) == count:
+            data.arrays[array] = np.asarray(about[key], float)
+    if not branch.has(f"frames/{name}.npz"):
+        return
+    with np.load(branch.path(f"frames/{name}.npz"), allow_pickle=False) as content:
+        for key, (scalar, title, unit, colours) in _FRAME_SCALARS.items():
+            if key not in content.files:
+                continue
+            values = np.asarray(content[key], np.float32)
+            if values.shape != (count, vertex_count) or not np.isfinite(values).all():
+                continue
+            data.arrays[f"frame_scalar:{scalar}"] = values
+            data.info["frame_scalars"][scalar] = colour_scale(values, title, unit, colours)
+            worst, word = (values.min(axis=0), "least") if scalar == "det_f" else (
+                values.max(axis=0), "peak")
+            add_scalar(data, scalar, worst.astype(float), f"{word} {title}", unit, colours)
+
+
+def _add_carried(data: SceneData, positions: np.ndarray, is_plan: bool) -> None:
+    vertices = data.arrays["vertices"]
+    for name in ("control_points", "grasp", "targets"):
+        if len(data.arrays.get(name, ())):
+            moved = carried(data.arrays[name], vertices, positions)
+            data.arrays[f"{name}_motion"] = moved[:, 0] if name == "grasp" else moved
+    if is_plan and "path:plan" in data.arrays:
+        # The path is where the gripper is, which its patch follows.
+        data.arrays["grasp_motion"] = _along(data.arrays["path:plan"], len(positions))
+
+
+def carried(points: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Return where ``points`` inside the branch go: as the surface around them; [frames, k, 3].
+
+    By inverse-distance weights of a high power: the ring of vertices about a point counts, and
+    both rings where a point lies between two.
+    """
+    distance = np.linalg.norm(points[:, None] - vertices, axis=2)
+    weights = np.maximum(distance, 1e-9) ** -4
+    weights /= weights.sum(axis=1, keepdims=True)
+    return points + np.einsum("kv,fvi->fki", weights, positions - vertices)
+
+
+def _along(points: np.ndarray, count: int) -> np.ndarray:
+    """Return a path's own points if it has ``count``, else points evenly spaced along it."""
+    if len(points) == count:
+        return points
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    places = np.linspace(0.0, length[-1], count)
+    return np.column_stack([np.interp(places, length, points[:, axis]) for axis in range(3)])
+
+
+def _read_frames(path: Path, vertex_count: int) -> np.ndarray:
+    """Return the frames of a PC2 file, shape [frames, v, 3]; it must fit the mesh's surface."""
+    positions, _, _ = read_pc2(path)
+    points = positions.shape[1]
+    if points != vertex_count:
+        raise BranchFolderError(
+            f"{path} moves {points} vertices; the mesh's surface has {vertex_count}.",
+            "The frames belong to another mesh; Blender would silently show the rest shape.",
+            "Run `limber plan` again.")
+    return positions

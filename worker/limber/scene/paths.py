@@ -1,0 +1,117 @@
+"""Paths to a goal in a scene: their points, poses and energies, the goal, and where it may lie."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import BranchFolderError
+from limber.scene.arrays import SceneData
+from limber.scene.colours import colour_scale, colours_of
+from limber.store import Branch
+
+_POSITION = ("x_m", "y_m", "z_m")
+_ROTATION = ("rx_rad", "ry_rad", "rz_rad")
+
+
+def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
+    """Add the paths of ``plan``, the newest by default, and its goal; return its name.
+
+    Raises:
+        BranchFolderError: no such plan, or a damaged one.
+    """
+    plans = [key.split(":", 1)[1] for key in branch.manifest.stages if key.startswith("plan:")]
+    data.info["plans"] = plans
+    if plan is None:
+        if not plans:
+            return None
+        plan = max(plans, key=lambda name: branch.manifest.stages[f"plan:{name}"].finished)
+    summary = json.loads(branch.require(f"plans/{plan}.json", f"plan --name {plan}").read_text(
+        encoding="utf-8"))
+    for key, name, title in (("plan", plan, "D-RRT*"), ("baseline", f"{plan}-baseline", "RRT*")):
+        if not branch.has(f"plans/{name}.csv"):
+            continue
+        _add_path(data, key, _table(branch.path(f"plans/{name}.csv")))
+        data.info["paths"][key] = {"title": title, "note": _path_note(summary.get(key) or {})}
+    _add_energy_scale(data)
+    data.info["plan"] = plan
+    data.info["goal"] = _goal(summary.get("goal") or {}, data.arrays.get("path:plan"))
+    saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
+    if saved is not None and added is not None:
+        data.info["notes"].append(f"energy {-saved:+.0f} %, length {added:+.0f} % against RRT*")
+    return plan
+
+
+def add_hemisphere(data: SceneData, branch: Branch) -> None:
+    """Add the half ball about the base in which the grasp may be taken, once it was sampled."""
+    if not branch.has("energy.npz"):
+        return
+    with np.load(branch.path("energy.npz"), allow_pickle=False) as content:
+        if {"chart_base_m", "arc_length_m"} <= set(content.files):
+            data.info["hemisphere"] = {
+                "centre_m": np.asarray(content["chart_base_m"], float).tolist(),
+                "radius_m": float(content["arc_length_m"]), "axis": [0.0, 0.0, 1.0]}
+
+
+def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:
+    positions = np.column_stack([table[name] for name in _POSITION])
+    data.arrays[f"path:{key}"] = positions
+    if all(name in table for name in _ROTATION):
+        data.arrays[f"path_pose:{key}"] = np.column_stack(
+            [positions, *(table[name] for name in _ROTATION)])
+    for column, name in (("energy_j", "energy"), ("force_n", "force"), ("strain", "strain")):
+        if column in table:
+            data.arrays[f"path_{name}:{key}"] = table[column]
+
+
+def _add_energy_scale(data: SceneData) -> None:
+    """Colour all paths by energy on one scale, so that they can be compared."""
+    energies = {key: data.arrays[f"path_energy:{key}"] for key in data.info["paths"]
+                if f"path_energy:{key}" in data.arrays}
+    if energies:
+        scale = colour_scale(np.concatenate(list(energies.values())), "energy along the path",
+                             "J", "inferno")
+        data.info["path_energy"] = scale
+        for key, values in energies.items():
+            data.arrays[f"path_color:{key}"] = colours_of(values, scale)
+
+
+def _table(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a path; x_m, y_m and z_m are there and finite."""
+    with open(path, encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    try:
+        table = {name: np.array([float(row[name]) for row in rows])
+                 for name in (rows[0] if rows else ()) if name is not None}
+        points = np.column_stack([table[name] for name in _POSITION]) if rows else np.empty(0)
+    except (KeyError, TypeError, ValueError) as error:
+        raise BranchFolderError(f"{path} is not a path ({error}).",
+                                "Columns x_m, y_m and z_m with numbers were expected.",
+                                "Run `limber plan` again.") from error
+    if len(points) == 0 or not np.isfinite(points).all():
+        raise BranchFolderError(f"{path} has no finite points.", "There is nothing to show.",
+                                "Run `limber plan` again.")
+    return {name: values for name, values in table.items() if np.isfinite(values).all()}
+
+
+def _path_note(summary: dict[str, Any]) -> str:
+    parts = []
+    if summary.get("length_m") is not None:
+        parts.append(f"{100 * summary['length_m']:.1f} cm")
+    if summary.get("energy_sum_nmm") is not None:
+        total = summary["energy_sum_nmm"]
+        parts.append(f"{total:.0f} N mm" if abs(total) >= 100 else f"{total:.3g} N mm")
+    return ", ".join(parts)
+
+
+def _goal(goal: dict[str, Any], path: np.ndarray | None) -> dict[str, Any] | None:
+    """Return what is to reach the goal region, its centre [m] and its radius [m] or None."""
+    centre = goal.get("position_m")
+    if centre is None:
+        if path is None:
+            return None
+        centre = path[-1]
+    return {"kind": goal.get("kind", "grasp"), "radius_m": goal.get("tolerance_m"),
+            "centre_m": [float(value) for value in centre[:3]]}
