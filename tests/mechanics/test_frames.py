@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
+from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.mechanics import BranchModel
 from limber.mechanics.frames import read_pc2, surface_fields, surface_nodes, write_pc2
 from limber.mechanics.strain import strain_state
 
