@@ -29,7 +29,8 @@ def truth(small):
     """Coarser than a real truth, and another mesh than the fit's."""
     skeleton = small.skeleton
     return TrueBranch(small.mesh(slice_length=2.6, sides=6), skeleton,
-                      control_points(skeleton, FRACTIONS), FRACTIONS, np.array(TRUTH))
+                      control_points(skeleton, FRACTIONS), FRACTIONS, np.array(TRUTH),
+                      is_weightless=True)
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,11 @@ import pytest
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
-from limber.mechanics import Grasp
+from limber.mechanics import BranchModel
+from limber.mechanics.loaded import hang
 from limber.planning.compare import PlanSettings
 from limber.planning.field import GraspSamples, fit_field
-from limber.planning.grasp_model import GraspModel, Reach
+from limber.planning.grasp_model import grasp_model_of
 from limber.stages.energy import EnergySettings, sample_energy_field
 from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
@@ -46,7 +47,7 @@ class AnalyticBranch:
         rotation = np.stack([-points[:, 1], points[:, 0], 0 * points[:, 0]], axis=1)
         energies = self.energy(points)
         return GraspSamples(
-            np.hstack([points, rotation]), energies, energies, self.force(points),
+            np.hstack([points, rotation]), energies, self.force(points),
             1.5 * points + [0.0, 0.0, 0.3], np.full(count, 0.95),
             np.asarray(rejected, float).reshape(-1, 6))
 
@@ -95,8 +96,14 @@ def small_mesh(small_skeleton):
 
 @pytest.fixture(scope="session")
 def small_model(small_mesh, small_skeleton):
-    return GraspModel(small_mesh, Reach.of(small_skeleton, Grasp.from_mesh(small_mesh).centre),
-                      None)
+    return small_grasp_model(small_mesh, small_skeleton, None)
+
+
+def small_grasp_model(mesh, skeleton, gravity):
+    """What planning asks of the small branch, under a gravity [m/s^2] or without weight."""
+    data = {name: mesh.cell_data[name] for name in ("young", "poisson", "density")}
+    return grasp_model_of(hang(BranchModel(mesh, **data, gravity=gravity), warn=pytest.fail),
+                          skeleton)
 
 
 @pytest.fixture(scope="session")

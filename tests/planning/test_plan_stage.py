@@ -17,6 +17,7 @@ from limber.planning.resolve import resolve_path
 from limber.progress import Progress
 from limber.report.plan_figures import report_figures
 from limber.stages.energy import EnergySettings, sample_energy_field
+from limber.stages.loading import load_grasp_model
 from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
 
@@ -42,8 +43,9 @@ def test_deformation_aware_path_is_gentler_on_the_full_model(planned_branch):
     assert plan["plan"]["peak_energy_j"] <= 1.01 * plan["baseline"]["peak_energy_j"]
 
 
-def test_reported_energies_are_the_full_models(planned_branch, small_model):
+def test_reported_energies_are_the_full_models(planned_branch):
     """Energy, force and pose of a path's point are those that the branch model gives there."""
+    small_model = load_grasp_model(Branch.open(planned_branch), gravity=True, warn=pytest.fail)
     plan = read_plan(planned_branch)["plan"]
     poses = np.array(plan["poses"])
     middle = len(poses) // 2

@@ -63,10 +63,11 @@ class PaperBranch:
         return mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
 
     def truth(self) -> TrueBranch:
-        """The branch on its fine mesh."""
+        """The branch on its fine mesh, weightless: such moduli could not carry it."""
         skeleton = self.skeleton
         return TrueBranch(self.mesh(slice_length=1.3, sides=10), skeleton,
-                          control_points(skeleton, FRACTIONS), FRACTIONS, np.array(self.young))
+                          control_points(skeleton, FRACTIONS), FRACTIONS, np.array(self.young),
+                          is_weightless=True)
 
 
 BRANCHES = (

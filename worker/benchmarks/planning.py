@@ -20,13 +20,14 @@ from benchmarks.table import Row
 from limber.errors import WorkError
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.marks import mark
-from limber.mechanics import Grasp, solve_static, young_weights
+from limber.mechanics import BranchModel, Grasp, solve_static, young_weights
+from limber.mechanics.loaded import LoadedBranch
 from limber.plain import plain
 from limber.planning.compare import PlanSettings, plan_pair, random_start
 from limber.planning.cost import measure_path
 from limber.planning.field import EnergyField, error_measures, fit_field
 from limber.planning.goals import GraspGoal, default_goal
-from limber.planning.grasp_model import GraspModel, Reach
+from limber.planning.grasp_model import GraspModel, grasp_model_of
 from limber.planning.ompl_engine import ompl_missing
 from limber.planning.resolve import resolve_path
 from limber.planning.sampling import sample_branch, sample_positions, without_taut
@@ -86,7 +87,9 @@ def _grasp_model(branch: PaperBranch) -> GraspModel:
                 poisson=branch.poisson, density=900.0)
     young = young_weights(mesh, control_points(skeleton, FRACTIONS)) @ np.array(branch.young)
     mesh = mesh.with_data(cell_data={"young": young})
-    return GraspModel(mesh, Reach.of(skeleton, Grasp.from_mesh(mesh).centre), None)
+    # The paper's moduli are too soft to stand under their own weight.
+    model = BranchModel(mesh, young=young, poisson=branch.poisson, density=900.0, gravity=None)
+    return grasp_model_of(LoadedBranch(model), skeleton)
 
 
 def _field(branch: PaperBranch, model: GraspModel, progress: Progress,

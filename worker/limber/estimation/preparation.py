@@ -46,8 +46,10 @@ class Subject:
 
 
 def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
-               settings: EstimateSettings) -> Subject:
+               gravity: tuple[float, float, float], settings: EstimateSettings) -> Subject:
     """Return the branch of a mesh, its axes and the masses that hang on it; the start is uniform.
+
+    It hangs as it was scanned, whatever Young's modulus will come out.
 
     Raises:
         InputError: a modulus of the mesh, to start from, is not positive.
@@ -63,9 +65,9 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     poisson = _given(settings.poisson, mesh.cell_data["poisson"])
     density = _given(settings.density, mesh.cell_data["density"])
     damping = RayleighDamping()
-    # Twigs that the mesh leaves out weigh on it in pulls that gravity bends.
-    model = BranchModel(mesh, young=young, poisson=poisson, density=density, gravity=None,
-                        point_masses=masses)
+    model = BranchModel(mesh, young=young, poisson=poisson, density=density,
+                        gravity=gravity if settings.gravity else None, point_masses=masses)
+    model = model.as_scanned() if settings.gravity else model
     start = Values(np.full(len(points), young), poisson, density,
                    (damping.mass, damping.stiffness))
     return Subject(mesh, skeleton, points, young_weights(mesh, points), model, start)

@@ -15,7 +15,8 @@ class EstimateSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("pull", "drive", "motion", "fractions"),
-        "material": ("young", "poisson", "density", "fit_poisson", "fit_density", "fit_damping"),
+        "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
+                     "fit_damping"),
         "solver": ("method", "forward", "key_frames", "evaluations", "delta_m2", "robust"),
         "uncertainty": ("hold_out", "mesh_check", "shapes"),
     }
@@ -39,6 +40,8 @@ class EstimateSettings(Settings):
     poisson: float | None = Field(
         None, ge=0, lt=0.495, description="Poisson's ratio, fixed unless --fit-poisson.")
     density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
+    gravity: bool = Field(
+        True, description="The branch bears its own weight, and was scanned so.")
     fit_poisson: bool = Field(False, description="Estimate Poisson's ratio too.")
     fit_density: bool = Field(False, description="Estimate the density too.")
     fit_damping: bool = Field(False, description="Estimate Rayleigh damping too (dynamic only).")
@@ -63,7 +66,7 @@ class VirtualPullSettings(Settings):
     """A simulated pull."""
 
     groups: ClassVar[Groups] = {
-        "material": ("young", "poisson", "density", "damping", "gravity"),
+        "material": ("young", "poisson", "density", "damping", "gravity", "own_weight"),
         "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
             "reach", "turn", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
@@ -108,8 +111,10 @@ class VirtualPullSettings(Settings):
     torque_noise: float = Field(
         0.02, ge=0, description="Noise of the torque over its largest size (clamped).")
     gravity: bool = Field(
-        False, description="Let gravity bend the branch out of its scanned shape; without it "
-        "the scanned shape carries it already.")
+        True, description="The branch bears its own weight, and was scanned so.")
+    own_weight: bool = Field(
+        False, description="The shape is as drawn, without load: let gravity bend the branch out "
+        "of it, as for `limber import-pull --own-weight`.")
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")
@@ -133,7 +138,7 @@ class PredictSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "input": ("pull",),
-        "grasp and loads": ("weight", "load"),
+        "grasp and loads": ("weight", "load", "gravity"),
     }
 
     pull: str | None = Field(
@@ -142,3 +147,5 @@ class PredictSettings(Settings):
     weight: float | None = Field(None, ge=0, description="A hung weight [N].")
     load: tuple[float, float, float] | None = Field(
         None, description="A steady force in any direction, branch frame [N].")
+    gravity: bool = Field(
+        True, description="The branch bears its own weight, and was scanned so.")

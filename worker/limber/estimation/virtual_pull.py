@@ -5,7 +5,7 @@ where the branch was generated. What is known of it goes into ``pull.toml`` unde
 that an estimate can be scored; nothing that estimates reads it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,12 +14,14 @@ import numpy as np
 from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.model_error import refined
 from limber.estimation.settings import VirtualPullSettings
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import base_nodes
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
+from limber.mechanics.loaded import hang
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
@@ -37,6 +39,8 @@ from limber.recordings.recording import (
     SensorEntry,
 )
 
+BODY_LIMIT = 25_000
+"""Most tetrahedra of a meshed body's truth: a finer one takes minutes a pull."""
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
 
@@ -52,6 +56,7 @@ class TrueBranch:
         fractions: Their places on the main path.
         young: [Pa], shape [K].
         gravity: In the branch's frame [m/s^2].
+        is_weightless: Whether it has no weight, whatever the settings ask for.
     """
 
     mesh: TetMesh
@@ -60,13 +65,18 @@ class TrueBranch:
     fractions: tuple[float, ...]
     young: np.ndarray
     gravity: tuple[float, float, float] = GRAVITY
+    is_weightless: bool = False
 
 
 def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
-                fractions: tuple[float, ...] = FRACTIONS,
+                body: TetMesh | None = None, fractions: tuple[float, ...] = FRACTIONS,
                 young: Sequence[float] = DEFAULT_YOUNG_PA,
                 gravity: tuple[float, float, float] = GRAVITY) -> TrueBranch:
     """Return the branch of true axes, on a mesh of its own; the settings' moduli come first.
+
+    Args:
+        body: Tetrahedra of a body that was meshed as it is: it is the truth then, each cut in eight
+            where that stays small, and not the round branch of its axes.
 
     Raises:
         InputError: not one modulus a control point.
@@ -76,9 +86,13 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
         if len(young) != len(fractions):
             raise InputError(f"{len(young)} moduli for {len(fractions)} control points.",
                              "Each control point needs one.", "Give --young A,B,C,D.")
-    # Reconstructed branches have sections four radii apart, of six sides.
-    meshed = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3))
-    mesh = meshed.mesh.with_data(point_data={"fixed": base_nodes(meshed.mesh, skeleton)})
+    if body is not None:
+        mesh = refined(body) if 8 * body.tet_count <= BODY_LIMIT and body.is_quadratic else body
+    else:
+        # Reconstructed branches have sections four radii apart, of six sides.
+        mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)
+                           ).mesh
+    mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
     return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
                       np.array(young, float), gravity)
 
@@ -91,12 +105,9 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
         InputError: settings that do not go together. WorkError: the branch cannot be pulled so.
     """
     rng = np.random.default_rng(settings.seed)
-    entry = _entry(truth, settings)
-    gravity = truth.gravity if settings.gravity else (0.0, 0.0, 0.0)
-    weights = young_weights(truth.mesh, truth.control_points)
-    model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
-                        density=settings.density, gravity=gravity,
-                        damping=RayleighDamping(*settings.damping))
+    model = _model(truth, settings, progress.warn)
+    is_weightless = not (model.gravity.any() and (settings.own_weight or model.hanging))
+    entry = _entry(truth, settings, is_weightless)
     grasp = grasp_on(truth.mesh, entry.grasp)
     arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
     phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
@@ -128,6 +139,16 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     return pull, made.displacements
 
 
+def _model(truth: TrueBranch, settings: VirtualPullSettings,
+           warn: Callable[[str], None]) -> BranchModel:
+    weights = young_weights(truth.mesh, truth.control_points)
+    has_weight = settings.gravity and not truth.is_weightless
+    model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
+                        density=settings.density, gravity=truth.gravity if has_weight else None,
+                        damping=RayleighDamping(*settings.damping))
+    return model if settings.own_weight else hang(model, warn=warn).model
+
+
 def _kind(settings: VirtualPullSettings) -> str:
     if settings.weight is not None:
         if settings.motion == "dynamic":
@@ -140,7 +161,7 @@ def _kind(settings: VirtualPullSettings) -> str:
     return "turned" if settings.mode == "clamped" and settings.drive == "pose" else "pull"
 
 
-def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
+def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool) -> PullEntry:
     point = truth.skeleton.point_at(settings.grasp_fraction)
     radius = truth.skeleton.radius_at(settings.grasp_fraction)
     known = {"young_pa": truth.young.tolist(), "poisson": settings.poisson,
@@ -152,7 +173,8 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings) -> PullEntry:
         observation="depth" if settings.camera else "markers",
         drive="force" if settings.weight is not None else settings.drive,
         motion=settings.motion,
-        gravity_m_s2=truth.gravity if settings.gravity else None,
+        gravity_m_s2=truth.gravity if settings.own_weight and not is_weightless else None,
+        weightless=is_weightless,
         grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),
                          mode=settings.mode),
         rest_points_m=None if settings.camera else tuple(

@@ -13,6 +13,11 @@ RADIAN = 0.3
 """What a turn by one radian counts as in distances of poses, as part of the branch's extent:
 chosen, not measured."""
 
+_REACHED = 0.95
+"""Part of a patch's extent within which its centre may be moved: beyond, weights turn negative."""
+_WIDER, _WIDEST = 1.25, 4.0
+"""By how much a patch is widened at a time, and at most."""
+
 
 @dataclass(frozen=True)
 class Grasp:
@@ -48,7 +53,8 @@ class Grasp:
            mode: Literal["clamped", "pinned"] = "clamped") -> "Grasp":
         """Return the grasp of all nodes within ``radius`` [m] of ``point`` [m], centred on it.
 
-        A radius of 0 takes the nearest node.
+        A radius of 0 takes the nearest node. What is pinned is widened where the mesh is so
+        coarse that its nodes do not surround the place.
 
         Raises:
             InputError: no node is there (and the radius is not 0), or the patch touches the
@@ -61,7 +67,17 @@ class Grasp:
                 f"No node lies within {radius:g} m of ({', '.join(f'{x:.4g}' for x in point)}) m;"
                 f" the nearest is {distance.min():.4g} m away.", "The gripper would hold nothing.",
                 "Move the point onto the branch or widen the radius; check the units (metres).")
-        return cls.of_nodes(mesh, nodes, mode, point if radius > 0 else None)
+        grasp = cls.of_nodes(mesh, nodes, mode, point if radius > 0 else None)
+        wider = radius
+        while mode == "pinned" and wider < _WIDEST * radius and (
+                np.linalg.norm(grasp.centre - point) > 1e-6 * radius):
+            # A coarse mesh has nodes on one side of the place alone.
+            wider *= _WIDER
+            nodes = np.flatnonzero(distance <= wider)
+            if mesh.point_data.get("fixed", np.zeros(mesh.node_count))[nodes].any():
+                break
+            grasp = cls.of_nodes(mesh, nodes, mode, point)
+        return grasp
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped",
@@ -176,19 +192,21 @@ def check_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def _centred(weights: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Return weights that sum to 1 and whose moment about the grasp's place vanishes.
+    """Return weights that sum to 1 and whose centre is the grasp's place.
 
     Args:
         offset: Of the nodes from that place [m], shape [k, 3]. In directions in which the patch
-            has no extent it cannot be centred, and stays.
+            does not reach to both sides of it, the centre stays.
     """
-    size = np.linalg.norm(offset, axis=1).max()
-    if size == 0.0:
-        return weights
-    conditions = np.column_stack([np.ones(len(offset)), offset / size])
-    missing = np.array([1.0, 0.0, 0.0, 0.0]) - conditions.T @ weights
-    scaled = conditions * weights[:, None]
-    return weights + scaled @ np.linalg.lstsq(conditions.T @ scaled, missing, rcond=1e-8)[0]
+    centre = weights @ offset
+    arm = offset - centre
+    # The weights' change is linear in the place, so their sum stays 1.
+    variance, axes = np.linalg.eigh((weights[:, None] * arm).T @ arm)
+    along = arm @ axes
+    wanted = -centre @ axes
+    reached = (wanted > _REACHED * along.min(axis=0)) & (wanted < _REACHED * along.max(axis=0))
+    slope = np.where(reached, wanted / np.where(reached, variance, 1.0), 0.0)
+    return weights * (1.0 + along @ slope)
 
 
 def _patch_weights(mesh: TetMesh, nodes: np.ndarray) -> np.ndarray:

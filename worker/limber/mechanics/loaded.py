@@ -16,6 +16,7 @@ weight acts: :mod:`limber.mechanics.hanging`.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -56,10 +57,12 @@ class LoadedBranch:
     Attributes:
         model: Of the scan, which its weight has bent already; weightless where it was asked for.
         targets: Named places on it.
+        grasp_point: The place of the grasp that the mesh marks [m]; None: the patch's own centre.
     """
 
     model: BranchModel
     targets: tuple[NamedTarget, ...] = ()
+    grasp_point: tuple[float, float, float] | None = None
 
     @property
     def mesh(self) -> TetMesh:
@@ -69,6 +72,14 @@ class LoadedBranch:
     def with_young(self, young: float | np.ndarray) -> "LoadedBranch":
         """Return it with other moduli [Pa]; it hangs as it does."""
         return replace(self, model=self.model.with_young(young))
+
+    def marked_grasp(self, mode: Literal["clamped", "pinned"]) -> Grasp:
+        """Return the grasp that the mesh marks.
+
+        Raises:
+            InputError: none is marked.
+        """
+        return Grasp.from_mesh(self.mesh, mode, self.grasp_point)
 
     def equilibrium(self, grasp: Grasp | None, pose: np.ndarray | None, *,
                     start: StaticResult | np.ndarray | None = None,

@@ -63,9 +63,10 @@ class SimulateSettings(Settings):
         False, description="Mass at the nodes alone instead of the consistent mass matrix.")
     young: float | None = Field(
         None, gt=0, description="Young's modulus everywhere [Pa] instead of the mesh's.")
-    gravity: bool = Field(True, description="Gravity, as it acts on the scan.")
+    gravity: bool = Field(
+        True, description="The branch bears its own weight, and was scanned so.")
     rest_shape: bool = Field(
-        True, description="Take the scan as already sagging under gravity.")
+        True, description="Take the scan as already sagging under gravity; else gravity bends it.")
     material: Literal["st_venant_kirchhoff", "stable_neo_hookean", "linear"] = Field(
         "st_venant_kirchhoff", description="Material law.")
     damping_mass: float = Field(0.5, ge=0, description="Damping on velocity [1/s].")

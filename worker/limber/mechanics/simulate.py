@@ -3,8 +3,7 @@
 
 import numpy as np
 
-from limber.errors import ConvergenceError, InputError
-from limber.geometry.tets.tet_mesh import TetMesh
+from limber.errors import InputError
 from limber.mechanics.dynamics.load_case import (
     LoadCase,
     SimulatedMotion,
@@ -16,7 +15,6 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.settings import Point, SimulateSettings
-from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics.solve import solve_static
 from limber.progress import SILENT, Progress
 
@@ -41,26 +39,24 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
     return _PROBE * _DEFAULT_BEND * np.linalg.norm(axis) / moved * across
 
 
-def load_case_of(model: BranchModel, scan: TetMesh, settings: SimulateSettings,
-            along: PoseTable | None = None) -> LoadCase:
+def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTable | None = None,
+                 grasp_point: np.ndarray | None = None) -> LoadCase:
     """Return the load case that settings ask for.
 
     Args:
-        model: At its rest shape.
-        scan: The mesh as scanned: places are given on it.
+        model: Of the scan, on which places are given.
         settings: How to pull.
         along: The grasp's way instead of a motion of the settings.
+        grasp_point: The place of the marked grasp [m]; None: the patch's own centre.
 
     Raises:
         InputError: options that do not fit. ConvergenceError: the branch finds no rest.
     """
     def patch(point: Point, mode: str) -> Grasp:
-        # Places are given on the scan; the model's rest shape is that before it sagged.
-        nodes = Grasp.at(scan, np.array(point), settings.grasp_radius, mode).nodes
-        return Grasp.of_nodes(model.mesh, nodes, mode)
+        return Grasp.at(model.mesh, np.array(point), settings.grasp_radius, mode)
 
-    grasp = (Grasp.from_mesh(model.mesh, settings.grasp_mode) if settings.grasp_point is None
-             else patch(settings.grasp_point, settings.grasp_mode))
+    grasp = (Grasp.from_mesh(model.mesh, settings.grasp_mode, grasp_point)
+             if settings.grasp_point is None else patch(settings.grasp_point, settings.grasp_mode))
     holds = tuple(patch(point, settings.grasp_mode) for point in settings.hold_at)
     loads = np.zeros_like(model.mesh.nodes)
     for place in settings.load_at:
@@ -79,18 +75,9 @@ def load_case_of(model: BranchModel, scan: TetMesh, settings: SimulateSettings,
                 _way(start.pose[0], changes, settings.grasp_mode), force, loads, times, part)
 
 
-def loaded_model(model: BranchModel, settings: SimulateSettings,
-                 progress: Progress = SILENT) -> BranchModel:
-    """Return the model of a scan at its rest shape with all that hangs on it."""
-    scan = model.mesh
-    if settings.gravity and settings.rest_shape:
-        try:
-            model = model.with_rest_nodes(unloaded_rest_shape(model, progress=progress).nodes)
-        except ConvergenceError as error:
-            progress.warn(f"{error} The scan is taken as the shape without load.")
-    added = [PointMass(tuple(model.mesh.nodes[Grasp.at(scan, np.array(place[:3]), 0.0).nodes[0]]),
-                       place[3]) for place in settings.mass_at]
-    return model.with_point_masses(added)
+def with_masses(model: BranchModel, settings: SimulateSettings) -> BranchModel:
+    """Return the model with what the settings hang on it."""
+    return model.with_point_masses([PointMass(place[:3], place[3]) for place in settings.mass_at])
 
 
 def require_one_drive(settings: SimulateSettings, along: PoseTable | None) -> None:

@@ -1,12 +1,8 @@
 """The energy field: deformation energy of the branch over the position of its grasp.
 
-Two scalars are kept apart. Both are zero in the rest state, the branch with the gripper open,
-which hangs under its own weight where it is given any:
-
-- ``energy``: strain energy above that of the rest state, the paper's measure of deformation.
-  Lifting a sagging branch can take it below zero; the field is cut off there.
-- ``work``: what the gripper has done to get there slowly, the strain energy plus the weight
-  lifted. Its gradient is the force of the gripper. Without gravity the two are one.
+The energy is the potential of strain and weight above the hanging state, the branch with the
+gripper open: what the gripper does to bring the branch there slowly. Its gradient is the force of
+the gripper. Without weight it is the strain energy, the paper's measure of deformation.
 
 The field also gives the rotation that the grasped piece takes by itself, and the branch's tip.
 """
@@ -53,8 +49,7 @@ class GraspSamples:
 
     Attributes:
         poses: Position [m] and the rotation vector [rad] that the grasped piece takes, [m, 6].
-        energies: Strain energy above the rest state [J], shape [m].
-        works: Work of the gripper from the rest state [J], shape [m].
+        energies: Potential of strain and weight above the hanging state [J], shape [m].
         forces: Force that the gripper exerts on the branch [N], shape [m, 3].
         tips: Position of the branch's tip [m], shape [m, 3].
         min_det_f: Least determinant of the deformation gradient, shape [m].
@@ -63,7 +58,6 @@ class GraspSamples:
 
     poses: np.ndarray
     energies: np.ndarray
-    works: np.ndarray
     forces: np.ndarray
     tips: np.ndarray
     min_det_f: np.ndarray
@@ -75,7 +69,7 @@ class GraspSamples:
 
     def take(self, index: np.ndarray) -> "GraspSamples":
         """Return the samples of ``index``; rejected poses stay."""
-        names = ("poses", "energies", "works", "forces", "tips", "min_det_f")
+        names = ("poses", "energies", "forces", "tips", "min_det_f")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
@@ -84,7 +78,6 @@ class FieldArrays(NamedTuple):
 
     chart: tuple
     energy: tuple
-    work: tuple
     planes: np.ndarray
     accepted: np.ndarray
     rejected: np.ndarray
@@ -99,7 +92,7 @@ class EnergyField:
     Attributes:
         samples: What it was fitted to.
         chart: The coordinates of the fits.
-        energy_fit, work_fit: Interpolants of the two scalars (cut off at 0 by the methods).
+        energy_fit: Interpolant of the energy (cut off at 0 by the methods).
         shape_fit: Six channels: natural rotation vector and tip position.
         region: Where the field may be believed.
         errors: Held-out errors; see :func:`held_out_errors`.
@@ -108,7 +101,6 @@ class EnergyField:
     samples: GraspSamples
     chart: Chart
     energy_fit: RadialInterpolant
-    work_fit: RadialInterpolant
     shape_fit: RadialInterpolant
     region: TrustRegion
     errors: dict[str, float]
@@ -127,13 +119,9 @@ class EnergyField:
         cut_off = self._value(self.energy_fit, points)[:, 0] <= 0.0
         return np.where(cut_off[:, None], 0.0, self._gradient(self.energy_fit, points, 0))
 
-    def work(self, points: np.ndarray) -> np.ndarray:
-        """Return the gripper's slow work from rest [J] at ``points``, shape [n]."""
-        return np.maximum(self._value(self.work_fit, points)[:, 0], 0.0)
-
     def force(self, points: np.ndarray) -> np.ndarray:
-        """Return the force that holds the grasp there [N], the gradient of work, [n, 3]."""
-        return self._gradient(self.work_fit, points, 0)
+        """Return the force that holds the grasp there [N], the energy's gradient, [n, 3]."""
+        return self._gradient(self.energy_fit, points, 0)
 
     def poses(self, points: np.ndarray) -> np.ndarray:
         """Return positions with the rotation that the grasped piece takes there, [n, 6]."""
@@ -157,7 +145,7 @@ class EnergyField:
 
     def limited(self, max_energy: float = np.inf, max_force: float = np.inf) -> FieldArrays:
         """Return the arrays for compiled loops, with limits on energy [J] and force [N]."""
-        return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.work_fit.arrays,
+        return FieldArrays(self.chart.arrays, self.energy_fit.arrays,
                            self.region.planes, self.region.accepted, self.region.rejected,
                            float(max_energy), float(max_force))
 
@@ -165,7 +153,7 @@ class EnergyField:
         """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; nothing pickled."""
         samples = self.samples
         arrays = {
-            "poses": samples.poses, "energies_j": samples.energies, "works_j": samples.works,
+            "poses": samples.poses, "energies_j": samples.energies,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
             "rejected_poses": samples.rejected_poses,
             "chart_base_m": self.chart.base, "chart_radius_m": np.array(self.chart.radius),
@@ -175,7 +163,7 @@ class EnergyField:
             "energy_error": np.array(self.errors["energy_error"]),
             "force_error": np.array(self.errors["force_error"]),
         }
-        for name in ("energy_fit", "work_fit", "shape_fit"):
+        for name in ("energy_fit", "shape_fit"):
             arrays |= getattr(self, name).to_arrays(f"{name}_")
         np.savez_compressed(path, **arrays, **(extra or {}))
 
@@ -190,12 +178,12 @@ class EnergyField:
             with np.load(path, allow_pickle=False) as file:
                 arrays = dict(file)
             samples = GraspSamples(
-                arrays["poses"], arrays["energies_j"], arrays["works_j"], arrays["forces_n"],
-                arrays["tips_m"], arrays["min_det_f"], arrays["rejected_poses"])
+                arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
+                arrays["min_det_f"], arrays["rejected_poses"])
             chart = Chart(arrays["chart_base_m"], float(arrays["chart_radius_m"]),
                           float(arrays["chart_stretch"]))
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
-                    for name in ("energy_fit", "work_fit", "shape_fit")]
+                    for name in ("energy_fit", "shape_fit")]
             errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                               strict=True))
         except (KeyError, ValueError, OSError, TypeError) as error:
@@ -290,16 +278,11 @@ def _fitted(samples: GraspSamples, choice: FitChoice, base: np.ndarray) -> Energ
     places = chart.map(samples.positions)
     forces = chart.push_forward(samples.positions, samples.forces) if choice.with_forces else None
     options = {"kernel": choice.kernel, "shape": choice.shape, "smoothing": _SMOOTHING}
-    work = RadialInterpolant.fit(places, samples.works, forces, **options)
-    # The force is the gradient of work, not of energy; what gravity adds is smooth and is fitted
-    # to values alone. Same centres and kernel: the weights add up, one loop evaluates the sum.
-    lifted = RadialInterpolant.fit(places, samples.energies - samples.works, **options)
-    energy = replace(work, value_weights=work.value_weights + lifted.value_weights,
-                     polynomial=work.polynomial + lifted.polynomial)
+    energy = RadialInterpolant.fit(places, samples.energies, forces, **options)
     shape = RadialInterpolant.fit(places, np.hstack([samples.poses[:, 3:], samples.tips]),
                                   **options)
     region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3])
-    return EnergyField(samples, chart, energy, work, shape, region, {})
+    return EnergyField(samples, chart, energy, shape, region, {})
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
@@ -326,5 +309,5 @@ def allowed_at(point, energy, field):
     if field.max_force == np.inf:
         return True
     slope = np.empty(len(point))
-    gradient_at(mapped(point, *field.chart), 0, *field.work, slope)
+    gradient_at(mapped(point, *field.chart), 0, *field.energy, slope)
     return pulled_back_size(point, slope, *field.chart) <= field.max_force

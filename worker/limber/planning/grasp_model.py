@@ -7,28 +7,24 @@ by turning as the branch would, so each pose carries that natural rotation for t
 gripper that turns otherwise bends the branch more than planned here.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from limber.errors import WorkError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import (
     BranchModel,
     Grasp,
-    PointMass,
     StaticResult,
     StaticSettings,
     follow_poses,
-    solve_static,
 )
+from limber.mechanics.loaded import LoadedBranch
 from limber.mechanics.status import Status
 from limber.mechanics.strain import strain_state
 
-_PARTS = ("mesh", "reach", "gravity", "point_masses")
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
 _SETTINGS = StaticSettings(min_step=1 / 64)
 
@@ -62,39 +58,35 @@ class Reach:
 
 @dataclass(frozen=True)
 class GraspModel:
-    """A branch, its grasp and its own weight; picklable, so that processes can each have one.
+    """The loaded branch and its grasp; picklable, so that processes can each have one.
 
     Attributes:
-        mesh: Tetrahedra with material and grasp, free of stress as they are.
+        branch: As it hangs, or without weight.
+        grasp: Pinned.
         reach: Where the grasp may go.
-        gravity: Acceleration [m/s^2], or None for a branch without weight.
-        point_masses: Masses that hang on the branch.
     """
 
-    mesh: TetMesh
+    branch: LoadedBranch
+    grasp: Grasp
     reach: Reach
-    gravity: tuple[float, float, float] | None
-    point_masses: tuple[PointMass, ...] = ()
 
-    @cached_property
+    @property
     def model(self) -> BranchModel:
-        data = self.mesh.cell_data
-        return BranchModel(self.mesh, young=data["young"], poisson=data["poisson"],
-                           density=data["density"], gravity=self.gravity,
-                           point_masses=self.point_masses)
+        return self.branch.model
 
-    @cached_property
-    def grasp(self) -> Grasp:
-        return Grasp.from_mesh(self.mesh, mode="pinned")
+    @property
+    def mesh(self) -> TetMesh:
+        """The hanging branch."""
+        return self.branch.mesh
 
     @cached_property
     def rest(self) -> StaticResult:
-        """The rest state: the branch with the gripper open, under its weight if it has any.
+        """The hanging state: the branch as scanned, the gripper open; its energy is 0.
 
         Raises:
             ConvergenceError: there is none, as when the branch cannot bear its weight.
         """
-        return solve_static(self.model).require()
+        return self.branch.equilibrium(None, None).require()
 
     @property
     def rest_position(self) -> np.ndarray:
@@ -111,12 +103,12 @@ class GraspModel:
         return self.grasp.pose_of(self.mesh.nodes, displacement)
 
     def energy(self, result: StaticResult) -> float:
-        """Return the strain energy above that of the rest state [J]."""
-        return result.strain_energy - self.rest.strain_energy
+        """Return the potential of strain and weight above the hanging state [J].
 
-    def work(self, result: StaticResult) -> float:
-        """Return what the gripper has done from rest [J]: strain energy and weight lifted."""
-        return self.energy(result) - self._weight_done(result) + self._weight_done(self.rest)
+        That is what a gripper has to do slowly to bring the branch there; its gradient to the
+        grasp's position is the gripper's force.
+        """
+        return result.energy
 
     def tip(self, displacement: np.ndarray) -> np.ndarray:
         """Return the position of the branch's tip [m], shape [3]."""
@@ -126,24 +118,9 @@ class GraspModel:
         """Return the largest principal Green-Lagrange strain of any tetrahedron, by magnitude."""
         return float(np.abs(strain_state(self.model, displacement).principal_strain).max())
 
-    def _weight_done(self, result: StaticResult) -> float:
-        return float(np.sum(self._weight_force * result.displacement))
-
-    @cached_property
-    def _weight_force(self) -> np.ndarray:
-        return self.model.weight_force
-
     @cached_property
     def _tip_node(self) -> int:
         return int(np.argmin(np.linalg.norm(self.mesh.nodes - self.reach.tip, axis=1)))
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Only what it is made of goes to another process; models hold compiled factors.
-        return {name: getattr(self, name) for name in _PARTS}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        for name, value in state.items():
-            object.__setattr__(self, name, value)
 
 
 def refusal(result: StaticResult) -> Status | None:
@@ -153,25 +130,11 @@ def refusal(result: StaticResult) -> Status | None:
     return None if result.min_det_f > 0.0 else Status.inverted
 
 
-def grasp_model_of(mesh: TetMesh, skeleton: Skeleton, gravity: tuple[float, float, float] | None,
-                   masses: tuple[PointMass, ...] = ()) -> GraspModel:
-    """Return the model of a scanned branch.
-
-    Without ``gravity`` [m/s^2] the scanned shape is the rest state and free of stress. With it
-    the scanned shape is the one that the branch hangs in under its own weight: the shape that it
-    would have without weight is computed first, so that the rest state is the scan again.
+def grasp_model_of(branch: LoadedBranch, skeleton: Skeleton) -> GraspModel:
+    """Return what planning asks of a branch that hangs as it was scanned.
 
     Raises:
-        WorkError: the mesh marks no material, or the branch cannot bear its weight.
+        InputError: the mesh marks no grasp.
     """
-    missing = {"young", "poisson", "density"} - set(mesh.cell_data)
-    if missing:
-        raise WorkError(f"The mesh has no {', '.join(sorted(missing))}.",
-                        "Its energy cannot be computed.", "Reconstruct the branch again.")
-    reach = Reach.of(skeleton, Grasp.from_mesh(mesh).centre)
-    if gravity is None:
-        return GraspModel(mesh, reach, None)
-    from limber.mechanics.statics.rest_shape import unloaded_rest_shape
-
-    hanging = GraspModel(mesh, reach, gravity, masses)
-    return replace(hanging, mesh=unloaded_rest_shape(hanging.model))
+    grasp = branch.marked_grasp("pinned")
+    return GraspModel(branch, grasp, Reach.of(skeleton, grasp.centre))

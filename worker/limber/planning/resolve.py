@@ -20,7 +20,7 @@ class ResolvedPath:
 
     Attributes:
         poses: Positions [m] and natural rotations [rad], shape [n, 6].
-        energies: Strain energy above the rest state [J], shape [n].
+        energies: Potential of strain and weight above the hanging state [J], shape [n].
         forces: Magnitude of the gripper's force [N], shape [n].
         strains: Largest principal Green-Lagrange strain anywhere in the branch, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].

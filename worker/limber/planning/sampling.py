@@ -35,7 +35,6 @@ class _Solved:
     target: int
     pose: np.ndarray
     energy: float
-    work: float
     force: np.ndarray
     tip: np.ndarray
     min_det_f: float
@@ -99,7 +98,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
             progress(done / len(targets), "solving grasp poses", solved=done)
         solved = _solve_tree(grasp_model, targets, np.arange(len(targets)), report)
     rest = grasp_model.rest
-    at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, 0.0, np.zeros(3),
+    at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, np.zeros(3),
                       grasp_model.tip(rest.displacement), rest.min_det_f, None)
     good = [at_rest, *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
     bad = sorted((s for s in solved if s.trouble), key=lambda s: s.target)
@@ -108,7 +107,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
     rejected[:, :3] = targets[[s.target for s in bad]] if bad else 0.0
     samples = GraspSamples(
         poses=np.array([s.pose for s in good]), energies=np.array([s.energy for s in good]),
-        works=np.array([s.work for s in good]), forces=np.array([s.force for s in good]),
+        forces=np.array([s.force for s in good]),
         tips=np.array([s.tip for s in good]), min_det_f=np.array([s.min_det_f for s in good]),
         rejected_poses=rejected)
     return samples, {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
@@ -128,7 +127,7 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
         result = grasp_model.follow(targets[target][None], states[source])[0]
         found = _Solved(
             int(numbers[target]), grasp_model.pose(result.displacement),
-            grasp_model.energy(result), grasp_model.work(result), result.reaction_force,
+            grasp_model.energy(result), result.reaction_force,
             grasp_model.tip(result.displacement), float(result.min_det_f), refusal(result))
         if not found.trouble:
             positions.append(targets[target])
@@ -213,12 +212,14 @@ def without_taut(samples: GraspSamples) -> tuple[GraspSamples, int]:
 
 
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
-    """Return digests of what the field depends on: geometry, grasp, material and gravity."""
+    """Return digests of what the field depends on: geometry, grasp, material, weight, targets."""
     import hashlib
 
-    mesh = grasp_model.mesh
-    material = hashlib.sha256()
-    for name in ("young", "poisson", "density"):
-        material.update(np.ascontiguousarray(mesh.cell_data[name], float).tobytes())
-    return {"mesh geometry": mesh.geometry_digest(), "material": material.hexdigest(),
-            "weight": str((grasp_model.gravity, grasp_model.point_masses))}
+    model, material = grasp_model.model, hashlib.sha256()
+    for values in (model.young, model.poisson, model.density):
+        material.update(np.ascontiguousarray(values, float).tobytes())
+    grasp = hashlib.sha256(repr(grasp_model.grasp.key()).encode())
+    return {"mesh geometry": grasp_model.mesh.geometry_digest(), "material": material.hexdigest(),
+            "grasp": grasp.hexdigest(),
+            "weight": str((model.gravity.tolist(), model.point_masses)),
+            "targets": str(grasp_model.branch.targets)}

@@ -22,9 +22,8 @@ class EnergySettings(Settings):
     stretch: float = Field(0.2, ge=0, le=1.0, description=(
         "How far out of its curve the branch may be pulled straight: 0 the distance between base "
         "and grasp at rest, 1 the length of branch between them."))
-    gravity: bool = Field(False, description=(
-        "Let the branch bear its own weight; the scanned shape is then the one it hangs in. "
-        "Otherwise it has no weight, and the scanned shape is free of stress."))
+    gravity: bool = Field(True, description=(
+        "The branch bears its own weight, and was scanned so. Otherwise it has no weight."))
     seed: int = Field(0, ge=0, description="Of the sampled positions.")
 
 

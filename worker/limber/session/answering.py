@@ -9,7 +9,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.mechanics.dynamics.simulate import NewmarkSettings
-from limber.mechanics.grasp import Grasp, pose_between
+from limber.mechanics.grasp import pose_between
 from limber.mechanics.reduced.dynamics import ReducedStepper
 from limber.mechanics.reduced.model import ReducedModel
 from limber.mechanics.reduced.state import ReducedState, ReducedStaticSettings
@@ -90,7 +90,7 @@ class Answering:
     def hold_marked(self, mode: Literal["clamped", "pinned"]) -> None:
         """Hold the patch that the mesh marks, if it marks one."""
         if np.any(self.held.model.mesh.point_data.get("grasp", 0)):
-            self.held.hold(Grasp.from_mesh(self.held.model.mesh, mode))
+            self.held.hold(self.held.loaded.marked_grasp(mode))
 
     def aim(self, number: int | None, pose: np.ndarray) -> None:
         """Say where a grasp is wanted."""

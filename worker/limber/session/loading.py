@@ -3,12 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from limber.mechanics.loaded import hang
 from limber.mechanics.reduced.state import ReducedSettings
 from limber.mechanics.reduced.training import TrainingSettings
 from limber.session.held import HeldBranch
 from limber.session.settings import SessionSettings
-from limber.stages.loading import load_model
+from limber.stages.loading import load_branch
 from limber.store import Branch
 
 
@@ -26,6 +25,4 @@ def load_held(folder: Path, settings: SessionSettings,
     Raises:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
     """
-    branch = Branch.open(folder)
-    gravity = {} if settings.gravity else {"gravity": None}
-    return HeldBranch(hang(load_model(branch, **gravity), warn=warn))
+    return HeldBranch(load_branch(Branch.open(folder), gravity=settings.gravity, warn=warn))

@@ -30,7 +30,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
     from limber.stages.loading import load_grasp_model
 
     branch = Branch.open(folder)
-    grasp_model = load_grasp_model(branch, gravity=settings.gravity)
+    grasp_model = load_grasp_model(branch, gravity=settings.gravity, warn=progress.warn)
     digests = energy_inputs(grasp_model)
     if not force and branch.is_current("energy", settings, digests=digests):
         return branch.manifest.stages["energy"].result
@@ -54,9 +54,9 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
             taut_count=taut_count,
             energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
-            errors=field.errors, kernel=field.work_fit.kernel, shape=field.work_fit.shape,
+            errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
             chart_stretch=field.chart.stretch,
-            fitted_to_forces=len(field.work_fit.gradient_weights) > 0,
+            fitted_to_forces=len(field.energy_fit.gradient_weights) > 0,
             max_energy_j=float(samples.energies.max()),
             max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
             rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)

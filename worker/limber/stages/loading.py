@@ -6,18 +6,24 @@ computation comes through here.
 
 import hashlib
 import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
 from limber.mechanics.model import BranchModel, PointMass
 from limber.planning.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import clean
 from limber.recordings.recording import Pull, read_pull
 from limber.store import Branch
+
+Warn = Callable[[str], None]
 
 
 def load_mesh(branch: Branch) -> TetMesh:
@@ -39,18 +45,58 @@ def load_skeleton(branch: Branch) -> Skeleton:
 
 
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
-    """Return the twigs that a folder's mesh leaves out, as masses where they were attached."""
-    if not branch.has("point_masses.json"):
+    """Return what hung on the branch when it was scanned, and its mesh leaves out.
+
+    Twigs, as masses where they were attached, and targets.
+    """
+    twigs: list[dict[str, Any]] = []
+    if branch.has("point_masses.json"):
+        twigs = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
+    return (*(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in twigs),
+            *target_masses(load_targets(branch)))
+
+
+def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
+    """Return the named places on the branch, as `limber target` has written them."""
+    if not branch.has("targets.json"):
         return ()
-    masses = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
-    return tuple(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses)
+    known = json.loads(branch.path("targets.json").read_text(encoding="utf-8"))
+    return tuple(NamedTarget(t["name"], tuple(t["position_m"]), t["mass_kg"])
+                 for t in known["targets"])
+
+
+def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
+    """Return the place of the grasp that the mesh marks [m], None where it is not known."""
+    made = next((branch.manifest.stages[key] for key in ("reconstruct", "mesh")
+                 if key in branch.manifest.stages), None)
+    fraction = made.settings.get("grasp_fraction") if made else None
+    if fraction is None or not branch.has("skeleton.swc"):
+        return None
+    return tuple(map(float, load_skeleton(branch).point_at(float(fraction))))
+
+
+def load_branch(branch: Branch, *, gravity: bool, warn: Warn, **overrides: object,
+                ) -> LoadedBranch:
+    """Return the branch as everything computes on it: as it hangs, with targets and grasp.
+
+    Args:
+        gravity: Whether it has any weight.
+        warn: Is told where it cannot carry itself and its weight is left out.
+        overrides: As for BranchModel.
+
+    Raises:
+        BranchFolderError: there is no mesh. InputError: it lacks material data.
+    """
+    model = load_model(branch, gravity=branch.gravity if gravity else None, **overrides)
+    loaded = hang(model, load_targets(branch), warn=warn)
+    return replace(loaded, grasp_point=load_grasp_point(branch))
 
 
 def load_model(branch: Branch, **overrides: object) -> BranchModel:
     """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for BranchModel.
 
-    Gravity acts as it did on the scan, which the upright turn has turned with the branch;
-    twigs that the mesh leaves out hang on it as masses.
+    The mesh is taken as the shape without load: see :func:`load_branch`. Gravity is that of the
+    scan, which the upright turn has turned with the branch; what its mesh leaves out hangs on it.
 
     Raises:
         BranchFolderError: there is no mesh. InputError: it lacks material data.
@@ -67,15 +113,13 @@ def load_model(branch: Branch, **overrides: object) -> BranchModel:
     return BranchModel(mesh, **values, **{**known, **overrides})
 
 
-def load_grasp_model(branch: Branch, *, gravity: bool) -> GraspModel:
+def load_grasp_model(branch: Branch, *, gravity: bool, warn: Warn) -> GraspModel:
     """Return what planning asks of a branch: :func:`limber.planning.grasp_model.grasp_model_of`.
 
     Raises:
-        BranchFolderError: a file is missing.
-        WorkError: the mesh marks no material, or the branch cannot bear its weight.
+        BranchFolderError: a file is missing. InputError: the mesh lacks material or grasp.
     """
-    return grasp_model_of(load_mesh(branch), load_skeleton(branch),
-                          branch.gravity if gravity else None, load_point_masses(branch))
+    return grasp_model_of(load_branch(branch, gravity=gravity, warn=warn), load_skeleton(branch))
 
 
 def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
@@ -84,7 +128,8 @@ def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
     Raises:
         BranchFolderError: a file is missing. InputError: its moduli are not positive.
     """
-    return subject_of(load_mesh(branch), load_skeleton(branch), load_point_masses(branch), settings)
+    return subject_of(load_mesh(branch), load_skeleton(branch), load_point_masses(branch),
+                      branch.gravity, settings)
 
 
 def known_pulls(branch: Branch) -> list[str]:

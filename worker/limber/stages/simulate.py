@@ -58,27 +58,29 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     """
     from limber.mechanics.simulate import (
         load_case_of,
-        loaded_model,
         motion_of,
         require_one_drive,
+        with_masses,
     )
+    from limber.stages.loading import load_grasp_point
 
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
     require_one_drive(settings, along)
     digests = {"along": along.digest()} if along else {}
+    reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json")
+             if branch.has(name)]
     stored = branch.manifest.stages.get(KEY)
     if not force and stored and stored.result.get("converged") and branch.is_current(
-            KEY, settings, reads=["mesh.vtu"], digests=digests):
+            KEY, settings, reads=reads, digests=digests):
         return stored.result
     progress(0.0, "preparing")
-    scanned = _scanned_model(branch, settings)
-    model = loaded_model(scanned, settings, progress.part(0.0, 0.2))
-    case = load_case_of(model, scanned.mesh, settings, along)
+    model = with_masses(_model(branch, settings, progress), settings)
+    case = load_case_of(model, settings, along, load_grasp_point(branch))
     motion = motion_of(case, settings, progress.part(0.2, 0.9))
     for message in motion.warnings:
         progress.warn(message)
-    with branch.stage(KEY, settings, reads=["mesh.vtu"], digests=digests) as stage:
+    with branch.stage(KEY, settings, reads=reads, digests=digests) as stage:
         result = _write(stage, case.model, settings, motion)
         stage.result.update(result)
     progress(1.0, "done")
@@ -91,15 +93,16 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     return result
 
 
-def _scanned_model(branch: Branch, settings: SimulateSettings) -> BranchModel:
+def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> BranchModel:
     from limber.mechanics.materials import RayleighDamping
-    from limber.stages.loading import load_model
+    from limber.stages.loading import load_branch, load_model
 
-    gravity = branch.gravity if settings.gravity else None
-    return load_model(
-        branch, young=settings.young, material=settings.material, gravity=gravity,
-        lumped_mass=settings.lumped_mass,
-        damping=RayleighDamping(settings.damping_mass, settings.damping_stiffness))
+    values = {"young": settings.young, "material": settings.material,
+              "lumped_mass": settings.lumped_mass,
+              "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
+    if settings.rest_shape:
+        return load_branch(branch, gravity=settings.gravity, warn=progress.warn, **values).model
+    return load_model(branch, gravity=branch.gravity if settings.gravity else None, **values)
 
 
 def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.constants import GRAVITY
 from limber.estimation.settings import VirtualPullSettings
 from limber.progress import SILENT, Progress
 from limber.settings import Groups
@@ -47,7 +46,8 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     branch = Branch.open(branch_folder)
     branch.require("skeleton.swc", "reconstruct")
     key = f"pull:{name}"
-    reads = [file for file in ("skeleton.swc", "truth/skeleton.swc", "truth/truth.json")
+    body = ("mesh.vtu",) if _is_meshed_body(branch) else ()
+    reads = [file for file in ("skeleton.swc", "truth/skeleton.swc", "truth/truth.json", *body)
              if branch.has(file)]
     if not force and branch.is_current(key, settings, reads=reads):
         return branch.manifest.stages[key].result
@@ -72,9 +72,11 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
 
 
 def _truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
-    """The truth of a branch folder: that of its generator, or its own skeleton's."""
+    """The truth of a branch folder: its generator's, the body that was meshed, or its skeleton's.
+    """
     from limber.estimation.virtual_pull import true_branch
     from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.stages.loading import load_mesh
 
     known: dict[str, Any] = {}
     where = "skeleton.swc"
@@ -82,10 +84,15 @@ def _truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
         told = json.loads(branch.path("truth/truth.json").read_text(encoding="utf-8"))
         known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
         where = "truth/skeleton.swc"
-    made = branch.manifest.stages.get("reconstruct")
-    # An upright turn of the scan turns gravity with it.
-    gravity = tuple((made.result.get("gravity_m_s2") if made else None) or GRAVITY)
-    return true_branch(Skeleton.read_swc(branch.path(where)), settings, gravity=gravity, **known)
+    body = load_mesh(branch) if _is_meshed_body(branch) else None
+    return true_branch(Skeleton.read_swc(branch.path(where)), settings, gravity=branch.gravity,
+                       body=body, **known)
+
+
+def _is_meshed_body(branch: Branch) -> bool:
+    """Whether `limber mesh` made the branch: its own tetrahedra are the truth."""
+    return "mesh" in branch.manifest.stages and branch.has("mesh.vtu") and not branch.has(
+        "truth/truth.json")
 
 
 def run(inputs: VirtualPullInputs, settings: VirtualPullSettings, options: RunOptions,
