@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.settings import EstimateSettings
-from limber.estimation.virtual_pull import TrueBranch, VirtualPullSettings, simulate_pull
+from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.virtual_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
-from limber.mechanics.simulate import SimulateSettings, load_case_of, motion_of
+from limber.mechanics.settings import SimulateSettings
+from limber.mechanics.simulate import load_case_of, motion_of
 from limber.recordings.alignment import frames_of
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import GraspEntry, PullEntry
