@@ -267,8 +267,8 @@ def test_the_session_ends_with_a_client_that_was_killed(branch_folder, tmp_path)
     script = (
         "import numpy as np, sys, time\n"
         "from limber.session.client import InteractiveSession\n"
-        f"s = InteractiveSession({str(branch_folder)!r}, grasps=24, size=36, fields=70,"
-        " cache=False)\n"
+        # So much to learn that it would go on for a quarter of an hour.
+        f"s = InteractiveSession({str(branch_folder)!r}, grasps=9000, cache=False)\n"
         "print(s.process_id, s.hello['positions'], flush=True)\n"
         "while True:\n"
         "    s.move(np.array(s.hello['rest_pose']) + [0.05, 0, 0, 0, 0, 0]); time.sleep(0.01)\n")
@@ -281,3 +281,18 @@ def test_the_session_ends_with_a_client_that_was_killed(branch_folder, tmp_path)
     _, left = psutil.wait_procs(family, timeout=20)
     assert not left
     assert not os.path.exists(path.strip())
+
+
+def test_the_command_is_a_session(branch_folder, tmp_path):
+    """`limber session` speaks the protocol; a folder that is none ends it with code 2."""
+    command = [sys.executable, "-m", "limber", "session"]
+    with subprocess.Popen([*command, str(branch_folder), "--no-reduced", "--no-grasp"],
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        hello = json.loads(process.stdout.readline())
+        assert (hello["protocol"], hello["grasps"]) == (PROTOCOL, [])
+        process.stdin.close()
+        assert json.loads(process.stdout.readline())["event"] == "closed"
+        assert process.wait(15) == 0
+    done = subprocess.run([*command, str(tmp_path)], input=b"", capture_output=True, check=False)
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["event"] == "failed"

@@ -16,15 +16,17 @@ A model is kept in the cache of :mod:`limber.mechanics.reduced.cache`.
 import argparse
 import json
 import os
+import queue
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from limber.errors import LimberError
+from limber.errors import Cancelled, LimberError
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.reduced.cache import (
     LearntModel,
@@ -59,6 +61,8 @@ def main(arguments: list[str] | None = None) -> int:
             folder = settings.cache_folder or default_folder()
             cache = ReducedCache(folder if settings.cache else Path(own), warn=_warn)
             _serve(options.folder, settings, cache)
+    except Cancelled as error:
+        return error.exit_code
     except LimberError as error:
         say(event="failed", message=str(error))
         return error.exit_code
@@ -70,7 +74,12 @@ def _warn(message: str) -> None:
 
 
 def _serve(folder: Path, settings: SessionSettings, cache: ReducedCache) -> None:
-    wanted = json.loads(sys.stdin.readline())
+    progress = Progress(JsonSink(interval_seconds=0.5))
+    requests: queue.Queue[dict[str, Any] | None] = queue.Queue()
+    threading.Thread(target=_listen, args=(requests, progress), daemon=True).start()
+    wanted = requests.get()
+    if wanted is None:
+        return
     held = load_held(folder, settings)
     nodes, shares = np.array(wanted["nodes"]), np.array(wanted["weights"])
     grasp = Grasp(nodes, shares, shares @ held.model.mesh.nodes[nodes], wanted["mode"])
@@ -78,17 +87,25 @@ def _serve(folder: Path, settings: SessionSettings, cache: ReducedCache) -> None
     about, began = reduced_settings(settings), time.perf_counter()
     key = model_key(held.model, grasp, weights, young, about)
     learnt = learnt_model(held.model, grasp, weights, young, about, cache=cache,
-                          progress=Progress(JsonSink(interval_seconds=0.5)))
+                          progress=progress)
     refreshing = RefreshingModel(held.model, grasp, weights, young, about, reduced=learnt.reduced,
                                  snapshots=learnt.snapshots)
     _announce(cache, key, refreshing, began, learnt)
     _step_back()
-    for line in sys.stdin:
+    while (request := requests.get()) is not None:
         began, count = time.perf_counter(), refreshing.refresh_count
-        _check(refreshing, json.loads(line))
+        _check(refreshing, request)
         if refreshing.refresh_count > count:
             cache.store(key, refreshing.reduced, refreshing.snapshots)
             _announce(cache, key, refreshing, began)
+
+
+def _listen(requests: queue.Queue[dict[str, Any] | None], progress: Progress) -> None:
+    """Hand on what the session asks; once it has gone, end what is being learnt as well."""
+    for line in sys.stdin:
+        requests.put(json.loads(line))
+    progress.cancel()
+    requests.put(None)
 
 
 def _step_back() -> None:
