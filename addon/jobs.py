@@ -55,8 +55,10 @@ class Job:
         self._lines: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
         self._cancelled_at: float | None = None
         self._process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True, encoding="utf-8", errors="replace", env=worker_environment(),
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True, encoding="utf-8", errors="replace",
+            # Its input closes when Blender ends, however that comes; then it ends too.
+            env=worker_environment() | {"LIMBER_PARENT_PIPE": "stdin"},
             start_new_session=_POSIX)
         self._readers = [
             threading.Thread(target=self._read, args=(name, stream), daemon=True)
@@ -79,6 +81,7 @@ class Job:
                 reader.join(timeout=2.0)
         self._take_lines()
         if code is not None:
+            self._process.stdin.close()
             self._finish(code)
         elif self._cancelled_at and time.monotonic() - self._cancelled_at > _GRACE_SECONDS:
             self._signal(kill=True)
@@ -117,7 +120,7 @@ class Job:
             content = _json_object(line) if name == "out" else None
             if content is None:
                 self.log.append(line)
-            elif "progress" in content:
+            elif _is_fraction(content.get("progress")):
                 self.fraction = float(content["progress"])
                 self.message = str(content.get("message", ""))
             elif "status" in content:
@@ -147,10 +150,14 @@ class Job:
             return
 
 
+def _is_fraction(value: Any) -> bool:
+    return isinstance(value, int | float) and 0.0 <= value <= 1.0
+
+
 def _json_object(line: str) -> dict[str, Any] | None:
     try:
         content = json.loads(line)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         # Native libraries print lines of their own among ours.
         return None
     return content if isinstance(content, dict) else None

@@ -1,6 +1,7 @@
 """What every test shares: real recordings; small meshes, branches and pulls with known truth."""
 
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,11 @@ from limber.recordings.recording import (
     PullEntry,
     SensorEntry,
 )
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # Started in the background of a shell, or under one that ignores Ctrl-C: the programs that
+    # tests start would inherit that, and no user's does.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 

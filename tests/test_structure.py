@@ -44,8 +44,8 @@ def test_top_level_is_as_designed():
                              check=True).stdout.splitlines()
     top = {name.split("/")[0] for name in tracked}
     allowed = {"addon", "worker", "tests", "blend_files", "scripts", ".ci", "README.md",
-               "CHANGELOG.md", "LICENSE", "pyproject.toml", "requirements.lock", ".gitignore",
-               ".gitattributes"}
+               "CHANGELOG.md", "LICENSE", "MANIFEST.in", "pyproject.toml", "requirements.lock",
+               "setup.py", ".gitignore", ".gitattributes"}
     assert top <= allowed
 
 

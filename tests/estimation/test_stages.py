@@ -1,6 +1,7 @@
 """The commands virtual-pull and estimate on a branch folder."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -69,8 +70,8 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
 
 
 def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
-    """Cancelled in the middle: exit 130's error, estimate.json unfinished, mesh untouched; the
-    next run takes the evaluations over.
+    """Cancelled in the middle: exit 130's error, estimate.json unfinished, mesh untouched; asked
+    to, the next run takes the evaluations over.
     """
     before = TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"]
 
@@ -88,9 +89,48 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
     assert kept["stopped"] and not kept["converged"]
     assert np.array_equal(TetMesh.read(branch_folder / "mesh.vtu").cell_data["young"], before)
     warnings: list[str] = []
-    result = estimate(branch_folder, QUICK, progress=Progress(on_warning=warnings.append))
+    result = estimate(branch_folder, QUICK, resume=True,
+                      progress=Progress(on_warning=warnings.append))
     assert any("Resumed" in warning for warning in warnings)
     assert result["converged"] and not result["stopped"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("forward", ["full", "reduced"])
+def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, forward: str):
+    """Killed at its third evaluation, or at its end before anything was entered: the next run
+    ends as one in a folder where nothing had happened.
+    """
+    settings = QUICK.model_copy(update={"forward": forward})
+    clean, early, late = (tmp_path / name for name in ("clean", "early", "late"))
+    for folder in (clean, early, late):
+        shutil.copytree(branch_folder, folder)
+    expected = estimate(clean, settings)
+    calls = 0
+
+    class Killed(BaseException):
+        """Nothing catches it, as nothing catches SIGKILL."""
+
+    def kill(share: float, message: str, _numbers: dict) -> None:
+        nonlocal calls
+        calls += message == "fitting"
+        if calls >= 3:
+            raise Killed
+
+    with pytest.raises(Killed):
+        estimate(early, settings, progress=Progress(kill))
+    assert (early / EVALUATIONS).exists()
+
+    def kill_late(share: float, _message: str, _numbers: dict) -> None:
+        if share > 0.9:
+            raise Killed
+
+    with pytest.raises(Killed):
+        estimate(late, settings, progress=Progress(kill_late))
+    for folder in (early, late):
+        found = estimate(folder, settings)
+        for name in ("young_pa", "young_interval_pa", "loss_m2"):
+            assert np.array_equal(found[name], expected[name]), (folder, name)
 
 
 def test_pulls_that_are_not_there(branch_folder):

@@ -79,25 +79,3 @@ def test_missing_branch_folder_is_an_input_error(tmp_path):
     with pytest.raises(InputError, match="limber reconstruct") as error:
         process.run_stage(["report", str(tmp_path / "none.branch")])
     assert not isinstance(error.value, BranchFolderError)
-
-
-def test_pool_processes_end_with_a_killed_parent(tmp_path):
-    """SIGKILL to the program that made a pool: its processes end too, also those that wait."""
-    program = tmp_path / "pooled.py"
-    program.write_text(
-        "import os, sys, time\n"
-        "from concurrent.futures import ProcessPoolExecutor\n"
-        "from multiprocessing import get_context\n"
-        "from limber.jobs.process import end_with_parent\n"
-        "if __name__ == '__main__':\n"
-        "    pool = ProcessPoolExecutor(1, mp_context=get_context('spawn'),\n"
-        "                               initializer=end_with_parent)\n"
-        "    print(pool.submit(os.getpid).result(), flush=True)\n"
-        "    time.sleep(60)\n")
-    parent = process.subprocess.Popen([sys.executable, str(program)],
-                                      stdout=process.subprocess.PIPE, text=True)
-    worker = psutil.Process(int(parent.stdout.readline()))
-    parent.kill()
-    parent.wait()
-    worker.wait(timeout=10)
-    assert not worker.is_running()

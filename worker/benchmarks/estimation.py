@@ -5,9 +5,7 @@ The truth is always simulated on another, finer mesh than the fit, with noise of
 
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +37,7 @@ from limber.estimation.virtual_pull import (
     simulate_pull,
     write_depth_frames,
 )
+from limber.jobs import run_tasks
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import frames_of
 from limber.recordings.recording import Pull
@@ -79,8 +78,7 @@ def _exact(branch: PaperBranch) -> tuple[np.ndarray, float, int]:
 
 
 def _paper_table() -> list[Row]:
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(_exact, BRANCHES))
+    found = run_tasks(_exact, [(branch,) for branch in BRANCHES])
     table = []
     for branch, (errors, poisson, count) in zip(BRANCHES, found, strict=True):
         truth = " ".join(f"{young / 1e7:.3g}" for young in branch.young)

@@ -4,26 +4,24 @@ A force bends a branch little beyond its last control point, and its own noise m
 once: the outer modulus is known to within a factor, and the interval has to say so.
 """
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 
 import numpy as np
 from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
 
 from benchmarks.table import Row
 from limber.estimation.settings import EstimateSettings
+from limber.jobs import run_tasks
 
 SETTINGS = EstimateSettings(hold_out=False)
 DRIVES = ("pose", "force")
 
 
-def force_rows(seeds: int, workers: int = 2) -> list[Row]:
+def force_rows(seeds: int) -> list[Row]:
     """Both drives on the three branches, one pull of 60 frames each, ``seeds`` noises."""
     tasks = [(number, seed) for number in range(len(BRANCHES)) for seed in range(seeds)]
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        found = np.array(list(pool.map(fitted, tasks))).reshape(
-            len(BRANCHES), seeds, len(DRIVES), 2, 4)
+    found = np.array(run_tasks(fitted, [(task,) for task in tasks])).reshape(
+        len(BRANCHES), seeds, len(DRIVES), 2, 4)
     table = []
     for number, drive in enumerate(DRIVES):
         errors, covered = found[:, :, number, 0], found[:, :, number, 1]

@@ -8,9 +8,8 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
 
 from benchmarks.table import Row
 from limber.estimation.settings import EstimateSettings
+from limber.jobs import Pool
 from limber.progress import Progress
 
 SETTINGS = EstimateSettings(hold_out=False)
@@ -128,7 +128,7 @@ def _computed(tasks: list[tuple[int, int]], workers: int) -> Iterator[Trial]:
         for task in tasks:
             yield from trials_of(task)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with Pool(workers) as pool:
         for future in as_completed([pool.submit(trials_of, task) for task in tasks]):
             yield from future.result()
 

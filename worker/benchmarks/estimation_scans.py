@@ -9,9 +9,8 @@ import json
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from limber.errors import LimberError
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch
+from limber.jobs import Pool
 from limber.progress import Progress
 from limber.stages.estimate import estimate
 from limber.stages.generate import write_generated
@@ -184,7 +184,7 @@ def _computed(tasks: list[tuple[int, str]], workers: int) -> Iterator[Trial]:
     if workers < 2:
         yield from map(trial_of, tasks)
         return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with Pool(workers) as pool:
         for future in as_completed([pool.submit(trial_of, task) for task in tasks]):
             yield future.result()
 

@@ -6,9 +6,7 @@ disturbs them least. Ratios are taken within one run.
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 
@@ -17,6 +15,7 @@ from benchmarks.mechanics_reduced import bench_branch
 from benchmarks.table import Row
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.jobs import Pool
 from limber.mechanics import (
     BranchModel,
     Grasp,
@@ -238,7 +237,7 @@ def _tour(centre: np.ndarray, count: int) -> np.ndarray:
 def memory_row(quick: bool) -> Row:
     """A static solve with 50,000 quadratic tetrahedra, in a process of its own."""
     count = 10_000 if quick else 50_000
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with Pool(1) as pool:
         found, megabytes, seconds, converged = pool.submit(_solve_large, count).result()
     return Row("memory at 50,000 quadratic tetrahedra", "4 GB, and it solves",
                f"{megabytes / 1024:.2f} GB at {found} tetrahedra,"

@@ -7,9 +7,8 @@ compared are never the field's.
 
 import json
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from benchmarks.table import Row
 from limber.errors import WorkError
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.marks import mark
+from limber.jobs import Pool
 from limber.mechanics import BranchModel, Grasp, solve_static, young_weights
 from limber.mechanics.loaded import LoadedBranch
 from limber.plain import plain
@@ -98,7 +98,7 @@ def _field(branch: PaperBranch, model: GraspModel, progress: Progress,
     started = time.perf_counter()
     targets = sample_positions(model.reach, model.rest_position, settings.samples,
                                deflection=settings.deflection, stretch=settings.stretch)
-    samples, reasons = sample_branch(model, targets, workers=2, progress=progress)
+    samples, reasons = sample_branch(model, targets, progress=progress)
     samples, taut = without_taut(samples)
     field = fit_field(samples, model.reach.base)
     seconds = time.perf_counter() - started
@@ -122,7 +122,7 @@ def _fresh_rows(branch: PaperBranch, model: GraspModel, field: EnergyField, coun
     targets = sample_positions(model.reach, model.rest_position, 3 * count, seed=99,
                                deflection=settings.deflection, stretch=settings.stretch)
     targets = targets[field.region.contains(targets)][:count]
-    fresh, _ = sample_branch(model, targets, workers=2, progress=progress)
+    fresh, _ = sample_branch(model, targets, progress=progress)
     errors = error_measures(fresh, field.energy(fresh.positions), field.force(fresh.positions))
     return [Row(f"{branch.name}: field error, {len(targets)} fresh poses (rms)", "-",
                 f"energy {100 * errors['energy_error']:.1f} %, its gentle half "
@@ -133,7 +133,7 @@ def _fresh_rows(branch: PaperBranch, model: GraspModel, field: EnergyField, coun
 def _trials(model: GraspModel, field: EnergyField, goal: GraspGoal, count: int,
             progress: Progress) -> list[_Trial]:
     found = []
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+    with Pool() as pool:
         futures = [pool.submit(_trial, model, field, goal, seed) for seed in range(count)]
         for future in as_completed(futures):
             found.append(future.result())

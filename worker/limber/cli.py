@@ -10,6 +10,7 @@ import ast
 import functools
 import importlib
 import json
+import os
 import signal
 import sys
 import time
@@ -175,6 +176,10 @@ def run(arguments: list[str] | None = None) -> None:
 def call(arguments: list[str] | None = None) -> int:
     """Run one command line and return its exit code; what Blender's command entry calls."""
     _terminate_like_interrupt()
+    if "LIMBER_PARENT_PIPE" in os.environ:
+        from limber.jobs.ending import end_with_parent_pipe
+
+        end_with_parent_pipe()
     try:
         main.main(args=arguments, prog_name="limber", standalone_mode=False)
     except click.ClickException as error:

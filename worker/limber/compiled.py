@@ -30,7 +30,11 @@ def cache_folder() -> Path | None:
 def compiled(function: Callable) -> Callable:
     """Compile ``function`` with numba; the result is kept in :func:`cache_folder`."""
     folder = cache_folder()
-    options = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
+    # Inlined always: a kernel that another calls would otherwise be there twice, optimised in two
+    # ways, and which one runs (and so the last digits) would depend on whether it was compiled
+    # in this process or loaded.
+    options = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+               "forceinline": True}
     if folder is None:
         return numba.njit(**options)(function)
     before = numba.config.CACHE_DIR

@@ -10,6 +10,7 @@ import click
 from limber.cli import Run, stage_command
 from limber.errors import InputError
 from limber.jobs.process import run_stage
+from limber.optional import require_extra
 
 # Young's modulus [Pa] at the control points for the simulated pull on a scan that comes without
 # a recording: green wood that softens towards the tip.
@@ -62,6 +63,8 @@ def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None,
     if cloud is not None and not cloud.is_file():
         raise InputError(f"There is no file {cloud}.", "The demo wants the scan of one branch.",
                          "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
+    # Before minutes of work, not after them.
+    require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     name = cloud.stem if cloud else "generated"
     demo = _Demo(output or Path("out") / name, run)
     _make_folder(demo.folder)

@@ -22,12 +22,14 @@ PARTS = [
     ("pytetwild", "pytetwild", "fTetWild meshes; the sweep mesher takes over"),
     ("manifold3d", "manifold3d", "smooth unions at forks"),
     ("ompl", "ompl", "OMPL's RRT*; our own planner takes over (no wheel for Windows)"),
-    ("rtde_control", "ur-rtde", "motion of a UR robot"),
+    ("rtde_control", "ur-rtde", "motion of a UR robot (pip install 'limber[robot]')"),
     ("laspy", "laspy", "LAS and LAZ scans"),
     ("pypcd4", "pypcd4", "PCD scans"),
     ("ezc3d", "ezc3d", "C3D motion capture"),
-    ("distributed", "distributed", "work on more than one machine"),
-    ("bpy", "bpy", "`limber scene`, unless a real Blender is found"),
+    ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
+    ("matplotlib", "matplotlib", "`limber report` (pip install 'limber[report]')"),
+    ("jinja2", "jinja2", "`limber report` (pip install 'limber[report]')"),
+    ("bpy", "bpy", "`limber scene` without a real Blender (pip install 'limber[blender]')"),
     ("ultralytics", "ultralytics", "masks by a YOLO model of your own (optional)"),
 ]
 

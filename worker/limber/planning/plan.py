@@ -39,7 +39,7 @@ class PlannedMotion:
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
-                workers: int = 2, progress: Progress = SILENT) -> PlannedMotion:
+                workers: int | None = None, progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
     Raises:

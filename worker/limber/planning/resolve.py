@@ -1,11 +1,11 @@
 """A planned path on the full model: what the branch really does along it."""
 
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 
 from limber.errors import ConvergenceError
+from limber.jobs import run_tasks
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.grasp_model import GraspModel, refusal
 from limber.progress import SILENT, Progress
@@ -41,7 +41,8 @@ class ResolvedPath:
         return measure_path(self.poses[:, :3], self.energies, self.forces)
 
 
-def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray) -> ResolvedPath:
+def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray,
+                 progress: Progress = SILENT) -> ResolvedPath:
     """Solve the branch at each point of ``path`` [n, 3], coming from rest by ``approach`` [k, 3].
 
     Raises:
@@ -52,7 +53,8 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
         result = grasp_model.follow(point[None], state)[0]
         state = state if refusal(result) else result.displacement
     good, reasons = [], []
-    for point in path:
+    for number, point in enumerate(path):
+        progress(number / len(path), "path on the full model")
         result = grasp_model.follow(point[None], state)[0]
         if reason := refusal(result):
             reasons.append(reason)
@@ -74,19 +76,11 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
 
 
 def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,
-                         workers: int, progress: Progress = SILENT) -> list[ResolvedPath]:
-    """Solve several paths with the same approach, each in a process where ``workers`` allows."""
-    if workers < 2:
-        return [resolve_path(grasp_model, path, approach) for path in paths]
-    with get_context("spawn").Pool(min(workers, len(paths))) as pool:
-        # Leaving the block, also by a cancel, ends the processes.
-        waiting = [pool.apply_async(resolve_path, (grasp_model, path, approach))
-                   for path in paths]
-        while not all(result.ready() for result in waiting):
-            waiting[-1].wait(0.1)
-            progress(sum(result.ready() for result in waiting) / len(paths),
-                     "both paths on the full model")
-        return [result.get() for result in waiting]
+                         workers: int | None = None, progress: Progress = SILENT,
+                         ) -> list[ResolvedPath]:
+    """Solve several paths with the same approach, each in a process where cores allow."""
+    return run_tasks(resolve_path, [(grasp_model, path, approach) for path in paths],
+                     workers=workers, progress=progress, message="both paths on the full model")
 
 
 def _unsolved(reasons: list[str], count: int) -> ConvergenceError:

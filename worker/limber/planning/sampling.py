@@ -7,17 +7,13 @@ short, also where a tour would have to jump, and the branch stays in the equilib
 out of rest.
 """
 
-import queue
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import dataclass
-from multiprocessing import get_context
-from typing import Any
 
 import numpy as np
 
 from limber.errors import WorkError
-from limber.jobs.process import end_with_parent
+from limber.jobs import run_tasks
 from limber.mechanics.status import Status
 from limber.planning.field import GraspSamples
 from limber.planning.grasp_model import GraspModel, Reach, refusal
@@ -25,6 +21,9 @@ from limber.progress import SILENT, Progress
 
 _LAYER = 0.06  # share of the reach
 _TAUT = 2.0  # times the median force
+_SHARE_POSES = 40
+"""Poses of one tree. How many trees there are must not depend on how many processes work on
+them, nor what they find."""
 _SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
 
 
@@ -84,19 +83,19 @@ def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([first[:shared], second[:shared]], axis=1).reshape(-1, 3)
 
 
-def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int = 1,
+def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int | None = None,
                   progress: Progress = SILENT) -> tuple[GraspSamples, dict[str, int]]:
     """Solve the branch with its grasp at each of ``targets`` [n, 3].
 
     Returns:
         The accepted samples, the rest pose first; and how many were rejected for which reason.
     """
-    if workers > 1:
-        solved = _solve_side_by_side(grasp_model, targets, workers, progress)
-    else:
-        def report(done: int) -> None:
-            progress(done / len(targets), "solving grasp poses", solved=done)
-        solved = _solve_tree(grasp_model, targets, np.arange(len(targets)), report)
+    # Slabs of space: in each a tree of its own out of the rest state.
+    share_count = max(2, -(-len(targets) // _SHARE_POSES))
+    shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), share_count)
+    found = run_tasks(_solve_share, [(grasp_model, targets[share], share) for share in shares],
+                      workers=workers, progress=progress, message="solving grasp poses")
+    solved = [one for share in found for one in share]
     rest = grasp_model.rest
     at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, np.zeros(3),
                       grasp_model.tip(rest.displacement), rest.min_det_f, None)
@@ -155,47 +154,13 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
     return solved
 
 
-_channel: Any = None
-_stop: Any = None
-
-
-def _join_pool(channel: Any, stop: Any) -> None:
-    global _channel, _stop
-    end_with_parent()
-    _channel, _stop = channel, stop
-
-
 def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
-                 ) -> list[_Solved]:
-    def report(_done: int) -> None:
-        _channel.put(1)
-        if _stop.is_set():
-            raise WorkError("Stopped.", "Another part of the sampling was cancelled.")
+                 progress: Progress = SILENT) -> list[_Solved]:
+    def report(done: int) -> None:
+        progress(done / len(targets), "solving grasp poses", solved=done)
     return _solve_tree(grasp_model, targets, numbers, report)
 
 
-def _solve_side_by_side(grasp_model: GraspModel, targets: np.ndarray, workers: int,
-                        progress: Progress) -> list[_Solved]:
-    context = get_context("spawn")
-    channel, stop = context.Queue(), context.Event()
-    # Slabs of space: each process follows its own tree out of the rest state.
-    shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), workers)
-    done = 0
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_join_pool,
-                             initargs=(channel, stop)) as pool:
-        futures = [pool.submit(_solve_share, grasp_model, targets[share], share)
-                   for share in shares]
-        try:
-            while wait(futures, timeout=0.1).not_done:
-                while True:
-                    try:
-                        done += channel.get_nowait()
-                    except queue.Empty:
-                        break
-                progress(done / len(targets), "solving grasp poses", solved=done)
-        finally:
-            stop.set()
-        return [solved for future in futures for solved in future.result()]
 
 
 def without_taut(samples: GraspSamples) -> tuple[GraspSamples, int]:

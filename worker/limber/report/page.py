@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError
+from limber.optional import require_extra
 from limber.progress import SILENT, Progress
 from limber.report import figures
 from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
@@ -53,7 +54,11 @@ def draw_page(branch: Branch, *, picture: Path | None = None, progress: Progress
 
     Args:
         picture: A render of the scene to put at the top, PNG.
+
+    Raises:
+        MissingDependencyError: what the extra ``report`` brings is not installed.
     """
+    require_extra("report", ("matplotlib", "jinja2"), "The report")
     page = [_summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
         _scan, _mesh, *_pulls(branch), _estimate, *_simulations(branch), _energy,

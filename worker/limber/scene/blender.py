@@ -13,8 +13,6 @@ from typing import Any
 from limber.errors import MissingDependencyError
 from limber.progress import Progress
 
-_SCRIPT = Path(__file__).parents[3] / "addon" / "make_scene.py"
-
 
 def make_scene(arguments: list[object], progress: Progress) -> dict[str, Any]:
     """Run the script with ``arguments``; returns what it made and with which Blender."""
@@ -30,15 +28,12 @@ def blender_command() -> list[str]:
     """Return the command that runs the add-on's script in a process with bpy.
 
     Raises:
-        MissingDependencyError: neither the bpy package nor a Blender is there.
+        MissingDependencyError: neither the bpy package nor a Blender is there, or no script.
     """
-    if not _SCRIPT.is_file():
-        raise MissingDependencyError(
-            f"The add-on's {_SCRIPT.name} is not beside the worker.",
-            "`limber scene` needs it.", "Run from a checkout of the project.")
+    script = str(scene_script())
     named = os.environ.get("LIMBER_SCENE_BLENDER")
     if named is None and importlib.util.find_spec("bpy") is not None:
-        return [sys.executable, str(_SCRIPT)]
+        return [sys.executable, script]
     blender = named or os.environ.get("LIMBER_BLENDER") or shutil.which("blender")
     if not blender:
         raise MissingDependencyError(
@@ -46,4 +41,20 @@ def blender_command() -> list[str]:
             "A scene needs one of them.",
             "Install bpy (pip install 'limber[blender]'), or set LIMBER_BLENDER to a Blender.")
     return [blender, "--background", "--factory-startup", "--python-exit-code", "3",
-            "--python", str(_SCRIPT)]
+            "--python", script]
+
+
+def scene_script() -> Path:
+    """Return the path of ``make_scene.py``: the wheel's own copy, or the checkout's.
+
+    Raises:
+        MissingDependencyError: it is in neither.
+    """
+    here = Path(__file__).parent
+    places = [here / "addon" / "make_scene.py", here.parents[2] / "addon" / "make_scene.py"]
+    for place in places:
+        if place.is_file():
+            return place
+    raise MissingDependencyError(
+        f"The add-on's {places[0].name} is not installed.", "`limber scene` needs it.",
+        "Install Limber from its wheel, or run it from a checkout of the project.")

@@ -12,7 +12,7 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 
-def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int = 2,
+def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int | None = None,
                         force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Stage ``energy``: sample grasp poses and fit the field; writes ``energy.npz``.
 

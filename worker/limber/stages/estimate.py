@@ -11,6 +11,7 @@ from pydantic import Field
 
 from limber.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings
+from limber.files import file_digest
 from limber.plain import plain
 from limber.progress import SILENT, Progress
 from limber.settings import Groups
@@ -25,13 +26,18 @@ if TYPE_CHECKING:
 
 EVALUATIONS = ".estimate-evaluations.jsonl"
 """Beside the branch's own files: grows while an estimate runs, and lets a stopped one resume."""
+_BASES = ".reduced-*.npz"
+"""Beside them too: bases of reduced models, from which the next estimate starts."""
 
 
 class EstimateOptions(RunOptions):
     """How an estimate is run."""
 
-    groups: ClassVar[Groups] = {"running": ("follow", "pace")}
+    groups: ClassVar[Groups] = {"running": ("resume", "follow", "pace")}
 
+    resume: bool = Field(False, json_schema_extra={"switch": True}, description=(
+        "Start at the best that a stopped run found; otherwise what it left behind does not "
+        "count."))
     follow: bool = Field(
         False, description="Estimate frame by frame while a pull is recorded, or replay one.",
         json_schema_extra={"switch": True})
@@ -39,11 +45,20 @@ class EstimateOptions(RunOptions):
 
 
 def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = False,
-             progress: Progress = SILENT) -> dict[str, Any]:
+             resume: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Estimate Young's modulus from the pulls of a branch folder.
 
     Writes ``estimate.json`` and the modulus into ``mesh.vtu``. Stopped by Ctrl-C it keeps the
-    best so far in ``estimate.json`` (``converged`` is then false); run again, it resumes.
+    best so far in ``estimate.json`` (``converged`` is then false).
+
+    Args:
+        branch_folder: Of the branch.
+        settings: What the result depends on.
+        force: Estimate again even if nothing has changed.
+        resume: Start at the best that a stopped run of the same estimate found. It ends at the
+            same moduli to the fit's tolerance, not to the last digit; without it nothing that a
+            stopped or killed run left behind counts.
+        progress: Called as it goes.
 
     Returns:
         DESIGN's keys and ``warnings``.
@@ -53,12 +68,18 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
         WorkError: the simulation finds no equilibrium.
         Cancelled: after the best so far was kept.
     """
+    branch = Branch.open(branch_folder)
+    with branch.writing("limber estimate"):
+        return _estimate(branch, settings, force=force, resume=resume, progress=progress)
+
+
+def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
+              progress: Progress) -> dict[str, Any]:
     from limber.estimation.evaluations import EvaluationLog
     from limber.estimation.fit import fit_branch, judge_model
     from limber.estimation.summary import details, summary
     from limber.stages.loading import load_pulls, load_subject, pull_names, pulls_digest
 
-    branch = Branch.open(branch_folder)
     names = pull_names(branch, settings)
     subject = load_subject(branch, settings)
     digests = {"mesh geometry": subject.mesh.geometry_digest(),
@@ -71,8 +92,9 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
     heard = progress.keeping(warnings)
     pulls = load_pulls(branch, names, subject, settings, heard.part(0.0, 0.2))
     log_path = branch.folder / EVALUATIONS
-    if force:
+    if force or not resume:
         log_path.unlink(missing_ok=True)
+    bases = _finished_bases(branch)
     log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
     found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
                        digest=json.dumps(digests, sort_keys=True),
@@ -100,13 +122,32 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
                 "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
                 "density": np.full(subject.mesh.tet_count, found.values.density),
             }).write(stage.path("mesh.vtu"))
-        stage.result.update(result)
+        stage.result.update(result | {"bases": bases | _bases(branch.folder)})
     if found.stopped:
         raise Cancelled("The estimate was stopped.",
                         f"Its best so far (loss {found.fit.evaluation.loss:.3g} m2) is in "
-                        "estimate.json, not in the mesh.", "Run it again to resume.")
+                        "estimate.json, not in the mesh.",
+                        "Run it again with --resume to start from there.")
     log.forget()
     return stage.result
+
+
+def _bases(folder: Path) -> dict[str, str]:
+    """Bases of reduced models in a folder: file name to checksum."""
+    return {path.name: file_digest(path) for path in sorted(folder.glob(_BASES))}
+
+
+def _finished_bases(branch: Branch) -> dict[str, str]:
+    """Bases that finished estimates left; others are removed, since a killed run wrote them."""
+    entry = branch.manifest.stages.get("estimate")
+    known = entry.result.get("bases", {}) if entry else {}
+    kept = {}
+    for name, digest in _bases(branch.folder).items():
+        if known.get(name) == digest:
+            kept[name] = digest
+        else:
+            (branch.folder / name).unlink()
+    return kept
 
 
 def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0,
@@ -173,7 +214,8 @@ def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptio
     """Run the stage."""
     if options.follow:
         return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
-    return estimate(inputs.branch_folder, settings, force=options.force, progress=progress)
+    return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,
+                    progress=progress)
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

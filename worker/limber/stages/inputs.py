@@ -35,7 +35,9 @@ class ParallelOptions(RunOptions):
 
     groups: ClassVar[Groups] = {"running": ("workers",)}
 
-    workers: int = Field(2, ge=1, le=64, description="Processes that work side by side.")
+    workers: int | None = Field(None, ge=1, description=(
+        "At most so many processes side by side; by default one a core (LIMBER_CORES). The result "
+        "is the same."))
 
 
 class NoOptions(Settings):

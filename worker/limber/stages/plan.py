@@ -45,7 +45,7 @@ class PlanInputs(BranchInputs):
     name: str = Field("path", description="Name of the plan's files.")
 
 
-def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: int = 2,
+def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: int | None = None,
          force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Plan paths on the branch's energy field.
 

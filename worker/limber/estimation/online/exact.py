@@ -5,15 +5,13 @@ its training did not go. One frame of the full model takes longer than a frame, 
 what it says of some frames corrects the reduced model's answers at all of them.
 """
 
-import signal
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.jobs.process import end_with_parent
+from limber.jobs import Pool
 from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
@@ -122,8 +120,8 @@ class Beside:
     """Runs an :class:`ExactSolver` in a process of its own; close it, or use it in a ``with``."""
 
     def __init__(self, branch: FullBranch):
-        self._pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"),
-                                         initializer=_begin, initargs=(branch,))
+        self._pool = Pool(1, begin=_begin, begin_arguments=(branch,),
+                          name="the full model beside an online estimate")
 
     def frame(self, *arguments: np.ndarray) -> "Future[ExactFrame | None]":
         return self._pool.submit(_frame, *arguments)
@@ -132,7 +130,7 @@ class Beside:
         return self._pool.submit(_basis, *arguments)
 
     def close(self) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool.close()
 
     def __enter__(self) -> "Beside":
         return self
@@ -167,9 +165,6 @@ _solver: list[ExactSolver] = []
 
 
 def _begin(branch: FullBranch) -> None:
-    end_with_parent()
-    # Ctrl-C reaches the whole group of processes; the parent ends this one in order.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _solver[:] = [ExactSolver(branch)]
 
 

@@ -1,6 +1,6 @@
 """fTetWild in a process of its own: it is slow, and a crash or a leak must not be ours.
 
-``python -m limber.geometry.tets.tetwild_process IN.npz OUT.npz`` is what :func:`run_tetwild`
+``python -m limber.geometry.tets.tetwild_process IN.npz OUT.npz PARENT`` is what :func:`run_tetwild`
 starts.
 """
 
@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import MeshingError, MissingDependencyError
+from limber.jobs.ending import end_by_kernel, kill_tree
+from limber.jobs.pool import memory_mb
 from limber.progress import SILENT, Progress
 
 
@@ -50,7 +52,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
         np.savez(source, vertices=vertices, faces=faces, edge_length=edge_length,
                  epsilon=epsilon, stop_energy=stop_energy, coarsen=coarsen)
         command = [sys.executable, "-m", "limber.geometry.tets.tetwild_process", str(source),
-                   str(target)]
+                   str(target), str(os.getpid())]
         # fTetWild uses TBB and OpenMP: one thread each, since a second one gains nothing.
         environment = os.environ | {"OMP_NUM_THREADS": "1",
                                     "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -62,7 +64,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
             message = process.stderr.read().decode(errors="replace").strip()
         finally:
             if process.poll() is None:
-                process.kill()
+                kill_tree(process.pid)
             process.wait()
             process.stderr.close()
         if process.returncode != 0 or not target.exists():
@@ -76,8 +78,6 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
 
 def _watch(process: subprocess.Popen, time_limit: float, memory_limit_mb: float,
            progress: Progress) -> None:
-    import psutil
-
     started = time.perf_counter()
     while True:
         try:
@@ -91,10 +91,7 @@ def _watch(process: subprocess.Popen, time_limit: float, memory_limit_mb: float,
             raise MeshingError(f"fTetWild was stopped after {seconds:.0f} s.",
                                "It had not finished within its time limit.",
                                "Raise --mesh-time-limit, or choose a coarser mesh.")
-        try:
-            used = psutil.Process(process.pid).memory_info().rss / 1e6
-        except psutil.NoSuchProcess:
-            continue
+        used = memory_mb(process.pid)
         if used > memory_limit_mb:
             raise MeshingError(f"fTetWild was stopped at {used:.0f} MB.",
                                "It went over its memory limit.",
@@ -112,7 +109,8 @@ def _load_tetrahedralize():
     return tetrahedralize
 
 
-def _main(source: str, target: str) -> None:
+def _main(source: str, target: str, parent_id: str) -> None:
+    end_by_kernel(int(parent_id))
     with np.load(source) as given:
         # The wrapper refuses integers for floats and arrays that are not its own.
         nodes, tets = _load_tetrahedralize()(
@@ -126,4 +124,4 @@ def _main(source: str, target: str) -> None:
 
 
 if __name__ == "__main__":
-    _main(sys.argv[1], sys.argv[2])
+    _main(*sys.argv[1:])

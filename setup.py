@@ -1,0 +1,31 @@
+"""Puts the add-on's modules into the wheel: `limber scene` has a process with bpy run them.
+
+Everything else stands in pyproject.toml.
+"""
+
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+ROOT = Path(__file__).parent
+
+
+class BuildWithAddon(build_py):
+    """Copies ``addon/`` to ``limber/scene/addon/``; a checkout, also an editable one, has it."""
+
+    def run(self):
+        super().run()
+        if self.editable_mode:
+            return
+        sources = sorted(p for p in (ROOT / "addon").rglob("*") if p.suffix in (".py", ".toml"))
+        if not sources:
+            raise FileNotFoundError("The folder addon/ is not beside setup.py; the wheel needs it.")
+        for source in sources:
+            target = Path(self.build_lib, "limber", "scene", "addon",
+                          source.relative_to(ROOT / "addon"))
+            self.mkpath(str(target.parent))
+            self.copy_file(str(source), str(target))
+
+
+setup(cmdclass={"build_py": BuildWithAddon})

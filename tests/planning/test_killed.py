@@ -1,0 +1,110 @@
+"""A killed command leaves no process, and its folder to the next run."""
+
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from limber.owner import is_owned_name
+from limber.store import Branch
+
+ROOT = Path(__file__).parents[2]
+KINDS = [pytest.param(kind, id=kind.name) for kind in (signal.SIGKILL, signal.SIGTERM)]
+pytestmark = [pytest.mark.skipif(os.name == "nt", reason="POSIX signals"),
+              pytest.mark.timeout(400)]
+
+
+@pytest.fixture
+def folder(planned_branch, tmp_path) -> Path:
+    shutil.copytree(planned_branch, tmp_path / "small.branch")
+    return tmp_path / "small.branch"
+
+
+def command(stage: str, *arguments: object) -> list[str]:
+    return [sys.executable, "-m", "limber", stage, *map(str, arguments), "--json", "--progress",
+            "json"]
+
+
+def run(stage: str, *arguments: object) -> dict:
+    done = subprocess.run(command(stage, *arguments), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def killed_at_work(program: list[str], kind: signal.Signals) -> int:
+    """Start a program, kill it once two processes of its pool compute; returns its exit code.
+
+    None of the processes that it had is left.
+    """
+    process = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                               cwd=ROOT, env=os.environ | {"LIMBER_CORES": "2"})
+    family = psutil.Process(process.pid)
+    deadline = time.monotonic() + 240
+    while sum(_computes(p) for p in family.children()) < 2:
+        assert process.poll() is None, "it ended before it was killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    started = family.children(recursive=True)
+    process.send_signal(kind)
+    code = process.wait(30)
+    _gone, alive = psutil.wait_procs(started, timeout=10)
+    assert not [p for p in alive if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+    return code
+
+
+def _computes(process: psutil.Process) -> bool:
+    """Whether it has loaded what it needs and works."""
+    try:
+        return process.cpu_times().user > 1.0
+    except psutil.NoSuchProcess:
+        return False
+
+
+def assert_clean(folder: Path) -> None:
+    Branch.open(folder, verify=True)
+    left = [p.name for p in folder.iterdir()
+            if is_owned_name(p.name) or p.name in (".commit", ".run.json")]
+    assert not left
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_killed_energy_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
+    """Earlier results stand; the next run sweeps what was left, and finds what it always finds."""
+    before = (folder / "energy.npz").read_bytes()
+    code = killed_at_work(command("energy", folder, "--samples", 400), kind)
+    assert code == (130 if kind == signal.SIGTERM else -kind)
+    assert (folder / "energy.npz").read_bytes() == before
+    run("energy", folder, "--samples", "60", "--force")
+    assert_clean(folder)
+    with np.load(folder / "energy.npz") as now, np.load(io.BytesIO(before)) as then:
+        assert {name: now[name].tobytes() for name in then} == {
+            name: then[name].tobytes() for name in then}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_killed_plan_leaves_no_process_and_a_folder_to_go_on_with(folder, kind):
+    """While both paths are solved on the full model."""
+    ask = (folder, "--start-seed", "3", "--iterations", "800", "--name", "new")
+    before = Branch.open(folder).names("plans")
+    killed_at_work(command("plan", *ask), kind)
+    assert Branch.open(folder, verify=True).names("plans") == before
+    run("plan", *ask)
+    assert_clean(folder)
+    assert len(Branch.open(folder).names("plans")) > len(before)
+
+
+@pytest.mark.slow
+def test_a_killed_bench_leaves_no_process():
+    killed_at_work([sys.executable, "-m", "benchmarks.table", "estimation", "--quick"],
+                   signal.SIGKILL)

@@ -1,0 +1,28 @@
+"""Whether a branch folder's files are as they were written."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from limber.cli import Run, stage_command
+from limber.store import Branch, damage_error, unlisted
+
+
+@stage_command("verify")
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+def command(run: Run, branch_folder: Path) -> dict[str, Any]:
+    """Compare every file of a branch folder with its checksum; exit code 2 if one is damaged.
+
+    Files that no stage wrote, and recordings that were cut off, are named too; they are no
+    damage.
+    """
+    branch = Branch.open(branch_folder)
+    run.progress(0.0, "comparing with checksums")
+    damages = branch.damages()
+    if damages:
+        raise damage_error(branch.folder, damages, shown_count=len(damages))
+    return {"uuid": branch.uuid, "file_count": len(branch.manifest.files),
+            "byte_count": sum(entry.bytes for entry in branch.manifest.files.values()),
+            "unlisted": unlisted(branch.folder, branch.manifest),
+            "unfinished_streams": branch.streams()}
