@@ -103,6 +103,7 @@ def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
             for key, about in data.info["paths"].items()]
     keys += [("goal", _goal_words(data.info.get("goal") or {}), "", dot),
              ("grasp", "grasp", "", dot),
+             ("targets", ", ".join(data.info.get("targets") or ()), "", dot),
              ("control_points", "control points", "", dot), ("rest", "rest shape", "", dot),
              ("base", "fixed base", "", dot)]
     for name, words, note, (width, height) in keys:

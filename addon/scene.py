@@ -181,7 +181,8 @@ def _add_points(shown: ShownBranch, data: SceneData) -> None:
         material = materials.plain_material(title, COLORS[name], roughness=0.35)
         shown.objects[name] = []
         for number, point in enumerate(points):
-            thing = add_object(shown.collection, f"{title} {number + 1}", ball, material)
+            named = data.info["targets"][number] if name == "targets" else number + 1
+            thing = add_object(shown.collection, f"{title} {named}", ball, material)
             thing.location = point
             thing.scale = [data.arrays[f"{name}_radius"][number]] * 3
             shown.objects[name].append(thing)

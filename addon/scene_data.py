@@ -156,8 +156,11 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     wanted = [f"{kind}:{name}" for name in info["scalars"] for kind in ("scalar", "color")]
     wanted += [f"path:{name}" for name in info["paths"]]
     wanted += [f"frame_scalar:{name}" for name in info.get("frame_scalars") or {}]
-    wanted += ["control_points_radius"] * ("control_points" in arrays)
-    wanted += ["grasp_radius"] * ("grasp" in arrays)
+    if len(arrays.get("targets", ())) != len(info.get("targets") or ()):
+        return "the targets do not fit their names"
+    for name in ("grasp", "control_points", "targets"):
+        wanted += [f"{name}_radius"] * (name in arrays)
+        wanted += [f"{name}_motion"] * (name in arrays and bool(info.get("frames")))
     missing = [name for name in wanted if name not in arrays]
     if missing:
         return f"{missing[0]} is missing"

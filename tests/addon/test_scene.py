@@ -127,6 +127,24 @@ def test_a_motion_plays_in_its_own_time(bpy, addon, beam, write_pc2, positions, 
     assert scene.frame_end >= 1 + times[-1] * fps > scene.frame_end - 1
 
 
+def test_targets_go_with_the_branch(bpy, addon, beam, tmp_path):
+    """A named target is a ball of that name that follows its place on the branch."""
+    from limber.mechanics.loaded import NamedTarget
+    from limber.scene.data import scene_data
+    from limber.store import Branch
+
+    scenes = importlib.import_module("limber_addon.scene")
+    reader = importlib.import_module("limber_addon.scene_data")
+    flower = NamedTarget("flower", (0.0, 0.0, 0.5))
+    scene_data(Branch.open(beam.folder), targets=[flower]).write(tmp_path / "data.npz")
+    shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
+    (thing,) = shown.objects["targets"]
+    assert thing.name == "Target flower"
+    np.testing.assert_allclose(thing.location, flower.position, atol=1e-4)
+    bpy.context.scene.frame_set(6)
+    assert thing.location.x == pytest.approx(0.25, abs=0.02), "bent by the square of its height"
+
+
 def test_skeleton_is_drawn_with_its_radii(bpy, addon, beam, tmp_path):
     """Lines from each node to its parent, radii as attribute, hidden until they are wanted."""
     from limber.geometry.skeleton.skeleton import Skeleton

@@ -57,6 +57,7 @@ def _set(arrays, name, value):
     (lambda d: d.info["frames"].update(count=99), "frames"),
     (lambda d: d.arrays.pop("vertices"), "vertices"),
     (lambda d: d.arrays.pop("grasp_radius"), "grasp_radius"),
+    (lambda d: d.info.update(targets=["flower"]), "targets"),
     (lambda d: _set(d.arrays, "vertices", np.nan), "not finite"),
     (lambda d: _set(d.arrays, "faces", 10**6), "do not index"),
     (lambda d: _set(d.arrays, "faces", -1), "do not index"),

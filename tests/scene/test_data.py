@@ -261,3 +261,18 @@ def test_the_map_offset_is_kept_in_double_precision(tmp_path, mesh):
     data = scene_data(branch)
     np.testing.assert_allclose(data.info["map_offset"], [32612345.678901, 5812345.123456, 71.5],
                                rtol=0, atol=1e-6)
+
+
+def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
+    """What `limber target` wrote is in the file that the add-on opens."""
+    from limber.stages.scene import scene
+
+    targets = {"targets": [{"name": "flower", "position_m": [0.0, 0.0, 0.4], "mass_kg": 0.01}]}
+    _branch(tmp_path / "a.branch", mesh.with_data(
+        cell_data={"young": np.full(mesh.tet_count, 1e8)}),
+        target={"targets.json": json.dumps(targets)})
+    scene(tmp_path / "a.branch", data_path=tmp_path / "data.npz")
+    with np.load(tmp_path / "data.npz", allow_pickle=False) as content:
+        assert json.loads(str(content["info"]))["targets"] == ["flower"]
+        np.testing.assert_allclose(content["targets"], [[0.0, 0.0, 0.4]])
+        assert content["targets_radius"].shape == (1,)

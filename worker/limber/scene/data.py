@@ -39,10 +39,13 @@ scan's file to branch), ``map_offset`` (the branch's origin in the scan's coordi
 precision) and ``source``.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.frames import node_average
+from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import FORMAT, SceneData
 from limber.scene.motion import add_motion, add_observation
 from limber.scene.paths import add_hemisphere, add_plan
@@ -51,6 +54,7 @@ from limber.scene.shape import (
     add_marks,
     add_scalar,
     add_skeleton,
+    add_targets,
     add_view,
     alignment,
     map_offset,
@@ -60,12 +64,14 @@ from limber.store import Branch
 __all__ = ["FORMAT", "SceneData", "scene_data"]
 
 
-def scene_data(branch: Branch, plan: str | None = None, motion: str | None = None) -> SceneData:
+def scene_data(branch: Branch, plan: str | None = None, motion: str | None = None,
+               targets: Sequence[NamedTarget] = ()) -> SceneData:
     """Gather what there is to show of ``branch``.
 
     Args:
         plan: Which path; the newest by default.
         motion: Which frames; the plan's by default, else the newest.
+        targets: Named places on the branch.
 
     Raises:
         BranchFolderError: no mesh yet, no such plan or frames, or frames of another mesh.
@@ -85,6 +91,7 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     add_cloud(data, branch)
     add_skeleton(data, branch)
     add_marks(data, mesh, used)
+    add_targets(data, targets)
     plan = add_plan(data, branch, plan)
     add_hemisphere(data, branch)
     add_motion(data, branch, plan, motion)

@@ -1,6 +1,7 @@
 """What stands still in a scene: surface values, the scan, the skeleton, marks and the view."""
 
 import csv
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from limber.geometry.cloud.cloud import read_cloud
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of, linear_of
 from limber.store import Branch
@@ -96,6 +98,14 @@ def add_marks(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:
             radius = np.linalg.norm((fixed - middle)[:, :2], axis=1).max()
             data.info["base"] = {"centre_m": middle, "top_m": fixed[:, 2].max(),
                                  "radius_m": radius}
+
+
+def add_targets(data: SceneData, targets: Sequence[NamedTarget]) -> None:
+    """Add named places, in their order; ``info["targets"]`` names them."""
+    data.info["targets"] = [target.name for target in targets]
+    if targets:
+        data.arrays["targets"] = np.array([target.position for target in targets], float)
+        add_radii(data, "targets", 0.014)
 
 
 def add_radii(data: SceneData, name: str, share: float) -> None:

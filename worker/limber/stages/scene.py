@@ -65,12 +65,14 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
     """
     from limber.scene.blender import make_scene
     from limber.scene.data import scene_data
+    from limber.stages.loading import load_targets
 
     if (output is None) == (data_path is None):
         raise InputError("Neither or both of --output and --data were given.",
                          "One says what to make.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
-    data = scene_data(Branch.open(branch_folder), plan, motion)
+    branch = Branch.open(branch_folder)
+    data = scene_data(branch, plan, motion, load_targets(branch))
     if color not in data.info["scalars"]:
         raise InputError(f"The branch has no {color} to show.",
                          f"It has: {', '.join(data.info['scalars'])}.",
