@@ -31,6 +31,19 @@ def point_operator(mesh: TetMesh, rest_points: np.ndarray) -> sparse.csr_matrix:
     return sparse.kron(scalar + _stalks(mesh, points, outside), sparse.identity(3), format="csr")
 
 
+def nearest_inside(mesh: TetMesh, points: np.ndarray) -> np.ndarray:
+    """Return the places of a mesh that are nearest to points [m], shape [m, 3]."""
+    from trimesh.triangles import closest_point
+
+    nearest = np.array(points, float)
+    corners = mesh.nodes[mesh.surface_faces()]
+    outside = np.linalg.norm(_located(mesh, nearest)[2], axis=1) > 0
+    for number in np.flatnonzero(outside):
+        feet = closest_point(corners, np.tile(nearest[number], (len(corners), 1)))
+        nearest[number] = feet[np.linalg.norm(feet - nearest[number], axis=1).argmin()]
+    return nearest
+
+
 def _stalks(mesh: TetMesh, points: np.ndarray, outside: np.ndarray) -> sparse.csr_matrix:
     """What the turn of the section adds to a point that lies off it, shape [m, n]."""
     size = np.linalg.norm(outside, axis=1)

@@ -25,6 +25,9 @@ from limber.store import Branch
 
 Warn = Callable[[str], None]
 
+TARGETS_FORMAT = 1
+"""Version of ``targets.json``."""
+
 
 def load_mesh(branch: Branch) -> TetMesh:
     """Return the branch's tetrahedra.
@@ -57,10 +60,17 @@ def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
-    """Return the named places on the branch, as `limber target` has written them."""
+    """Return the named places on the branch, as `limber target` has written them.
+
+    Raises:
+        InputError: the file is of a newer program.
+    """
     if not branch.has("targets.json"):
         return ()
     known = json.loads(branch.path("targets.json").read_text(encoding="utf-8"))
+    if known.get("format_version") != TARGETS_FORMAT:
+        raise InputError(f"{branch.folder}/targets.json has format {known.get('format_version')}.",
+                         f"This program knows format {TARGETS_FORMAT}.", "Update Limber.")
     return tuple(NamedTarget(t["name"], tuple(t["position_m"]), t["mass_kg"])
                  for t in known["targets"])
 

@@ -73,8 +73,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
     digests = energy_inputs(grasp_model)
     if energy_stage.reads != digests:
         raise BranchFolderError(
-            "The energy field is of another mesh or another Young's modulus.",
-            "The branch was reconstructed or estimated anew since `limber energy` ran.",
+            "The energy field is of another mesh, material, weight or of other targets.",
+            "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
             "Run `limber energy` again.")
     key = f"plan:{name}"
     inputs = {"reads": ["energy.npz"], "digests": digests}
