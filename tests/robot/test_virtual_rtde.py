@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError, WorkError
-from limber.robot.virtual import rtde
+from limber.robot import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import answer
 from limber.robot.virtual.launch import VirtualRobot
@@ -183,6 +183,7 @@ def test_the_real_client_moves_it(robot):
         dashboard.connect()
         assert dashboard.running() and dashboard.robotmode() == "Robotmode: RUNNING"
         dashboard.stop()
+        io.disconnect()
         time.sleep(0.1)
         assert not control.moveL(off(*here), 0.1, 0.5)
         assert robot.state["program"] == "STOPPED"

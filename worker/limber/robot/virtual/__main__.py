@@ -1,10 +1,13 @@
 """``python -m limber.robot.virtual``: the process that :class:`VirtualRobot` starts."""
 
 import argparse
+import json
 import sys
+from pathlib import Path
 
 from limber.errors import LimberError
 from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.held_branch import BranchSetting, HeldBranch
 from limber.robot.virtual.launch import serve
 
 
@@ -18,11 +21,16 @@ def main() -> int:
     parser.add_argument("--centre", type=float, nargs=3, default=(0.0, 0.0, 0.0), help="m")
     parser.add_argument("--ft300", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--branch", type=Path, help="JSON file of a BranchSetting")
     options = parser.parse_args()
     try:
+        load = None
+        if options.branch is not None:
+            known = json.loads(options.branch.read_text(encoding="utf-8"))
+            load = HeldBranch(BranchSetting(**{**known, "mesh": Path(known["mesh"])}))
         controller = Controller(options.model, joints=options.joints, mass=options.mass,
                                 centre=tuple(options.centre), seed=options.seed,
-                                ft300=options.ft300)
+                                ft300=options.ft300, load=load)
         serve(controller, options.address, control=True)
     except LimberError as error:
         print(f"error: {error}", file=sys.stderr)

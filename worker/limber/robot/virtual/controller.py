@@ -58,12 +58,55 @@ class Load(Protocol):
         """Return force and torque of the load on the flange, flange frame, shape [6]."""
         ...
 
+    def grasp(self) -> None:
+        """Close the gripper."""
+        ...
+
+    def release(self) -> None:
+        """Open the gripper."""
+        ...
+
+    def lose(self, how: str) -> None:
+        """Lose what is held: ``slipped`` or ``broken``."""
+        ...
+
+    def slide(self, part: float) -> None:
+        """Let what is held slide back by a part of its way."""
+        ...
+
+    def report(self) -> dict[str, Any]:
+        """Return the state of what is held, as plain data."""
+        ...
+
+    def close(self) -> None:
+        """End what simulates it."""
+        ...
+
 
 class Nothing:
-    """The gripper is empty."""
+    """There is nothing to hold."""
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         return np.zeros(6)
+
+    def grasp(self) -> None:
+        raise InputError("There is no branch.", "The gripper closes on nothing.",
+                         "Give the virtual robot a branch.")
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+    def lose(self, how: str) -> None:
+        """Nothing is held."""
+
+    def slide(self, part: float) -> None:
+        """Nothing is held."""
+
+    def report(self) -> dict[str, Any]:
+        return {"branch": "none"}
+
+    def close(self) -> None:
+        """There is nothing to end."""
 
 
 @dataclass
@@ -124,7 +167,7 @@ class Controller:
         self.inputs: dict[str, Any] = {}
         self.outputs_int = [0] * 48
         self.outputs_double = [0.0] * 48
-        self.digital_outputs = 0
+        self.digital_outputs, self.gripper_output = 0, 0
         self.analog_outputs = [0.0, 0.0]
         self.history: deque[np.ndarray] = deque(maxlen=100)
         self.log: deque[str] = deque(maxlen=200)
@@ -299,7 +342,20 @@ class Controller:
     def _write_digital(self, values: dict[str, Any], name: str, first: int) -> None:
         mask = int(values.get(f"{name}_mask", 0)) << first
         wanted = int(values.get(name, 0)) << first
-        self.digital_outputs = self.digital_outputs & ~mask | wanted & mask
+        before, self.digital_outputs = (
+            self.digital_outputs, self.digital_outputs & ~mask | wanted & mask)
+        changed = before ^ self.digital_outputs
+        if changed >> self.gripper_output & 1:
+            self._drive_gripper(bool(self.digital_outputs >> self.gripper_output & 1))
+
+    def _drive_gripper(self, close: bool) -> None:
+        if not close:
+            self.load.release()
+            return
+        try:
+            self.load.grasp()
+        except InputError as error:
+            self.say(f"gripper: {error}")
 
     def _check_watchdog(self) -> None:
         """End a program whose client no longer writes: after the asked time, at least a step."""
@@ -346,7 +402,7 @@ class Controller:
 
 def _steady() -> dict[str, Any]:
     """Outputs that this controller does not model: plausible constants."""
-    from limber.robot.virtual.rtde import OUTPUT_TYPES
+    from limber.robot.rtde import OUTPUT_TYPES
 
     fill = {"VECTOR6D": (0.0,) * 6, "VECTOR3D": (0.0,) * 3, "VECTOR6INT32": (253,) * 6,
             "DOUBLE": 0.0, "BOOL": False}

@@ -138,7 +138,12 @@ def serve(controller: Controller, address: str, *, control: bool = False,
     try:
         loop.run_until_complete(_serve(server, control, seconds, say))
     finally:
+        controller.load.close()
         loop.run_until_complete(server.close())
+        left = asyncio.all_tasks(loop)
+        for task in left:
+            task.cancel()
+        loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
         loop.close()
     return server
 
@@ -205,7 +210,8 @@ def state_of(server: Server) -> dict[str, Any]:
             "mode": controller.robot_mode.name, "program": controller.runtime_state.name,
             "remote": controller.remote, "slider": controller.slider,
             "payload": controller.payload, "outputs": controller.digital_outputs,
-            "lost_seconds": server.lost_seconds, "log": list(controller.log)[-20:],
+            **controller.load.report(), "lost_seconds": server.lost_seconds,
+            "log": list(controller.log)[-20:],
             "wall": time.time()}
 
 
@@ -238,5 +244,9 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "reset_emergency": lambda server: server.controller.reset_emergency(),
     "local": lambda server: server.controller.set_remote(False),
     "remote": lambda server: server.controller.set_remote(True),
+    "grasp": lambda server: server.controller.load.grasp(),
+    "release": lambda server: server.controller.load.release(),
+    "break": lambda server: server.controller.load.lose("broken"),
+    "slip": lambda server, part: server.controller.load.slide(part),
     "stop_program": lambda server: server.controller.stop_program("test"),
 }

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 from limber.errors import InputError, WorkError
-from limber.robot.virtual import rtde
+from limber.robot import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import GREETING, answer
 

@@ -1,0 +1,176 @@
+"""The branch in the virtual gripper: its stiffness by differences, its force by statics."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.subjects.meshes import box_mesh
+
+from limber.mechanics import BranchModel, Grasp, solve_static
+from limber.robot.kinematics import inverted, matrices
+from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.held_branch import BranchSetting, HeldBranch, grasp_stiffness
+from limber.robot.virtual.launch import VirtualRobot
+
+TIP = np.array([0.0, 0.0, 0.3])
+
+
+@pytest.fixture(scope="module")
+def beam():
+    """A square beam of 10 mm, 0.32 m long, upright."""
+    mesh = box_mesh((0.010, 0.010, 0.32), (1, 1, 24))
+    count = mesh.tet_count
+    return mesh.with_data(cell_data={"young": np.full(count, 5e7), "poisson": np.full(count, 0.3),
+                                     "density": np.full(count, 900.0)})
+
+
+@pytest.fixture(scope="module")
+def setting(beam, tmp_path_factory) -> BranchSetting:
+    """The home pose of a UR5e holds its gripper at the beam's tip."""
+    path = tmp_path_factory.mktemp("truth") / "beam.vtu"
+    middle = beam.nodes[:, :2].mean(axis=0)
+    beam.write(path)
+    grasp = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
+    gripper = Controller("ur5e").flange @ matrices(np.array(grasp))
+    base = np.zeros(6)
+    base[:3] = np.r_[middle, TIP[2]] - gripper[:3, 3]
+    point = (float(middle[0]), float(middle[1]), 0.2)
+    return BranchSetting(path, tuple(base), grasp, points=(point,))
+
+
+def model_of(beam) -> BranchModel:
+    data = beam.cell_data
+    return BranchModel(beam, young=data["young"], poisson=data["poisson"], density=data["density"],
+                       gravity=(0.0, 0.0, 0.0))
+
+
+def test_stiffness_is_the_slope_of_the_wrench(beam):
+    """Against central differences, at a bent and turned pose."""
+    from scipy.spatial.transform import Rotation
+
+    model = model_of(beam)
+    middle = np.r_[beam.nodes[:, :2].mean(axis=0), TIP[2]]
+    grasp = Grasp.at(beam, middle, 0.012)
+    pose = grasp.rest_pose + [0.04, 0.02, -0.005, 0.05, 0.1, 0.02]
+    bent = solve_static(model, grasp=grasp, pose=pose).require()
+    stiffness = grasp_stiffness(model, grasp, bent.displacement)
+    for k in range(6):
+        step = 1e-5
+        wrenches = []
+        for sign in (-1, 1):
+            moved = pose.copy()
+            if k < 3:
+                moved[k] += sign * step
+            else:
+                turn = Rotation.from_rotvec(sign * step * np.eye(3)[k - 3])
+                moved[3:] = (turn * Rotation.from_rotvec(pose[3:])).as_rotvec()
+            result = solve_static(model, grasp=grasp, pose=moved,
+                                  start=bent.displacement).require()
+            wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
+        slope = (wrenches[1] - wrenches[0]) / (2 * step)
+        assert stiffness[:, k] == pytest.approx(slope, abs=2e-3 * np.abs(stiffness[:, k]).max())
+
+
+@pytest.fixture
+def held(setting):
+    branch = HeldBranch(setting)
+    yield branch
+    branch.close()
+
+
+def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
+    """After a way of 30 mm the wrench at the flange is that of an own solution there."""
+    flange = Controller("ur5e").flange
+    assert held.wrench(flange, 0.002) == pytest.approx(np.zeros(6))
+    held.grasp()
+    assert held.wrench(flange, 0.002) == pytest.approx(np.zeros(6), abs=1e-6)
+    moved = flange.copy()
+    for part in np.linspace(0, 1, 40):
+        moved[:3, 3] = flange[:3, 3] + part * np.array([0.0, 0.03, 0.0])
+        held.wrench(moved, 0.002)
+    for _ in range(200):
+        felt = held.wrench(moved, 0.002)
+        if np.allclose(held._solution.frame[:3, 3], (held._gripper @ held._offset)[:3, 3]):
+            break
+        held._pipe.poll(0.05)
+    model = model_of(beam)
+    base = matrices(np.array(setting.base_pose))
+    gripper = base @ moved @ matrices(np.array(setting.grasp_pose))
+    grasp = Grasp.at(beam, np.array([*beam.nodes[:, :2].mean(axis=0), TIP[2]]), setting.jaw)
+    pose = grasp.rest_pose + [0, 0.03, 0, 0, 0, 0]
+    result = solve_static(model, grasp=grasp, pose=pose).require()
+    # By hand: the opposite wrench, taken to the flange and its axes.
+    rotation = (base @ moved)[:3, :3]
+    force = -rotation.T @ result.reaction_force
+    lever = inverted(base @ moved) @ np.r_[pose[:3], 1.0]
+    torque = -rotation.T @ result.reaction_torque + np.cross(lever[:3], force)
+    assert felt == pytest.approx(np.r_[force, torque], rel=1e-4, abs=1e-5)
+    assert np.linalg.norm(result.reaction_force) > 0.5
+    assert gripper[:3, 3] == pytest.approx(pose[:3], abs=2e-3)
+    assert held.points[0, 1] > held.rest_points[0, 1] + 0.01
+    held.lose("broken")
+    assert held.wrench(moved, 0.002) == pytest.approx(np.zeros(6))
+
+
+def test_sliding_in_the_grip_lets_the_force_fall(held):
+    flange = Controller("ur5e").flange
+    held.wrench(flange, 0.002)
+    held.grasp()
+    moved = flange.copy()
+    moved[1, 3] += 0.01
+    for _ in range(50):
+        held.wrench(moved, 0.002)
+        held._pipe.poll(0.05)
+    before = np.linalg.norm(held.wrench(moved, 0.002)[:3])
+    held.slide(0.5)
+    after = np.linalg.norm(held.wrench(moved, 0.002)[:3])
+    assert 0.3 * before < after < 0.7 * before
+
+
+def test_closing_on_nothing_is_told(held):
+    from limber.errors import InputError
+
+    far = Controller("ur5e").flange.copy()
+    far[2, 3] += 0.3
+    held.wrench(far, 0.002)
+    with pytest.raises(InputError, match="closes on nothing"):
+        held.grasp()
+    assert held.state == "free"
+
+
+def test_the_real_client_feels_the_branch(setting, tmp_path, worker_address):
+    """Closed by a digital output, pulled by moveL, felt in the TCP force, opened again."""
+    import time
+
+    rtde_control = pytest.importorskip("rtde_control")
+    import rtde_io
+    import rtde_receive
+
+    path = tmp_path / "setting.json"
+    path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")
+    with VirtualRobot("ur5e", worker_address, ["--branch", path]) as robot:
+        receive = rtde_receive.RTDEReceiveInterface(worker_address)
+        control = rtde_control.RTDEControlInterface(worker_address)
+        io = rtde_io.RTDEIOInterface(worker_address)
+        try:
+            assert control.zeroFtSensor()
+            assert io.setStandardDigitalOut(0, True)
+            time.sleep(0.5)
+            assert robot.state["branch"] == "held"
+            start = receive.getActualTCPPose()
+            assert control.moveL([start[0], start[1] + 0.03, *start[2:]], 0.05, 0.5)
+            time.sleep(0.5)
+            state = robot.state
+            force = np.mean([receive.getActualTCPForce() for _ in range(20)
+                             if time.sleep(0.005) is None], axis=0)
+            # The branch pulls back; the robot's base is not turned against the branch here.
+            assert force[:3] == pytest.approx(-np.array(state["true_wrench"])[:3], abs=0.3)
+            assert abs(force[1]) > 0.5 and state["solve_s"] < 1.0
+            assert io.setStandardDigitalOut(0, False)
+            time.sleep(0.2)
+            assert robot.state["branch"] == "free"
+            assert np.linalg.norm(receive.getActualTCPForce()[:3]) < 1.5
+        finally:
+            io.disconnect()
+            control.disconnect()
+            receive.disconnect()

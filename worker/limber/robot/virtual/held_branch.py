@@ -1,0 +1,308 @@
+"""The branch in the virtual gripper: its reaction is what the virtual sensor feels.
+
+A process of its own solves the branch at the newest pose of the gripper, over and over. Between
+two solutions the wrench is extrapolated by the tangent stiffness at the last one, so the arm's
+loop never waits: the reaction is late by nothing and off by the curvature of the branch's force
+over the way moved since. How old the solution is and how long one takes is part of the robot's
+state.
+"""
+
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.jobs.process import end_with_parent
+from limber.robot.kinematics import inverted, matrices
+from limber.robot.virtual.kernels import crossed, rotation_vector
+
+
+@dataclass(frozen=True)
+class BranchSetting:
+    """Which branch stands where beside the virtual robot.
+
+    Attributes:
+        mesh: File of the true branch: tetrahedra with ``young``, ``poisson``, ``density`` and
+            ``fixed``, as it hangs.
+        base_pose: The robot's base in the branch's frame [m, rad], shape [6].
+        grasp_pose: The gripper's middle in the flange's frame [m, rad], shape [6].
+        points: Points of the branch that are seen (markers), [m], shape [n, 3].
+        gravity: In the branch's frame [m/s^2], or zeros for a branch without weight.
+        jaw: Half width of what the gripper takes hold of along the branch [m].
+        grip: Force that the grip bears before the branch slips out [N].
+        break_strain: Greatest principal strain that the branch bears.
+    """
+
+    mesh: Path
+    base_pose: tuple[float, ...]
+    grasp_pose: tuple[float, ...]
+    points: tuple[tuple[float, float, float], ...] = ()
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    jaw: float = 0.012
+    grip: float = 80.0
+    break_strain: float = 0.2
+
+
+@dataclass
+class Solution:
+    """The branch at one pose of the held patch.
+
+    Attributes:
+        frame: Of the patch, branch frame, shape [4, 4].
+        wrench: Of the gripper on the branch, about the patch's position, branch frame [N, N m].
+        stiffness: Its derivative to position and rotation, shape [6, 6].
+        points: Seen points [m], shape [n, 3].
+        peak_strain: Greatest principal strain.
+        seconds: What it took.
+        converged: Whether it is an equilibrium; if not, the rest is of the last one.
+    """
+
+    frame: np.ndarray
+    wrench: np.ndarray
+    stiffness: np.ndarray
+    points: np.ndarray
+    peak_strain: float
+    seconds: float
+    converged: bool
+
+
+class HeldBranch:
+    """What the gripper holds: a branch, once it is closed on it."""
+
+    def __init__(self, setting: BranchSetting):
+        self.setting = setting
+        self._base = matrices(np.asarray(setting.base_pose, float))
+        self._tool = matrices(np.asarray(setting.grasp_pose, float))
+        context = get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_solve_for_ever, args=(setting, theirs),
+                                        name="branch", daemon=True)
+        self._process.start()
+        theirs.close()
+        self.rest_points = self._receive("ready")["points"]
+        self.state = "free"
+        self._offset = np.eye(4)
+        self._solution: Solution | None = None
+        self._busy, self._age = False, 0.0
+        self._gripper = np.eye(4)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Where the seen points are [m], shape [n, 3]."""
+        return self._solution.points if self._solution is not None else self.rest_points
+
+    def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
+        """Return what the branch exerts on the flange, flange frame, shape [6]."""
+        self._gripper = self._base @ flange @ self._tool
+        if self.state != "held":
+            return np.zeros(6)
+        self._age += seconds
+        patch = self._gripper @ self._offset
+        self._exchange(patch)
+        solution = self._solution
+        if solution is None:
+            return np.zeros(6)
+        if solution.peak_strain > self.setting.break_strain:
+            self.lose("broken")
+            return np.zeros(6)
+        change = np.concatenate((patch[:3, 3] - solution.frame[:3, 3], rotation_vector(
+            patch @ inverted(solution.frame))))
+        on_branch = solution.wrench + solution.stiffness @ change
+        if np.linalg.norm(on_branch[:3]) > self.setting.grip:
+            self.lose("slipped")
+            return np.zeros(6)
+        return self._at_flange(-on_branch, patch, flange)
+
+    def grasp(self) -> None:
+        """Close the gripper where it is.
+
+        Raises:
+            InputError: the branch is not between its jaws.
+        """
+        position = self._gripper[:3, 3]
+        self._flush()
+        self._pipe.send(("grasp", tuple(position)))
+        answer = self._receive("grasped")
+        if "error" in answer:
+            raise InputError(answer["error"], "The gripper closes on nothing.",
+                             "Move it onto the branch.")
+        rest = np.eye(4)
+        rest[:3, 3] = answer["centre"]
+        self._offset = inverted(self._gripper) @ rest
+        self._solution, self._busy, self._age = answer["solution"], False, 0.0
+        self.state = "held"
+
+    def release(self) -> None:
+        """Open the gripper: the branch goes back to rest."""
+        self.lose("free")
+
+    def lose(self, how: str) -> None:
+        """The branch is no longer held: ``free``, ``slipped`` or ``broken``."""
+        self.state, self._solution = how, None
+
+    def slide(self, part: float) -> None:
+        """Let the branch slide back in the grip by ``part`` of the way it was pulled."""
+        if self._solution is None:
+            return
+        step = np.linalg.solve(self._solution.stiffness[:3, :3], self._solution.wrench[:3])
+        moved = np.eye(4)
+        moved[:3, 3] = -part * step
+        self._offset = inverted(self._gripper) @ moved @ self._gripper @ self._offset
+
+    def close(self) -> None:
+        """End the solver."""
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+
+    def report(self) -> dict[str, Any]:
+        """Return its state as plain data."""
+        solution = self._solution
+        told: dict[str, Any] = {"branch": self.state, "solution_age_s": self._age,
+                                "points": self.points.tolist()}
+        if solution is not None:
+            told |= {"solve_s": solution.seconds, "peak_strain": solution.peak_strain,
+                     "converged": solution.converged, "true_wrench": solution.wrench.tolist()}
+        return told
+
+    def _exchange(self, patch: np.ndarray) -> None:
+        if self._busy and self._pipe.poll():
+            self._solution = self._pipe.recv()[1]
+            self._busy, self._age = False, 0.0
+        if not self._busy:
+            self._pipe.send(("solve", patch))
+            self._busy = True
+
+    def _flush(self) -> None:
+        if self._busy:
+            self._pipe.recv()
+            self._busy = False
+
+    def _receive(self, kind: str) -> dict[str, Any]:
+        try:
+            got, content = self._pipe.recv()
+        except EOFError as error:
+            raise InputError(f"The branch {self.setting.mesh} cannot be held: its solver ended.",
+                             "See what it printed.") from error
+        assert got == kind
+        return content
+
+    def _at_flange(self, wrench: np.ndarray, patch: np.ndarray, flange: np.ndarray) -> np.ndarray:
+        """A wrench at the patch, branch frame, as one at the flange in its frame."""
+        rotation = (self._base[:3, :3] @ flange[:3, :3]).T
+        force, torque = rotation @ wrench[:3], rotation @ wrench[3:]
+        origin = self._base[:3, :3] @ flange[:3, 3] + self._base[:3, 3]
+        lever = rotation @ (patch[:3, 3] - origin)
+        return np.concatenate((force, torque + crossed(lever, force)))
+
+
+def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
+    end_with_parent()
+    solver = _Solver(setting)
+    pipe.send(("ready", {"points": solver.seen()}))
+    while True:
+        try:
+            kind, content = pipe.recv()
+        except EOFError:
+            return
+        if kind == "grasp":
+            pipe.send(("grasped", solver.grasp(np.array(content))))
+        else:
+            pipe.send(("solved", solver.solve(content)))
+
+
+class _Solver:
+    """The branch in its process."""
+
+    def __init__(self, setting: BranchSetting):
+        from limber.geometry.tets.tet_mesh import TetMesh
+        from limber.mechanics.model import BranchModel
+        from limber.recordings.points import point_operator
+
+        mesh = TetMesh.read(setting.mesh)
+        data = mesh.cell_data
+        model = BranchModel(mesh, young=data["young"], poisson=data["poisson"],
+                            density=data["density"], gravity=setting.gravity)
+        self._setting = setting
+        self._model = model.as_scanned() if np.any(setting.gravity) else model
+        self._points = np.asarray(setting.points, float).reshape(-1, 3)
+        self._operator = point_operator(mesh, self._points) if len(self._points) else None
+        self._grasp = None
+        self._state = np.zeros_like(mesh.nodes)
+        self._last: Solution | None = None
+
+    def seen(self) -> np.ndarray:
+        """Where the seen points are now [m], shape [n, 3]."""
+        if self._operator is None:
+            return self._points
+        return self._points + (self._operator @ self._state.ravel()).reshape(-1, 3)
+
+    def grasp(self, position: np.ndarray) -> dict[str, Any]:
+        from limber.mechanics.grasp import Grasp
+
+        self._state = np.zeros_like(self._model.mesh.nodes)
+        self._last = None
+        try:
+            self._grasp = Grasp.at(self._model.mesh, position, self._setting.jaw)
+        except InputError as error:
+            return {"error": error.seen}
+        frame = np.eye(4)
+        frame[:3, 3] = self._grasp.centre
+        return {"centre": self._grasp.centre, "solution": self.solve(frame)}
+
+    def solve(self, patch: np.ndarray) -> Solution:
+        """Return the solution at a frame of the patch; the last one where there is none."""
+        from limber.mechanics.statics.solve import solve_static
+        from limber.mechanics.strain import strain_state
+
+        pose = np.r_[patch[:3, 3], rotation_vector(patch)]
+        result = solve_static(self._model, grasp=self._grasp, pose=pose, start=self._state)
+        if not result.converged and self._last is not None:
+            last = self._last
+            self._last = Solution(last.frame, last.wrench, last.stiffness, last.points,
+                                  last.peak_strain, result.seconds, False)
+            return self._last
+        self._state = result.displacement
+        strain = strain_state(self._model, self._state).principal_strain
+        self._last = Solution(
+            patch, np.r_[result.reaction_force, result.reaction_torque],
+            grasp_stiffness(self._model, self._grasp, self._state),
+            self.seen(), float(np.abs(strain).max()), result.seconds, result.converged)
+        return self._last
+
+
+def grasp_stiffness(model: Any, grasp: Any, displacement: np.ndarray) -> np.ndarray:
+    """Return the derivative of a clamped grasp's wrench to its pose, shape [6, 6].
+
+    Args:
+        model: A :class:`~limber.mechanics.BranchModel` in equilibrium at ``displacement``
+            [node_count, 3].
+        grasp: A clamped :class:`~limber.mechanics.Grasp` that holds it.
+
+    Returns:
+        Rows force [N] and torque [N m] about the moved pose, columns position [m] and rotation
+        [rad, about the axes of the branch's frame].
+    """
+    pose = grasp.pose_of(model.mesh.nodes, displacement)
+    positions = model.mesh.nodes[grasp.nodes] + displacement[grasp.nodes]
+    arm = positions - pose[:3]
+    tangent = model.equations([grasp]).tangent(model, displacement)
+    state = model.internal(displacement)
+    held = state.force[grasp.nodes] - model.weight_force[grasp.nodes]
+    stiffness = np.empty((6, 6))
+    for k in range(6):
+        change = np.zeros_like(displacement)
+        axis = np.eye(3)[k % 3]
+        moved = np.tile(axis, (len(arm), 1)) if k < 3 else np.cross(axis, arm)
+        change[grasp.nodes] = moved
+        change = change + tangent.solve(-model.tangent_times(displacement, change))
+        forces = model.tangent_times(displacement, change)[grasp.nodes]
+        stiffness[:3, k] = forces.sum(axis=0)
+        stiffness[3:, k] = np.cross(arm, forces).sum(axis=0)
+        if k >= 3:
+            stiffness[3:, k] += np.cross(moved, held).sum(axis=0)
+    return stiffness
