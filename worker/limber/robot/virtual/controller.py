@@ -13,8 +13,8 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.robot.arms import Arm, arm_named
-from limber.robot.kinematics import matrices
-from limber.robot.virtual.kernels import crossed, tool_state, weight_wrench
+from limber.robot.frames import crossed, frame_of, weight_wrench
+from limber.robot.virtual.kernels import tool_state
 from limber.robot.virtual.motion import STOP_DECELERATION, Braking, Motion, Unreachable
 from limber.robot.virtual.program import ControlProgram
 from limber.robot.virtual.sensor import (
@@ -263,6 +263,12 @@ class Controller:
         """Turn the button back and switch the arm on again."""
         self.safety_mode, self.robot_mode, self.motion = SafetyMode.NORMAL, RobotMode.RUNNING, None
 
+    def go_home(self) -> None:
+        """Stand at the home pose at once, without a way there."""
+        self.stop_program("set to its home pose")
+        self.joints, self.speeds, self.motion = np.array(HOME), np.zeros(6), None
+        self._update_tool()
+
     def set_remote(self, remote: bool) -> None:
         """Switch between remote and local control; a running program ends in local control."""
         self.remote = remote
@@ -314,7 +320,7 @@ class Controller:
 
     def set_tool(self, offset: np.ndarray) -> None:
         """Set the tool's pose in the flange's frame [m, rad]."""
-        self.tool_offset, self.tool = np.asarray(offset, float), matrices(offset)
+        self.tool_offset, self.tool = np.asarray(offset, float), frame_of(np.asarray(offset, float))
         self._update_tool()
 
     def say(self, text: str) -> None:

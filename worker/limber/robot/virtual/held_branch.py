@@ -17,8 +17,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.jobs.process import end_with_parent
-from limber.robot.kinematics import inverted, matrices
-from limber.robot.virtual.kernels import crossed, rotation_vector
+from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,8 @@ class HeldBranch:
 
     def __init__(self, setting: BranchSetting):
         self.setting = setting
-        self._base = matrices(np.asarray(setting.base_pose, float))
-        self._tool = matrices(np.asarray(setting.grasp_pose, float))
+        self._base = frame_of(np.array(setting.base_pose, float))
+        self._tool = frame_of(np.array(setting.grasp_pose, float))
         context = get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_solve_for_ever, args=(setting, theirs),
@@ -110,7 +109,7 @@ class HeldBranch:
             self.lose("broken")
             return np.zeros(6)
         change = np.concatenate((patch[:3, 3] - solution.frame[:3, 3], rotation_vector(
-            patch @ inverted(solution.frame))))
+            patch @ inverse_of(solution.frame))))
         on_branch = solution.wrench + solution.stiffness @ change
         if np.linalg.norm(on_branch[:3]) > self.setting.grip:
             self.lose("slipped")
@@ -132,7 +131,7 @@ class HeldBranch:
                              "Move it onto the branch.")
         rest = np.eye(4)
         rest[:3, 3] = answer["centre"]
-        self._offset = inverted(self._gripper) @ rest
+        self._offset = inverse_of(self._gripper) @ rest
         self._solution, self._busy, self._age = answer["solution"], False, 0.0
         self.state = "held"
 
@@ -151,7 +150,7 @@ class HeldBranch:
         step = np.linalg.solve(self._solution.stiffness[:3, :3], self._solution.wrench[:3])
         moved = np.eye(4)
         moved[:3, 3] = -part * step
-        self._offset = inverted(self._gripper) @ moved @ self._gripper @ self._offset
+        self._offset = inverse_of(self._gripper) @ moved @ self._gripper @ self._offset
 
     def close(self) -> None:
         """End the solver."""

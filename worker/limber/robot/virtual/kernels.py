@@ -1,41 +1,10 @@
 """What the virtual controller computes at every step, compiled: flange pose and speed, servo."""
 
-import math
-
 import numpy as np
 
 from limber.compiled import compiled
-from limber.constants import STANDARD_GRAVITY
+from limber.robot.frames import rotation_vector
 from limber.robot.kinematics import _forward, _jacobian
-
-
-@compiled
-def rotation_vector(frame: np.ndarray) -> np.ndarray:
-    """Return the rotation vector [rad] of a 4 x 4 frame."""
-    # Through the quaternion with the largest component, which loses no digits at half a turn.
-    m00, m11, m22 = frame[0, 0], frame[1, 1], frame[2, 2]
-    squares = np.array([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22,
-                        1 - m00 - m11 + m22])
-    largest = squares.argmax()
-    q = np.empty(4)
-    part = math.sqrt(max(squares[largest], 1e-300))
-    x, y, z = (frame[2, 1] - frame[1, 2], frame[0, 2] - frame[2, 0], frame[1, 0] - frame[0, 1])
-    xy, xz, yz = frame[0, 1] + frame[1, 0], frame[0, 2] + frame[2, 0], frame[1, 2] + frame[2, 1]
-    if largest == 0:
-        q[0], q[1], q[2], q[3] = part, x / part, y / part, z / part
-    elif largest == 1:
-        q[0], q[1], q[2], q[3] = x / part, part, xy / part, xz / part
-    elif largest == 2:
-        q[0], q[1], q[2], q[3] = y / part, xy / part, part, yz / part
-    else:
-        q[0], q[1], q[2], q[3] = z / part, xz / part, yz / part, part
-    q *= 0.5
-    if q[0] < 0:
-        q = -q
-    sine = math.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    angle = 2.0 * math.atan2(sine, q[0])
-    scale = angle / sine if sine > 1e-12 else 2.0
-    return scale * q[1:]
 
 
 @compiled
@@ -61,30 +30,6 @@ def tool_state(table: np.ndarray, joints: np.ndarray, speeds: np.ndarray, tool: 
     pose[:3] = tip[:3, 3]
     pose[3:] = rotation_vector(tip)
     return pose, motion, flange
-
-
-@compiled
-def weight_wrench(mass: float, centre: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Return what a mass at the flange pulls with, flange frame, shape [6] in N and N m.
-
-    Args:
-        mass: [kg].
-        centre: Of mass, flange frame [m], shape [3].
-        rotation: Of the flange in a frame whose z points up, shape [3, 3].
-    """
-    wrench = np.empty(6)
-    for k in range(3):
-        wrench[k] = -mass * STANDARD_GRAVITY * rotation[2, k]
-    wrench[3:] = crossed(centre, wrench[:3])
-    return wrench
-
-
-@compiled
-def crossed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the cross product of two vectors [3]."""
-    return np.array([first[1] * second[2] - first[2] * second[1],
-                     first[2] * second[0] - first[0] * second[2],
-                     first[0] * second[1] - first[1] * second[0]])
 
 
 @compiled

@@ -248,5 +248,6 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "release": lambda server: server.controller.load.release(),
     "break": lambda server: server.controller.load.lose("broken"),
     "slip": lambda server, part: server.controller.load.slide(part),
+    "home": lambda server: server.controller.go_home(),
     "stop_program": lambda server: server.controller.stop_program("test"),
 }

@@ -1,0 +1,160 @@
+"""Faults while the robot moves, with the real client and processes: standstill and a report."""
+
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.robot_faults import (
+    ENDS_ROBOT,
+    FAULTS,
+    cell_for,
+    new_robot,
+    provoke,
+    restored,
+    straight,
+)
+from limber.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.robot.cell import Cell
+from limber.robot.link import RobotLink
+
+pytest.importorskip("rtde_control")
+
+
+@pytest.fixture(scope="module")
+def shared_robot(worker_id):
+    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 0
+    with new_robot(f"127.0.0.{51 + number}", "ur5e", 5) as robot:
+        yield robot
+
+
+@pytest.fixture
+def moving_robot(shared_robot):
+    restored(shared_robot)
+    return shared_robot
+
+
+@pytest.mark.parametrize("name", [name for name in FAULTS if name not in ENDS_ROBOT])
+def test_every_fault_ends_in_standstill_and_a_report(moving_robot, name):
+    """At 50 mm/s: standing within 0.6 s, most of them within a few millimetres."""
+    outcome = provoke(name, moving_robot, cell_for(moving_robot.address))
+    assert outcome.report
+    assert outcome.standstill_s < 0.6 and outcome.way_m < 0.03
+
+
+def test_a_killed_controller_is_reported(worker_address):
+    with new_robot(worker_address, "ur5e", 1) as robot:
+        assert provoke("controller killed", robot, cell_for(worker_address)).report
+
+
+def test_a_second_client_is_refused_and_the_first_goes_on(moving_robot):
+    cell = cell_for(moving_robot.address)
+    with RobotLink(cell) as first:
+        time.sleep(0.2)
+        first.tare()
+        first.start(straight(moving_robot, (0.0, 0.2, 0.0)))
+        with pytest.raises(LimberError):
+            RobotLink(cell).close()
+        assert first.wait("reached", "stopped", seconds=30)["event"] == "reached"
+
+
+@pytest.mark.parametrize("model", ["ur5", "ur5e"])
+def test_a_path_is_followed_within_a_millimetre(model, worker_address):
+    """Two legs at 30 mm/s: distance of the arm from the path, by the arm's own state."""
+    with new_robot(worker_address, model, 2) as robot:
+        from limber.robot.trajectory import Trajectory, along, densely
+
+        start = np.array(robot.state["pose"])
+        poses = densely(np.array([start, start + [0, 0.05, 0, 0, 0, 0],
+                                  start + [0, 0.05, 0.03, 0, 0.1, 0]]))
+        path = Trajectory(along(poses, 0.03, 0.2), poses, np.zeros_like(poses))
+        rows = []
+        with RobotLink(cell_for(worker_address, model), rows.append) as link:
+            time.sleep(0.2)
+            link.tare()
+            assert link.follow(path)["event"] == "reached"
+            back = link.retreat()
+            assert back["event"] == "reached"
+        samples = np.concatenate(rows)
+    steps = np.diff(samples[:, 0])
+    assert np.all(steps > 0)
+    assert steps.max() < 1.5 * steps.min()
+    distance = np.linalg.norm(samples[:, None, 1:4] - poses[None, :, :3], axis=2).min(axis=1)
+    # Poses of the path are 2 mm apart: the nearest is up to 1 mm off along it.
+    assert distance.max() < 1.5e-3
+    assert np.linalg.norm(samples[-1, 1:4] - start[:3]) < 1e-4
+
+
+def test_pause_at_the_soft_limit_then_resume(moving_robot):
+    cell = cell_for(moving_robot.address)
+    with RobotLink(cell) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
+        time.sleep(0.5)
+        moving_robot.ask("added_wrench", wrench=[0, 0, 12.0, 0, 0, 0])
+        assert "soft force" in link.wait("paused", "stopped", "reached", seconds=5)["reason"]
+        time.sleep(0.5)
+        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
+        for force in np.linspace(12, 0, 90):
+            moving_robot.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
+            time.sleep(0.05)
+        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
+        assert link.resume()["event"] == "reached"
+
+
+def test_after_a_stop_only_a_choice_moves_it(moving_robot):
+    with RobotLink(cell_for(moving_robot.address)) as link:
+        line = straight(moving_robot, (0.0, 0.1, 0.0))
+        time.sleep(0.2)
+        with pytest.raises(SafetyStop, match="not tared"):
+            link.start(line)
+        link.tare()
+        link.start(line)
+        time.sleep(0.6)
+        link.stop()
+        assert "asked to stop" in link.wait("stopped", seconds=5)["reason"]
+        time.sleep(0.2)
+        with pytest.raises(SafetyStop, match="Choose"):
+            link.start(straight(moving_robot, (0.0, 0.05, 0.0)))
+        assert link.retreat()["event"] == "reached"
+        assert np.allclose(moving_robot.state["pose"][:3], line.poses[0, :3], atol=1e-4)
+
+
+def test_a_path_that_starts_elsewhere_is_refused(moving_robot):
+    line = straight(moving_robot, (0.0, 0.1, 0.0))
+    moved = type(line)(line.times, line.poses + [0, 0, 0.02, 0, 0, 0], line.expected)
+    with RobotLink(cell_for(moving_robot.address)) as link:
+        with pytest.raises(SafetyStop, match=r"starts 20\.0 mm"):
+            link.start(moved)
+
+
+@pytest.mark.parametrize("action, values, error, told", [
+    ("local", {}, SafetyStop, "remote control"),
+    ("slider", {"value": 0.0}, SafetyStop, "slider"),
+    ("protective_stop", {}, SafetyStop, "not ready"),
+    ("silent", {"value": True}, WorkError, "does not answer"),
+])
+def test_a_robot_that_cannot_be_moved_is_refused(moving_robot, action, values, error, told):
+    moving_robot.ask(action, **values)
+    try:
+        with pytest.raises(error, match=told):
+            RobotLink(cell_for(moving_robot.address)).close()
+    finally:
+        moving_robot.ask("slider", value=1.0)
+        restored(moving_robot)
+
+
+def test_the_wrong_robot_is_refused(moving_robot):
+    for model, told in (("ur10e", "says that it is a UR5"), ("ur5", "different series")):
+        cell = Cell(robot={"model": model, "address": moving_robot.address},
+                    base={"pose": (0,) * 6})
+        with pytest.raises(InputError, match=told):
+            RobotLink(cell).close()
+
+
+def test_nobody_at_the_address_is_told_soon():
+    begin = time.monotonic()
+    with pytest.raises(WorkError, match="No robot answers"):
+        RobotLink(cell_for("127.0.0.99")).close()
+    assert time.monotonic() - begin < 20

@@ -1,0 +1,238 @@
+"""The guard as a state machine: every fault stops it, nothing starts it again by itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from limber.errors import SafetyStop
+from limber.robot.arms import ARMS
+from limber.robot.cell import LimitsEntry, WorkspaceEntry
+from limber.robot.guard import Guard, GuardSettings, State, Verdict
+from limber.robot.samples import Sample
+
+ARM = ARMS["ur5e"]
+JOINTS = np.array([0.1, -1.57, 1.57, -1.57, -1.57, 0.0])
+LIMITS = LimitsEntry(soft_force_n=10, hard_force_n=20, hard_torque_nm=3, unexpected_force_n=3)
+BOX = WorkspaceEntry(low_m=(-0.5, -0.5, 0), high_m=(0.5, 0.5, 1))
+INSIDE = np.array([0.0, 0.0, 0.5])
+
+
+class Bench:
+    """A guard and a stream of good samples with a little noise."""
+
+    def __init__(self, rate: float = 500.0, **changes):
+        self.guard = Guard(ARM, GuardSettings(LIMITS, ARM.joint_limits, BOX, **changes), rate)
+        self.rng = np.random.default_rng(1)
+        self.step, self.clock = 1 / rate, 10.0
+
+    def sample(self, **changes) -> Sample:
+        self.clock += self.step
+        return replace(Sample(self.clock, self.clock, JOINTS, np.zeros(6),
+                              np.array([0.4, 0.1, 0.5, 0, 0, 0]), np.zeros(6), np.zeros(6),
+                              7, 1, 2, 1.0), **changes)
+
+    def noise(self) -> np.ndarray:
+        return 0.05 * self.rng.standard_normal(6)
+
+    def look(self, force=(0, 0, 0), torque=(0, 0, 0), expected=None, grasp=INSIDE, sent=None,
+             **changes):
+        wrench = np.r_[force, torque].astype(float) + self.noise()
+        return self.guard.look(self.sample(**changes), wrench=wrench,
+                               raw=np.stack([wrench, wrench]), grasp=grasp, sent=sent,
+                               expected=None if expected is None else np.r_[expected, 0, 0, 0])
+
+    def run(self, count: int = 30, **changes):
+        for _ in range(count):
+            decision = self.look(**changes)
+            if decision.verdict != Verdict.GO:
+                return decision
+        return decision
+
+
+@pytest.fixture
+def bench():
+    bench = Bench()
+    bench.guard.begin()
+    assert bench.run().verdict == Verdict.GO
+    return bench
+
+
+ONE_SAMPLE = {
+    "force": {"force": (0, 25, 0)}, "torque": {"torque": (0, 0, 4)},
+    "infinite force": {"force": (np.inf, 0, 0)},
+    "nan force": {"force": (np.nan, 0, 0)}, "nan pose": {"pose": np.full(6, np.nan)},
+    "nan joints": {"joints": np.full(6, np.nan)},
+    "protective stop": {"safety_mode": 3}, "safeguard": {"safety_mode": 5},
+    "emergency stop": {"safety_mode": 7}, "violation": {"safety_mode": 8},
+    "power off": {"robot_mode": 3}, "program stopped": {"runtime_state": 1},
+    "program paused": {"runtime_state": 4}, "clock forward": {"clock": 99.0},
+    "clock back": {"clock": 1.0}, "clock stands": {"clock": None},
+    "clock nan": {"clock": np.nan}, "too fast": {"speed": np.array([0.2, 0, 0, 0, 0, 0])},
+    "joint limit": {"joints": np.array([6.27, -1.57, 1.57, -1.57, -1.57, 0])},
+    "wrist singularity": {"joints": np.array([0.1, -1.57, 1.57, -1.57, 0.01, 0])},
+    "elbow singularity": {"joints": np.array([0.1, -1.57, 0.01, -1.57, -1.57, 0])},
+    "outside": {"grasp": np.array([0.6, 0, 0.5])},
+    "off path": {"sent": np.array([0.4, 0.12, 0.5])},
+}
+
+
+@pytest.mark.parametrize("name", ONE_SAMPLE)
+def test_one_bad_sample_stops_and_says_why(bench, name):
+    changes = dict(ONE_SAMPLE[name])
+    if "clock" in changes and changes["clock"] is None:
+        changes["clock"] = bench.clock
+    decision = bench.look(**changes)
+    assert decision.verdict == Verdict.STOP and decision.reason
+    assert bench.guard.state == State.STOPPED and bench.guard.reason == str(decision)
+
+
+@pytest.mark.parametrize("name", ONE_SAMPLE)
+def test_after_a_stop_nothing_goes_on_by_itself(bench, name):
+    """A thousand good samples do not start it; nor does begin or resume; a person does."""
+    changes = dict(ONE_SAMPLE[name])
+    if "clock" in changes and changes["clock"] is None:
+        changes["clock"] = bench.clock
+    bench.look(**changes)
+    if "clock" not in changes:
+        bench.run(1000)
+    assert bench.guard.state == State.STOPPED
+    for attempt in (bench.guard.begin, bench.guard.resume):
+        with pytest.raises(SafetyStop):
+            attempt()
+    with pytest.raises(SafetyStop):
+        bench.guard.permit(np.zeros(6), np.zeros(6), 0.002)
+    bench.guard.end()
+    assert bench.guard.state == State.STOPPED
+    bench.guard.acknowledge()
+    assert bench.guard.state == State.IDLE
+    bench.guard.begin()
+    assert bench.guard.state == State.MOVING
+
+
+def test_silence_stops_after_50_ms(bench):
+    assert bench.guard.silence(0.049).verdict == Verdict.GO
+    assert bench.guard.silence(0.051).verdict == Verdict.STOP
+
+
+def test_the_soft_limit_pauses_until_a_person_resumes(bench):
+    decision = bench.run(force=(12, 0, 0))
+    assert decision.verdict == Verdict.PAUSE and bench.guard.state == State.PAUSED
+    assert bench.run(200).verdict == Verdict.PAUSE
+    with pytest.raises(SafetyStop):
+        bench.guard.permit(np.zeros(6), np.zeros(6), 0.002)
+    with pytest.raises(SafetyStop):
+        bench.guard.begin()
+    for force in np.linspace(12, 0, 2000):
+        assert bench.look(force=(force, 0, 0)).verdict == Verdict.PAUSE
+    bench.guard.resume()
+    assert bench.run().verdict == Verdict.GO
+
+
+def test_a_hard_fault_stops_while_paused(bench):
+    bench.run(force=(12, 0, 0))
+    assert bench.look(force=(25, 0, 0)).verdict == Verdict.STOP
+
+
+@pytest.mark.parametrize("rate", [125.0, 500.0])
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_frozen_sensor_is_seen_in_its_time(rate, row):
+    """Frozen as it came or in the flange's axes: the other one turns with the robot."""
+    bench = Bench(rate)
+    bench.guard.begin()
+    bench.run()
+    frozen, begin, verdict = bench.noise(), bench.clock, Verdict.GO
+    while verdict == Verdict.GO:
+        raw = np.stack([bench.noise(), bench.noise()])
+        raw[row] = frozen + 1e-14 * bench.noise()
+        verdict = bench.guard.look(bench.sample(), wrench=raw[1 - row], raw=raw).verdict
+        assert bench.clock - begin < 0.07
+    assert "frozen" in bench.guard.reason
+
+
+def test_a_force_unlike_the_predicted_one_stops_long_before_the_limit():
+    bench = Bench()
+    bench.guard.begin()
+    assert bench.run(200, force=(6, 0, 0), expected=(6.5, 0.5, 0)).verdict == Verdict.GO
+    decision = bench.run(200, force=(6, 4, 0), expected=(6.5, 0.5, 0))
+    assert decision.verdict == Verdict.STOP and "unlike" in decision.reason
+
+
+def test_slip_is_told_from_the_predicted_force():
+    bench = Bench()
+    bench.guard.begin()
+    bench.run(200, force=(5, 0, 0), expected=(5, 0, 0))
+    decision = bench.run(200, force=(0.5, 0, 0), expected=(5, 0, 0))
+    assert decision.verdict == Verdict.STOP and "slipped" in decision.reason
+
+
+def test_slip_is_told_without_a_prediction_by_a_sudden_fall(bench):
+    for force in np.linspace(0, 5, 1000):
+        bench.look(force=(force, 0, 0))
+    decision = bench.run(200, force=(1, 0, 0))
+    assert decision.verdict == Verdict.STOP and "slip or break" in decision.reason
+
+
+def test_a_slow_return_is_no_slip(bench):
+    for force in np.linspace(6, 0, 3000):
+        assert bench.look(force=(force, 0, 0)).verdict == Verdict.GO
+
+
+def test_idle_allows_rest_near_a_singularity_but_no_force():
+    bench = Bench()
+    folded = np.array([0.1, -1.57, 0.0, -1.57, 0.0, 0])
+    assert bench.run(joints=folded).verdict == Verdict.GO
+    assert bench.look(force=(25, 0, 0)).verdict == Verdict.STOP
+
+
+@given(st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6), st.floats(1e-4, 0.02))
+@settings(max_examples=200, deadline=None)
+def test_no_target_is_ever_faster_than_allowed(change, seconds):
+    bench = Bench()
+    bench.guard.begin()
+    current = np.array([0.4, 0.1, 0.5, 0.2, -0.1, 0.3])
+    target = bench.guard.permit(current, current + np.array(change), seconds)
+    assert np.linalg.norm(target[:3] - current[:3]) <= LIMITS.speed_m_s * seconds * (1 + 1e-9)
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(target[3:]) * Rotation.from_rotvec(current[3:]).inv()
+    assert turn.magnitude() <= LIMITS.turn_speed_rad_s * seconds * (1 + 1e-6) + 1e-9
+
+
+@pytest.mark.parametrize("target", [np.full(6, np.nan), np.zeros(3)])
+def test_a_target_that_is_no_pose_stops(bench, target):
+    with pytest.raises(SafetyStop):
+        bench.guard.permit(np.zeros(6), target, 0.002)
+    assert bench.guard.state == State.STOPPED
+
+
+@given(st.lists(st.sampled_from(["good", "bad", "soft", "begin", "end", "resume", "acknowledge",
+                                 "silence", "event"]), max_size=30))
+@settings(max_examples=200, deadline=None)
+def test_motion_after_a_stop_needs_acknowledge_and_begin_in_any_order_of_events(events):
+    """Whatever happens in whatever order: from STOPPED only `acknowledge` leads away."""
+    bench = Bench()
+    for event in events:
+        before = bench.guard.state
+        if event in ("begin", "resume"):
+            try:
+                getattr(bench.guard, event)()
+            except SafetyStop:
+                assert bench.guard.state == before
+        elif event in ("end", "acknowledge"):
+            getattr(bench.guard, event)()
+        elif event == "silence":
+            bench.guard.silence(1.0)
+        elif event == "event":
+            bench.guard.event("lost")
+        else:
+            force = {"good": 0, "bad": 30, "soft": 12}[event]
+            bench.look(force=(force, 0, 0))
+        if before == State.STOPPED and event != "acknowledge":
+            assert bench.guard.state == State.STOPPED
+        if before == State.PAUSED and bench.guard.state == State.MOVING:
+            assert event == "resume"
+        if before == State.IDLE and bench.guard.state == State.MOVING:
+            assert event == "begin"

@@ -1,0 +1,206 @@
+"""Force sensors: frames, tare, weight, saturation, torn messages, replay."""
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError, WorkError
+from limber.robot.cell import Cell
+from limber.robot.frames import (
+    frame_of,
+    inverse_of,
+    pose_between,
+    pose_of,
+    rotation_vector,
+    turned_wrench,
+    weight_wrench,
+)
+from limber.robot.kinematics import matrices
+from limber.robot.samples import Sample
+from limber.robot.sensors import (
+    FT300_PORT,
+    ControllerSensor,
+    Ft300Sensor,
+    Reading,
+    ReplayedSensor,
+    WrenchChain,
+    open_sensor,
+    parsed_message,
+)
+
+TOOL = (0.02, -0.01, 0.15, 0.3, 0.1, -0.2)
+BASE = (0.6, 0.1, 0.0, 0.2, 0.1, 1.2)
+
+
+def cell_with(**sensor) -> Cell:
+    return Cell(robot={"model": "ur5e"}, base={"pose": BASE},
+                tool={"grasp_pose": TOOL, "mass_kg": 0.9, "centre_of_mass_m": (0, 0, 0.06)},
+                sensor=sensor)
+
+
+def sample_at(pose, wrench=(0.0,) * 6, clock=1.0) -> Sample:
+    return Sample(clock, clock, np.zeros(6), np.zeros(6), np.asarray(pose, float), np.zeros(6),
+                  np.asarray(wrench, float), 7, 1, 2, 1.0)
+
+
+def reading_of(wrench) -> Reading:
+    return Reading(np.asarray(wrench, float), 0.0, np.asarray(wrench, float))
+
+
+def test_compiled_frames_are_those_of_scipy():
+    rng = np.random.default_rng(2)
+    for _ in range(300):
+        pose, other = np.r_[rng.normal(size=3), rng.uniform(-1.8, 1.8, 3)], rng.normal(size=6)
+        frame = frame_of(pose)
+        assert frame == pytest.approx(matrices(pose), abs=1e-14)
+        assert pose_of(frame) == pytest.approx(pose, abs=1e-9)
+        assert inverse_of(frame) @ frame == pytest.approx(np.eye(4), abs=1e-13)
+        turn = Rotation.from_rotvec(other[3:]) * Rotation.from_rotvec(pose[3:]).inv()
+        middle = Rotation.from_rotvec(0.3 * turn.as_rotvec()) * Rotation.from_rotvec(pose[3:])
+        assert frame_of(pose_between(pose, other, 0.3))[:3, :3] == pytest.approx(
+            middle.as_matrix(), abs=1e-12)
+    for angle in (0.0, 1e-12, np.pi - 1e-9, np.pi):
+        axis = np.array([0.6, 0.0, 0.8])
+        back = rotation_vector(Rotation.from_rotvec(angle * axis).as_matrix())
+        assert Rotation.from_rotvec(back).as_matrix() == pytest.approx(
+            Rotation.from_rotvec(angle * axis).as_matrix(), abs=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["controller", "ft300"])
+def test_every_sensor_gives_the_wrench_of_the_gripper_on_the_branch(kind):
+    """A known wrench on the branch, taken through each sensor's own frame and sign."""
+    cell = cell_with(kind=kind, pose=(0.01, 0.02, 0.03, 0.1, -0.4, 0.9))
+    chain = WrenchChain(cell)
+    rng = np.random.default_rng(4)
+    pose = np.r_[rng.normal(size=3), 0.8, -0.4, 1.1]
+    on_branch = rng.normal(size=6)
+    base, tip = matrices(np.array(BASE)), matrices(pose)
+    flange = tip @ np.linalg.inv(matrices(np.array(TOOL)))
+    if kind == "controller":
+        in_base = -np.r_[base[:3, :3].T @ on_branch[:3], base[:3, :3].T @ on_branch[3:]]
+        reading = ControllerSensor(cell).read(sample_at(pose, in_base))
+    else:
+        sensor = flange @ matrices(np.array(cell.sensor.pose))
+        rotation = (base @ sensor)[:3, :3].T
+        force, torque = -rotation @ on_branch[:3], -rotation @ on_branch[3:]
+        lever = sensor[:3, :3].T @ (tip[:3, 3] - sensor[:3, 3])
+        raw = np.r_[force, torque + np.cross(lever, force)]
+        frame = matrices(np.array(cell.sensor.pose))
+        at_flange = turned_wrench(frame[:3, :3], raw, frame[:3, 3])
+        reading = reading_of(at_flange + weight_wrench(0.9, np.array([0, 0, 0.06]),
+                                                       flange[:3, :3]))
+    now, smooth = chain.wrench(sample_at(pose), reading)
+    assert now == pytest.approx(on_branch, abs=1e-12)
+    assert smooth == pytest.approx(now)
+
+
+def test_the_tare_takes_the_bias_and_the_weight_goes_with_every_turn():
+    """Tared in one orientation, a bare gripper reads nothing in any other."""
+    cell = cell_with(kind="ft300")
+    chain = WrenchChain(cell)
+    bias = np.array([3.0, -1.0, 4.0, 0.1, 0.2, -0.1])
+    rng = np.random.default_rng(0)
+
+    def reading(pose) -> Reading:
+        flange = matrices(np.asarray(pose)) @ np.linalg.inv(matrices(np.array(TOOL)))
+        weight = weight_wrench(0.9, np.array([0, 0, 0.06]), flange[:3, :3])
+        return reading_of(weight + bias + 0.05 * rng.standard_normal(6))
+    pose = np.array([0.4, 0.1, 0.5, 0, 3.0, 0])
+    chain.start_tare()
+    for _ in range(200):
+        chain.wrench(sample_at(pose), reading(pose))
+    sigma = chain.end_tare()
+    assert sigma[:3].max() < 0.01
+    for turn in ([0, 3.0, 0], [1.5, 0, 0], [0.3, 0.4, -2.0]):
+        turned = np.r_[pose[:3], turn]
+        mean = np.mean([chain.wrench(sample_at(turned), reading(turned))[0] for _ in range(300)],
+                       axis=0)
+        assert mean == pytest.approx(np.zeros(6), abs=0.03)
+
+
+def test_a_touched_gripper_is_not_tared():
+    chain = WrenchChain(cell_with())
+    chain.start_tare()
+    for k in range(100):
+        chain.wrench(sample_at(np.zeros(6)), reading_of(np.full(6, 0.1 * k)))
+    with pytest.raises(WorkError, match="touched or moved"):
+        chain.end_tare()
+    with pytest.raises(WorkError, match="readings for the tare"):
+        chain.end_tare()
+
+
+def test_a_reading_at_the_end_of_the_range_is_no_number_to_trust():
+    chain = WrenchChain(cell_with(force_range_n=50.0))
+    now, _ = chain.wrench(sample_at(np.zeros(6)), reading_of(np.r_[50.0, np.zeros(5)]))
+    assert not np.isfinite(now).any()
+
+
+def test_the_smoothed_wrench_is_late_by_what_it_says():
+    chain = WrenchChain(cell_with(), count=5)
+    slope = 2.0
+    for k in range(50):
+        sample = sample_at(np.zeros(6), clock=0.002 * k)
+        now, smooth = chain.wrench(sample, reading_of(np.full(6, slope * sample.clock)))
+    late = (now[:3] - smooth[:3]) / np.where(now[:3] == 0, 1, now[:3]) * sample.clock
+    assert late == pytest.approx(np.full(3, chain.delay(500.0)))
+
+
+@pytest.mark.parametrize("text, good", [
+    (" 1.0 , 2.0 , -3.5 , 0.1 , 0.2 , 0.3 ", True), ("1,2,3,4,5", False),
+    ("1,2,3,4,5,6,7", False), ("1,2,3,,5,6", False), ("a,b,c,d,e,f", False)])
+def test_torn_messages_are_dropped(text, good):
+    assert (parsed_message(text) is not None) == good
+
+
+def test_ft300_messages_in_any_pieces(worker_address):
+    """A hundred messages cut at random places; the last whole one is the reading."""
+    sent = [f"( {k} , {-k} , 3.0 , 0.1 , 0.2 , 0.3 )" for k in range(100)]
+    data, rng = "".join(sent).encode(), np.random.default_rng(0)
+    cuts = np.sort(rng.choice(len(data), 60, replace=False))
+    with socket.create_server((worker_address, FT300_PORT)) as server:
+        cell = Cell(robot={"model": "ur5", "address": worker_address}, base={"pose": (0,) * 6},
+                    sensor={"kind": "ft300"})
+        sensor = Ft300Sensor(cell)
+        peer, _ = server.accept()
+        sample = sample_at(np.zeros(6))
+        assert np.isnan(sensor.read(sample).wrench).all()
+        with peer:
+            for piece in np.split(np.frombuffer(data, np.uint8), cuts):
+                peer.sendall(piece.tobytes())
+                sensor.read(sample)
+            threading.Event().wait(0.1)
+            reading = sensor.read(sample)
+            assert reading.wrench[:3] == pytest.approx([99, -99, 3]) and reading.age < 0.5
+        threading.Event().wait(0.1)
+        with pytest.raises(ConnectionError):
+            sensor.read(sample)
+        sensor.close()
+
+
+def test_a_replayed_file_runs_with_the_robots_clock(tmp_path):
+    path = tmp_path / "wrench.csv"
+    path.write_text("t_s,fx,fy,fz,tx,ty,tz\n10.0,1,0,0,0,0,0\n10.5,2,0,0,0,0,0\n")
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6})
+    sensor = ReplayedSensor(cell, path)
+    assert sensor.read(sample_at(np.zeros(6), clock=100.0)).wrench[0] == 1
+    later = sensor.read(sample_at(np.zeros(6), clock=100.52))
+    assert later.wrench[0] == 2 and later.age == pytest.approx(0.02)
+    assert sensor.read(sample_at(np.zeros(6), clock=103.0)).age > 2
+
+
+def test_without_a_sensor_nothing_is_moved():
+    with pytest.raises(InputError, match="cannot feel"):
+        open_sensor(cell_with(kind="none"))
+    cb3 = Cell(robot={"model": "ur5"}, base={"pose": (0,) * 6})
+    with pytest.raises(InputError, match="motor currents"):
+        open_sensor(cb3)
+
+
+def test_a_missing_ft300_is_told(worker_address):
+    cell = Cell(robot={"model": "ur5", "address": worker_address}, base={"pose": (0,) * 6},
+                sensor={"kind": "ft300"})
+    with pytest.raises(WorkError, match="63351"):
+        open_sensor(cell)

@@ -1,0 +1,136 @@
+"""Faults of a robot while it moves: each ends in standstill and a report, or it is a failure."""
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.errors import LimberError
+from limber.robot.cell import Cell
+from limber.robot.link import RobotLink
+from limber.robot.trajectory import Trajectory, along, densely
+from limber.robot.virtual.launch import VirtualRobot
+
+STILL_M_S = 1e-4
+_BEFORE_FAULT_SECONDS = 0.8
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a fault led to.
+
+    Attributes:
+        report: What the user is told.
+        standstill_s: From the fault until the arm stood still, by its own state; NaN where the
+            robot itself is gone.
+        way_m: What the tool still moved.
+    """
+
+    report: str
+    standstill_s: float
+    way_m: float
+
+
+Fault = Callable[[VirtualRobot, RobotLink], None]
+
+
+def _asked(action: str, **values: object) -> Fault:
+    return lambda robot, link: robot.ask(action, **values) and None
+
+
+FAULTS: dict[str, Fault] = {
+    "connection cut": _asked("cut"),
+    "controller killed": lambda robot, link: robot.kill(),
+    "protective stop": _asked("protective_stop"),
+    "emergency stop": _asked("emergency_stop"),
+    "local mode": _asked("local"),
+    "program stopped": _asked("stop_program"),
+    "silent port": _asked("silent"),
+    "frozen sensor": _asked("frozen_sensor"),
+    "sensor NaN": _asked("sensor_nan"),
+    "force spike": _asked("added_wrench", wrench=[0, 0, 40, 0, 0, 0]),
+    "torque limit": _asked("added_wrench", wrench=[0, 0, 0, 0, 4.5, 0]),
+    "clock jump": _asked("clock_jump", value=7.0),
+    "worker killed": lambda robot, link: link.process.kill(),
+    "add-on closed": lambda robot, link: link.abandon(),
+    "200 ms cable delay": _asked("delay", value=0.2),
+    "keep-alive starved": lambda robot, link: os.kill(link.process.pid, signal.SIGSTOP),
+    "drift of 4 N": _asked("added_wrench", wrench=[0, 0, 4.2, 0, 0, 0]),
+}
+ENDS_ROBOT = ("controller killed",)
+
+
+def cell_for(address: str, model: str = "ur5e") -> Cell:
+    """Return a cell of a virtual robot whose base is the branch's frame."""
+    kind = "controller" if model.endswith("e") else "ft300"
+    return Cell(robot={"model": model, "address": address}, base={"pose": (0.0,) * 6},
+                sensor={"kind": kind})
+
+
+def straight(robot: VirtualRobot, way: tuple[float, float, float], speed: float = 0.05,
+             *, expected: bool = True) -> Trajectory:
+    """Return a line from where the robot is, on which no force is expected."""
+    start = np.array(robot.state["pose"])
+    poses = densely(np.array([start, start + np.r_[way, 0, 0, 0]]))
+    return Trajectory(along(poses, speed, 0.3), poses,
+                      np.zeros_like(poses) if expected else None)
+
+
+def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) -> Outcome:
+    """Move the robot, provoke a fault on the way, and watch it from its own side.
+
+    Raises:
+        AssertionError: it did not come to a standstill, or nothing was reported.
+    """
+    with RobotLink(cell) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(robot, (0.0, 0.2, 0.0)))
+        time.sleep(_BEFORE_FAULT_SECONDS)
+        before = robot.state
+        assert abs(before["tool_speed"][1]) > 0.02, "it did not move before the fault"
+        began = time.monotonic()
+        FAULTS[name](robot, link)
+        standstill, way = float("nan"), float("nan")
+        if name not in ENDS_ROBOT:
+            while True:
+                state = robot.state
+                now = time.monotonic() - began
+                if np.linalg.norm(state["tool_speed"][:3]) < STILL_M_S:
+                    standstill = now
+                    break
+                assert now < seconds, f"{name}: still moving after {seconds} s"
+                time.sleep(0.002)
+            time.sleep(0.3)
+            after = robot.state
+            assert np.linalg.norm(after["tool_speed"][:3]) < STILL_M_S, f"{name}: moves again"
+            way = float(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))
+        if name == "keep-alive starved":
+            os.kill(link.process.pid, signal.SIGCONT)
+        try:
+            report = link.wait("stopped", seconds=seconds)["reason"]
+        except LimberError as error:
+            report = str(error)
+    assert report, f"{name}: nothing was reported"
+    return Outcome(report, standstill, way)
+
+
+def restored(robot: VirtualRobot) -> None:
+    """Bring a robot back to where a fault found it, as a person at its pendant would."""
+    for action, values in (("silent", False), ("delay", 0.0), ("frozen_sensor", False),
+                           ("sensor_nan", False), ("clock_jump", 0.0)):
+        robot.ask(action, value=values)
+    robot.ask("added_wrench", wrench=[0.0] * 6)
+    robot.ask("unlock")
+    robot.ask("reset_emergency")
+    robot.ask("remote")
+    robot.ask("home")
+
+
+def new_robot(address: str, model: str, seed: int) -> VirtualRobot:
+    """Return a virtual robot; a CB3 has an FT300."""
+    options = ["--seed", str(seed)] + ([] if model.endswith("e") else ["--ft300"])
+    return VirtualRobot(model, address, options)

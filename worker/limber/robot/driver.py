@@ -1,0 +1,493 @@
+"""The process that moves the robot: ``python -m limber.robot.driver``.
+
+ur-rtde has wheels for Python 3.11 and 3.12 only, holds the interpreter while it connects and ends
+the whole process when a connection breaks in a bad moment. So it lives here, alone. Orders come as
+JSON lines on standard input, samples and events go out as JSON lines; when the input ends, as when
+the parent is killed, the robot is stopped and the process ends.
+
+The loop is paced by the controller's own samples: each is read, judged by the guard, and answered
+by the next target within the same step. Nothing here waits for a motion.
+"""
+
+import json
+import os
+import queue
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any, TextIO
+
+import numpy as np
+
+from limber.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.robot.cell import Cell
+from limber.robot.frames import frame_of, pose_of
+from limber.robot.guard import Decision, Guard, GuardSettings, State, Verdict
+from limber.robot.real_time import claim_real_time
+from limber.robot.samples import Dashboard, Sample, SampleStream
+from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
+from limber.robot.trajectory import Trajectory
+
+WATCHDOG_HZ = 20.0
+"""The controller ends the program when it hears nothing for a twentieth of a second."""
+PARENT_SECONDS = 1.0
+"""The parent says something at least this often, or the robot stops."""
+
+_LOOKAHEAD, _GAIN = 0.06, 900.0
+_STOP_DECELERATION = 8.0  # rad/s^2 of the joints
+_START_TOLERANCE = 0.005  # m
+_BATCH_SECONDS = 0.02
+_SECOND_CHANNEL_SECONDS = 0.15
+
+
+@dataclass
+class Following:
+    """A motion under way.
+
+    Attributes:
+        trajectory: Where to.
+        time: How far along it the target is [s].
+        rate: How fast its time runs, 0 to 1.
+    """
+
+    trajectory: Trajectory
+    time: float = 0.0
+    rate: float = 0.0
+
+
+class Driver:
+    """One robot, its sensor and its guard.
+
+    Args:
+        cell: Robot, tool, sensor and limits.
+        out: Where events go, a JSON object a line.
+
+    Raises:
+        LimberError: the robot does not answer, or is not in a state to be moved.
+    """
+
+    def __init__(self, cell: Cell, out: TextIO):
+        self.cell, self._out = cell, out
+        self._base = frame_of(np.array(cell.base.pose))
+        address = cell.robot.address
+        self._stream = SampleStream(address)
+        self._dashboard = Dashboard(address)
+        self.facts = self._check()
+        self._sensor: ForceTorqueSensor = open_sensor(cell)
+        self._chain = WrenchChain(cell, count=5 if self._stream.rate > 200 else 3)
+        self.guard = self._new_guard()
+        self._warm_up()
+        self._control = self._connect(address)
+        self._following: Following | None = None
+        self._gone: Trajectory | None = None
+        self._stopped_at: float | None = None
+        self._command: np.ndarray | None = None
+        self._tare_until: float | None = None
+        self._batch: list[list[float]] = []
+        self._batch_since = time.monotonic()
+        self._last: Sample | None = None
+        self._heard = time.monotonic()
+        self.ended = False
+
+    # Connecting
+
+    def _new_guard(self) -> Guard:
+        cell = self.cell
+        return Guard(cell.arm, GuardSettings(cell.limits, cell.joint_limits, cell.workspace),
+                     self._stream.rate)
+
+    def _warm_up(self) -> None:
+        """Go through what the loop does once: compiling on the way would starve the watchdog."""
+        samples: list[Sample] = []
+        while len(samples) < 3:
+            samples += self._stream.read(1.0)
+        guard, chain = self._new_guard(), WrenchChain(self.cell)
+        guard.begin()
+        for sample in samples:
+            reading = self._sensor.read(sample)
+            now, _ = chain.wrench(sample, reading)
+            guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]),
+                       expected=now, grasp=sample.pose[:3])
+            guard.state = State.MOVING
+            guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
+            pose_of(self._base @ frame_of(sample.pose))
+
+    def _check(self) -> dict[str, Any]:
+        """Refuse a robot that is not what the cell says or cannot be moved; returns its facts."""
+        version = ".".join(map(str, self._stream.version[:3]))
+        series = "cb3" if self._stream.version[0] == 3 else "e"
+        arm = self.cell.arm
+        if series != arm.series:
+            raise InputError(f"The controller is version {version}, the cell says {arm.name}.",
+                             "They are of different series, with different arms.",
+                             "Correct robot.model in the cell file.")
+        facts = {"address": self.cell.robot.address, "version": version,
+                 "model": self._dashboard.ask("get robot model"),
+                 "serial": self._dashboard.ask("get serial number"),
+                 "remote": self._dashboard.ask("is in remote control"),
+                 "rate_hz": self._stream.rate, "real_time": claim_real_time()}
+        known = facts["model"].lower()
+        if known.startswith("ur") and known != arm.name.rstrip("e"):
+            raise InputError(f"The robot says that it is a {facts['model']}, the cell {arm.name}.",
+                             "Reach and limits would be those of another arm.",
+                             "Correct robot.model in the cell file.")
+        if facts["remote"] == "false":
+            raise SafetyStop("The robot is not in remote control.",
+                             "It would not take a program from here.",
+                             "Switch it to remote control on the pendant.")
+        samples = self._stream.read(1.0)
+        if not samples:
+            raise WorkError("The robot sends no data.", "", "Restart its controller.")
+        sample = samples[-1]
+        if sample.safety_mode != 1 or sample.robot_mode != 7:
+            raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot "
+                             f"mode {sample.robot_mode}.", "Nothing here releases a stop or "
+                             "switches an arm on.", "Do it on the pendant, having looked.")
+        if sample.slider <= 0.0:
+            raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
+                             "Raise it on the pendant.")
+        facts |= {"pose": sample.pose.tolist(), "joints": sample.joints.tolist(),
+                  "slider": sample.slider}
+        return facts
+
+    def _connect(self, address: str) -> Any:
+        from rtde_control import RTDEControlInterface
+
+        control = RTDEControlInterface(address, self._stream.rate)
+        self._require(control.setTcp(list(self.cell.tool.grasp_pose)), "set its tool")
+        self._require(control.setPayload(self.cell.tool.mass_kg,
+                                         list(self.cell.tool.centre_of_mass_m)), "set its payload")
+        self._require(control.setWatchdog(WATCHDOG_HZ), "start its watchdog")
+        return control
+
+    def _require(self, done: bool, what: str) -> None:
+        if not done:
+            raise WorkError(f"The robot did not {what}.", "It returned no success.",
+                            "See its log; restart the program.")
+
+    # The loop
+
+    def run(self, orders: "queue.Queue[dict[str, Any] | None]") -> None:
+        """Serve orders until they end."""
+        quiet = 2.0 / self._stream.rate + 0.005
+        self._stream.skip()
+        while not self.ended:
+            try:
+                samples = self._stream.read(quiet)
+            except ConnectionError as error:
+                self._lost(str(error))
+                return
+            for sample in samples:
+                self._look(sample)
+            if samples:
+                self._last = samples[-1]
+            elif self._last is not None:
+                self._judge(self.guard.silence(time.monotonic() - self._last.arrived))
+            self._take(orders)
+            if samples and not self.ended:
+                self._move(len(samples) / self._stream.rate)
+            self._send_batch()
+
+    def _take(self, orders: "queue.Queue[dict[str, Any] | None]") -> None:
+        while True:
+            try:
+                order = orders.get_nowait()
+            except queue.Empty:
+                break
+            if order is None:
+                self._judge(self.guard.event("the program that drives the robot is gone"))
+                self.ended = True
+                return
+            self._heard = time.monotonic()
+            try:
+                self._obey(order)
+            except LimberError as error:
+                self.tell(event="refused", order=order.get("order"), reason=str(error))
+        if time.monotonic() - self._heard > PARENT_SECONDS and self._following is not None:
+            self._judge(self.guard.event("the program that drives the robot does not answer"))
+
+    def _obey(self, order: dict[str, Any]) -> None:
+        name = order.get("order")
+        if name == "alive":
+            return
+        if name == "tare":
+            self._begin_tare(float(order.get("seconds", 0.5)))
+        elif name == "follow":
+            self._begin(Trajectory(
+                np.array(order["times"], float), np.array(order["poses"], float),
+                None if order.get("expected") is None else np.array(order["expected"], float)))
+        elif name == "stop":
+            self._judge(self.guard.event("asked to stop"))
+        elif name == "resume":
+            self.guard.resume()
+            self.tell(event="resumed")
+        elif name == "acknowledge":
+            self.guard.acknowledge()
+            self.tell(event="acknowledged")
+        elif name == "retreat":
+            self._retreat()
+        elif name == "gripper":
+            self._grip(bool(order["close"]))
+        else:
+            raise InputError(f"Order {name!r} is unknown.")
+
+    # Samples
+
+    def _look(self, sample: Sample) -> None:
+        try:
+            reading = self._sensor.read(sample)
+        except ConnectionError as error:
+            self._judge(self.guard.event(str(error)))
+            return
+        now, smooth = self._chain.wrench(sample, reading)
+        following = self._following
+        expected = sent = None
+        if following is not None:
+            # The arm is where its target was a look-ahead ago.
+            behind = max(following.time - _LOOKAHEAD * following.rate, 0.0)
+            expected = following.trajectory.wrench(behind)
+            sent = following.trajectory.pose(behind)[:3]
+        grasp = self._base @ frame_of(sample.pose)
+        decision = self.guard.look(
+            sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
+            grasp=grasp[:3, 3], sent=sent)
+        if reading.age > 0.05 and decision.verdict != Verdict.STOP:
+            decision = self.guard.event(f"the force sensor is silent for {reading.age:.3f} s")
+        self._judge(decision, sample)
+        pose = pose_of(grasp)
+        self._batch.append([sample.clock, *pose, *now, *smooth, *sample.joints,
+                            *(np.full(6, np.nan) if expected is None else expected)])
+        if self._tare_until is not None and sample.clock >= self._tare_until:
+            self._end_tare()
+
+    def _judge(self, decision: Decision, sample: Sample | None = None) -> None:
+        if decision.verdict == Verdict.STOP and self._stopped_at is None:
+            if self._following is not None:
+                self._stop(decision, sample)
+            else:
+                self._stopped_at = time.monotonic()
+                self.tell(event="stopped", reason=str(decision), moving=False)
+        elif decision.verdict == Verdict.PAUSE and self._following is not None \
+                and self._following.rate > 0 and decision.limit:
+            self.tell(event="paused", reason=str(decision))
+
+    def _stop(self, decision: Decision, sample: Sample | None) -> None:
+        following = self._following
+        assert following is not None
+        self._gone = following.trajectory.until(following.time)
+        self._following = None
+        self._stopped_at = time.monotonic()
+        came = sample.arrived if sample is not None else self._stopped_at
+        latency = self._stopped_at - came
+        self._stop_arm()
+        self.tell(event="stopped", reason=str(decision), moving=True, value=decision.value,
+                  limit=decision.limit, command_after_s=latency,
+                  clock=sample.clock if sample is not None else None,
+                  at_s=following.time)
+
+    def _stop_arm(self) -> None:
+        """First channel: the control program; second, where it fails: the dashboard."""
+        stopped = False
+        try:
+            stopped = bool(self._control.servoStop(_STOP_DECELERATION))
+        except RuntimeError as error:
+            self.tell(event="warning", text=f"servoStop: {error}")
+        if not stopped:
+            self._stop_by_dashboard("the control program did not confirm the stop")
+
+    def _stop_by_dashboard(self, why: str) -> None:
+        try:
+            self._dashboard.stop()
+            self.tell(event="second_channel", reason=why)
+        except OSError as error:
+            self.tell(event="warning", text=f"dashboard stop: {error}; the controller's watchdog "
+                      f"ends its program in {1 / WATCHDOG_HZ:.2f} s")
+
+    def _lost(self, reason: str) -> None:
+        """The data connection is gone: nothing is known, so everything that stops is used."""
+        moving = self._following is not None
+        decision = self.guard.event(reason)
+        self._stop_by_dashboard("the data connection is gone")
+        self.tell(event="stopped", reason=str(decision), moving=moving)
+        self.ended = True
+
+    # Motion
+
+    def _begin(self, trajectory: Trajectory) -> None:
+        sample = self._require_sample()
+        away = float(np.linalg.norm(trajectory.poses[0, :3] - sample.pose[:3]))
+        if away > _START_TOLERANCE:
+            raise SafetyStop(f"The path starts {1000 * away:.1f} mm from where the robot is.",
+                             f"At most {1000 * _START_TOLERANCE:.0f} mm are bridged.",
+                             "Move the robot to the start, or plan from its actual pose.")
+        if not self._chain.is_tared:
+            raise SafetyStop("The force sensor is not tared.", "Its bias would pass for a force "
+                             "on the branch.", "Tare it with the gripper hanging free.")
+        if sample.slider <= 0.0:
+            raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
+                             "Raise it on the pendant.")
+        if not self._control.isProgramRunning() and not self._control.reuploadScript():
+            raise WorkError("The control program does not run.", "", "See the pendant.")
+        self.guard.begin()
+        self._stopped_at = None
+        self._following = Following(trajectory)
+        self._command = sample.pose.copy()
+        self.tell(event="started", seconds=trajectory.duration)
+
+    def _move(self, step: float) -> None:
+        """Send the next target, ``step`` [s] of the controller's time after the last one."""
+        following = self._following
+        if following is None or self._last is None:
+            self._keep_alive()
+            return
+        assert self._command is not None
+        if self.guard.state == State.MOVING:
+            # Time along the path starts softly, also after a pause.
+            following.rate = min(following.rate + step / 0.2, 1.0)
+            following.time = min(following.time + following.rate * step,
+                                 following.trajectory.duration + _LOOKAHEAD)
+            target = following.trajectory.pose(following.time)
+            self._command = self.guard.permit(self._command, target, 1.2 * step)
+        else:
+            following.rate = 0.0
+        done = self._control.servoL(list(self._command), 0.1, 0.1, 1.0 / self._stream.rate,
+                                    _LOOKAHEAD, _GAIN)
+        if not done:
+            self._judge(self.guard.event("the control program took no target"))
+            return
+        over = following.time >= following.trajectory.duration + 0.5 * _LOOKAHEAD
+        still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
+        if over and still:
+            self._finish(following)
+
+    def _finish(self, following: Following) -> None:
+        self._gone = following.trajectory.until(following.trajectory.duration)
+        self._following = None
+        self.guard.end()
+        if not self._control.servoStop(_STOP_DECELERATION):
+            self._stop_by_dashboard("the control program did not end the motion")
+        error = float(np.linalg.norm(
+            self._require_sample().pose[:3] - following.trajectory.poses[-1, :3]))
+        self.tell(event="reached", error_m=error)
+
+    def _keep_alive(self) -> None:
+        if not self._control.kickWatchdog() and self._stopped_at is None:
+            self._judge(self.guard.event("the control program does not run"))
+        if self._stopped_at is not None and self._last is not None:
+            late = time.monotonic() - self._stopped_at > _SECOND_CHANNEL_SECONDS
+            moving = float(np.abs(self._last.joint_speeds).max()) > 1e-2
+            if late and moving:
+                self._stop_by_dashboard("the robot still moves after its stop")
+                self._stopped_at = time.monotonic()
+
+    def _retreat(self) -> None:
+        if self._gone is None:
+            raise SafetyStop("There is no way back.", "Nothing was followed yet.", "")
+        self.guard.acknowledge()
+        gone, sample = self._gone, self._require_sample()
+        poses = np.vstack([sample.pose, gone.poses[1:]])
+        # Half as fast as it came.
+        self._begin(Trajectory(2.0 * gone.times, poses))
+
+    def _grip(self, close: bool) -> None:
+        if self.cell.tool.gripper != "digital_output":
+            raise InputError("The cell's gripper is not driven from here.",
+                             f"tool.gripper is {self.cell.tool.gripper}.",
+                             "Close and open it by hand.")
+        from rtde_io import RTDEIOInterface
+
+        io = RTDEIOInterface(self.cell.robot.address)
+        try:
+            self._require(io.setStandardDigitalOut(self.cell.tool.close_output, close),
+                          "drive its gripper")
+        finally:
+            io.disconnect()
+        self.tell(event="gripper", closed=close)
+
+    # Tare
+
+    def _begin_tare(self, seconds: float) -> None:
+        sample = self._require_sample()
+        if self._following is not None:
+            raise SafetyStop("A tare while the robot moves.", "", "Wait until it stands.")
+        self._chain.start_tare()
+        self._tare_until = sample.clock + seconds
+
+    def _end_tare(self) -> None:
+        self._tare_until = None
+        try:
+            sigma = self._chain.end_tare()
+        except WorkError as error:
+            self.tell(event="refused", order="tare", reason=str(error))
+            return
+        self.tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
+                  delay_s=self._chain.delay(self._stream.rate))
+
+    # Words
+
+    def tell(self, **content: Any) -> None:
+        """Send an event."""
+        self._out.write(json.dumps(content) + "\n")
+        self._out.flush()
+
+    def _send_batch(self) -> None:
+        now = time.monotonic()
+        if self._batch and now - self._batch_since >= _BATCH_SECONDS:
+            rows = [[None if not np.isfinite(x) else round(float(x), 7) for x in row]
+                    for row in self._batch]
+            self.tell(samples=rows)
+            self._batch, self._batch_since = [], now
+
+    def _require_sample(self) -> Sample:
+        if self._last is None:
+            raise WorkError("No data of the robot yet.")
+        return self._last
+
+    def close(self) -> None:
+        """Stop what moves and let go of the robot."""
+        if self._following is not None:
+            self._following = None
+            self._stop_arm()
+        self._sensor.close()
+        self._control.disconnect()
+        self._stream.close()
+        self._dashboard.close()
+
+
+def _read_orders(orders: "queue.Queue[dict[str, Any] | None]") -> None:
+    for line in sys.stdin:
+        try:
+            orders.put(json.loads(line))
+        except json.JSONDecodeError:
+            orders.put({"order": line.strip()[:40]})
+    orders.put(None)
+
+
+def main() -> int:
+    """Read the cell from the first line of standard input, then serve; returns an exit code."""
+    # ur-rtde prints on standard output; what is ours goes through a copy of it.
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    driver: Driver | None = None
+    try:
+        driver = Driver(Cell.model_validate_json(sys.stdin.readline()), out)
+        driver.tell(event="connected", **driver.facts)
+        orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
+        driver.run(orders)
+    except (LimberError, RuntimeError, ConnectionError, ImportError) as error:
+        out.write(json.dumps({"event": "failed", "reason": str(error),
+                              "code": getattr(error, "exit_code", 3)}) + "\n")
+        out.flush()
+        return 3
+    finally:
+        if driver is not None and not driver.ended:
+            driver.close()
+    # What ur-rtde's threads still wait for is not waited for.
+    out.flush()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,324 @@
+"""The guard: one object that every motion of the robot passes.
+
+It is a pure state machine: samples and wishes go in, decisions come out; it opens no connection
+and reads no clock. After a stop nothing goes on by itself: a person acknowledges it and chooses.
+
+This is software on a computer that can stall, behind a network that can break. It is no certified
+safety function and claims no standard: the controller's own limits and the button on the pendant
+are what protects people.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from limber.errors import SafetyStop
+from limber.robot.arms import Arm
+from limber.robot.cell import LimitsEntry, WorkspaceEntry
+from limber.robot.frames import pose_between, turn_between
+from limber.robot.kinematics import singularity_distance
+from limber.robot.samples import Sample
+
+_RUNNING, _NORMAL, _PLAYING = 7, 1, 2
+_SAME = 1e-9  # N, N m
+
+
+class State(Enum):
+    """What the guard allows."""
+
+    IDLE = "idle"
+    MOVING = "moving"
+    PAUSED = "paused"
+    STOPPED = "stopped"
+
+
+class Verdict(Enum):
+    """What is to be done after a sample."""
+
+    GO = "go"
+    PAUSE = "pause"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A verdict and its reason."""
+
+    verdict: Verdict
+    reason: str = ""
+    value: float = 0.0
+    limit: float = 0.0
+
+    def __str__(self) -> str:
+        if self.limit:
+            return f"{self.reason} ({self.value:.3g}, allowed {self.limit:.3g})"
+        return self.reason
+
+
+_GO = Decision(Verdict.GO)
+
+
+@dataclass(frozen=True)
+class GuardSettings:
+    """Limits of the guard.
+
+    Attributes:
+        limits: The cell's.
+        workspace: Box that the grasp stays in, branch frame, or None.
+        joint_limits: [rad], shape [6, 2].
+        longest_silence: Age at which data is lost [s].
+        frozen_time: How long a wrench may repeat to the last digit [s]; a living sensor's noise
+            never does.
+        filter_time: Time constant of the force that is compared with the predicted one [s]. The
+            hard limits look at every reading as it comes.
+        off_path: Distance from where the robot was sent [m].
+        lost_share: Share of its force that a held branch loses when it slips or breaks.
+        least_force: Force below which a loss is not told from noise [N].
+        largest_torque_error: Of the torque against the predicted one [N m].
+    """
+
+    limits: LimitsEntry
+    joint_limits: np.ndarray
+    workspace: WorkspaceEntry | None = None
+    longest_silence: float = 0.05
+    frozen_time: float = 0.05
+    filter_time: float = 0.01
+    off_path: float = 0.01
+    lost_share: float = 0.4
+    least_force: float = 1.0
+    largest_torque_error: float = 1.0
+
+
+@dataclass
+class _Memory:
+    """What the guard remembers of the last samples."""
+
+    clock: float | None = None
+    raw: np.ndarray | None = None
+    frozen_since: float = 0.0
+    filtered: np.ndarray | None = None
+    peak: float = 0.0
+
+
+class Guard:
+    """Watches one robot.
+
+    Attributes:
+        state: What it allows now.
+        reason: Why it stopped or paused last.
+    """
+
+    def __init__(self, arm: Arm, settings: GuardSettings, rate: float):
+        self._arm, self._settings, self._step = arm, settings, 1.0 / rate
+        self.state = State.IDLE
+        self.reason = ""
+        self._memory = _Memory()
+
+    # What a person does
+
+    def begin(self) -> None:
+        """Allow a motion.
+
+        Raises:
+            SafetyStop: after a stop that was not acknowledged, or while one is paused.
+        """
+        if self.state != State.IDLE:
+            raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
+                             "No motion begins before a person has looked.",
+                             "Choose: hold, retreat or release.")
+        self.state = State.MOVING
+        self._memory = _Memory()
+
+    def end(self) -> None:
+        """The motion is over."""
+        if self.state in (State.MOVING, State.PAUSED):
+            self.state = State.IDLE
+
+    def resume(self) -> None:
+        """Go on after a pause.
+
+        Raises:
+            SafetyStop: it is not paused.
+        """
+        if self.state != State.PAUSED:
+            raise SafetyStop(f"The robot is {self.state.value}, not paused.", self.reason,
+                             "Only a pause goes on; after a stop choose what to do.")
+        self.state = State.MOVING
+        self._memory.peak = 0.0
+
+    def acknowledge(self) -> None:
+        """A person has seen the stop; a new motion may be asked for."""
+        if self.state in (State.STOPPED, State.PAUSED):
+            self.state = State.IDLE
+
+    # What happens
+
+    def silence(self, age: float) -> Decision:
+        """No sample has come for ``age`` [s]."""
+        if age > self._settings.longest_silence:
+            return self._stop("no data from the robot [s]", age, self._settings.longest_silence)
+        return _GO
+
+    def event(self, reason: str) -> Decision:
+        """Something that no sample shows: a lost connection, a parent that is gone."""
+        return self._stop(reason)
+
+    def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,
+             expected: np.ndarray | None = None, grasp: np.ndarray | None = None,
+             sent: np.ndarray | None = None) -> Decision:
+        """Judge a sample.
+
+        Args:
+            wrench: What the gripper exerts on the branch by the sensor in use, tared, branch
+                frame [N, N m], shape [6].
+            raw: The reading as it came and turned to the flange's axes, shape [2, 6]. A frozen
+                sensor repeats one of them to the last digit, whatever the robot turns.
+            expected: The same as the model predicts it, or None.
+            grasp: Where the grasp is, branch frame [m], shape [3].
+            sent: Where the tool was sent to be by now, base frame [m], shape [3], or None.
+        """
+        for check in (self._check_clock(sample), self._check_modes(sample),
+                      self._check_wrench(sample, wrench, raw),
+                      self._check_place(sample, grasp, sent),
+                      self._check_expected(wrench, expected)):
+            if check.verdict == Verdict.STOP:
+                return check
+        force = float(np.linalg.norm(wrench[:3]))
+        if self.state == State.MOVING and force > self._settings.limits.soft_force_n:
+            self.state = State.PAUSED
+            self.reason = "soft force limit"
+            return Decision(Verdict.PAUSE, "soft force limit [N]", force,
+                            self._settings.limits.soft_force_n)
+        if self.state == State.PAUSED:
+            return Decision(Verdict.PAUSE, self.reason)
+        return _GO
+
+    def permit(self, current: np.ndarray, target: np.ndarray, seconds: float) -> np.ndarray:
+        """Return a target [6] that keeps the speed limits, on the way from ``current`` to it.
+
+        Raises:
+            SafetyStop: nothing may move now, or the target is no pose.
+        """
+        if self.state != State.MOVING:
+            raise SafetyStop(f"The robot is {self.state.value}.", self.reason, "")
+        if target.shape != (6,) or not np.isfinite(target).all():
+            self._stop("a target that is no pose")
+            raise SafetyStop("A target that is no pose.", f"{target}", "")
+        limits = self._settings.limits
+        way = float(np.linalg.norm(target[:3] - current[:3]))
+        turn = float(np.linalg.norm(turn_between(current, target)))
+        part = min(1.0, limits.speed_m_s * seconds / way if way > 0 else 1.0,
+                   limits.turn_speed_rad_s * seconds / turn if turn > 0 else 1.0)
+        return target if part >= 1.0 else pose_between(current, target, part)
+
+    # Checks
+
+    def _check_clock(self, sample: Sample) -> Decision:
+        last, self._memory.clock = self._memory.clock, sample.clock
+        if not np.isfinite(sample.clock):
+            return self._stop("the controller's clock shows no number")
+        if last is None:
+            return _GO
+        passed = sample.clock - last
+        if passed <= 0:
+            return self._stop("the controller's clock went back [s]", passed, self._step)
+        if passed > self._settings.longest_silence + self._step:
+            return self._stop("the controller's clock jumped [s]", passed,
+                              self._settings.longest_silence)
+        return _GO
+
+    def _check_modes(self, sample: Sample) -> Decision:
+        if sample.safety_mode != _NORMAL:
+            return self._stop(_SAFETY.get(sample.safety_mode, f"safety mode {sample.safety_mode}"))
+        if sample.robot_mode != _RUNNING:
+            return self._stop(f"robot mode {sample.robot_mode}: it is not running")
+        if self.state in (State.MOVING, State.PAUSED) and sample.runtime_state != _PLAYING:
+            return self._stop("the program on the controller was stopped")
+        return _GO
+
+    def _check_wrench(self, sample: Sample, wrench: np.ndarray, raw: np.ndarray) -> Decision:
+        numbers = np.concatenate((wrench, sample.wrench, sample.pose, sample.joints, sample.speed))
+        if not np.isfinite(numbers).all():
+            return self._stop("a sensor shows no number")
+        memory, limits = self._memory, self._settings.limits
+        # Turning a wrench to other axes and back leaves rounding in its last digits.
+        if memory.raw is None or np.abs(raw - memory.raw).max(axis=1).min() > _SAME:
+            memory.frozen_since = sample.clock
+        memory.raw = raw.copy()
+        if sample.clock - memory.frozen_since > self._settings.frozen_time:
+            return self._stop("the force sensor is frozen [s]",
+                              sample.clock - memory.frozen_since, self._settings.frozen_time)
+        force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
+        if force > limits.hard_force_n:
+            return self._stop("hard force limit [N]", float(force), limits.hard_force_n)
+        if torque > limits.hard_torque_nm:
+            return self._stop("hard torque limit [N m]", float(torque), limits.hard_torque_nm)
+        return _GO
+
+    def _check_place(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
+                     ) -> Decision:
+        limits, settings = self._settings.limits, self._settings
+        speed = float(np.linalg.norm(sample.speed[:3]))
+        if speed > 1.5 * limits.speed_m_s + 0.005:
+            return self._stop("speed [m/s]", speed, limits.speed_m_s)
+        margin = np.minimum(sample.joints - settings.joint_limits[:, 0],
+                            settings.joint_limits[:, 1] - sample.joints)
+        if margin.min() < 0.5 * limits.joint_margin_rad:
+            return self._stop(f"joint {int(margin.argmin()) + 1} at its limit")
+        distance = float(singularity_distance(self._arm, sample.joints).min())
+        if self.state == State.MOVING and distance < 0.5 * limits.singularity:
+            return self._stop("singularity", distance, 0.5 * limits.singularity)
+        box = settings.workspace
+        if box is not None and grasp is not None and self.state == State.MOVING and (
+                np.any(grasp < np.array(box.low_m) - 1e-3)
+                or np.any(grasp > np.array(box.high_m) + 1e-3)):
+            return self._stop("the grasp left the workspace")
+        if sent is not None and self.state == State.MOVING:
+            off = float(np.linalg.norm(sample.pose[:3] - sent))
+            if off > settings.off_path:
+                return self._stop("off its path [m]", off, settings.off_path)
+        return _GO
+
+    def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None) -> Decision:
+        settings, memory = self._settings, self._memory
+        if self.state not in (State.MOVING, State.PAUSED):
+            return _GO
+        kept = np.exp(-self._step / settings.filter_time)
+        before = wrench if memory.filtered is None else memory.filtered
+        memory.filtered = filtered = kept * before + (1 - kept) * wrench
+        force = float(np.linalg.norm(filtered[:3]))
+        if expected is None:
+            # Nothing is predicted while E is being measured: a sudden loss still tells a slip.
+            memory.peak = max(memory.peak * np.exp(-self._step / 0.5), force)
+            lost = memory.peak - force
+            if lost > max(settings.lost_share * memory.peak, settings.least_force):
+                return self._stop("the force fell at once: slip or break [N]", lost,
+                                  max(settings.lost_share * memory.peak, settings.least_force))
+            return _GO
+        wanted = float(np.linalg.norm(expected[:3]))
+        if wanted > settings.least_force:
+            along = float(filtered[:3] @ expected[:3]) / wanted
+            if along < (1 - settings.lost_share) * wanted - settings.least_force:
+                return self._stop("the branch slipped, broke or was never held: force along the "
+                                  "predicted one [N]", along, wanted)
+        error = float(np.linalg.norm(filtered[:3] - expected[:3]))
+        if error > settings.limits.unexpected_force_n:
+            return self._stop("force unlike the predicted one [N]", error,
+                              settings.limits.unexpected_force_n)
+        twist = float(np.linalg.norm(filtered[3:] - expected[3:]))
+        if twist > settings.largest_torque_error:
+            return self._stop("torque unlike the predicted one [N m]", twist,
+                              settings.largest_torque_error)
+        return _GO
+
+    def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
+        decision = Decision(Verdict.STOP, reason, value, limit)
+        if self.state != State.STOPPED:
+            self.state = State.STOPPED
+            self.reason = str(decision)
+        return decision
+
+
+_SAFETY = {3: "protective stop", 4: "recovery mode", 5: "safeguard stop", 6: "emergency stop",
+           7: "emergency stop", 8: "safety violation", 9: "safety fault"}

@@ -1,0 +1,102 @@
+"""Poses over time, for the robot to follow, with the wrench that the model expects at each."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.robot.frames import pose_between
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Where the tool is to be when.
+
+    Attributes:
+        times: [s], from 0, ascending, shape [n].
+        poses: Of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
+        expected: Wrench of the gripper on the branch, branch frame [N, N m], shape [n, 6], or
+            None where nothing is predicted.
+    """
+
+    times: np.ndarray
+    poses: np.ndarray
+    expected: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shaped = (self.times.ndim == 1 and len(self.times) >= 2
+                  and self.poses.shape == (len(self.times), 6))
+        if not shaped or not np.isfinite(self.poses).all() or np.any(np.diff(self.times) <= 0):
+            raise InputError(f"A trajectory of {self.times.shape} times and {self.poses.shape} "
+                             "poses.", "It needs ascending times and one finite pose each.",
+                             "Check the path.")
+        if self.expected is not None and (self.expected.shape != self.poses.shape
+                                          or not np.isfinite(self.expected).all()):
+            raise InputError("Expected wrenches that do not fit the poses.",
+                             "Each pose has one of six numbers.", "Check the plan.")
+
+    @property
+    def duration(self) -> float:
+        return float(self.times[-1])
+
+    def pose(self, time: float) -> np.ndarray:
+        """Return the pose at a time [s]; the last one afterwards, shape [6]."""
+        k, part = self._place(time)
+        return pose_between(self.poses[k], self.poses[k + 1], part)
+
+    def wrench(self, time: float) -> np.ndarray | None:
+        """Return the expected wrench at a time [s], shape [6]."""
+        if self.expected is None:
+            return None
+        k, part = self._place(time)
+        return (1 - part) * self.expected[k] + part * self.expected[k + 1]
+
+    def until(self, time: float) -> "Trajectory":
+        """Return the way back: what was gone until ``time`` [s], reversed in time."""
+        kept = np.flatnonzero(self.times < time)
+        times = np.r_[self.times[kept], time]
+        poses = np.vstack([self.poses[kept], self.pose(time)])
+        if len(times) < 2:
+            times, poses = np.r_[0.0, max(time, 1e-3)], np.vstack([poses[-1], poses[-1]])
+        return Trajectory(times[-1] - times[::-1], poses[::-1])
+
+    def _place(self, time: float) -> tuple[int, float]:
+        time = min(max(time, 0.0), self.duration)
+        k = min(int(np.searchsorted(self.times, time, side="right")) - 1, len(self.times) - 2)
+        return k, (time - self.times[k]) / (self.times[k + 1] - self.times[k])
+
+
+def along(poses: np.ndarray, speed: float, acceleration: float, *, turn_speed: float = 0.5,
+          pause: float = 0.0) -> np.ndarray:
+    """Return times [s] at which ``poses`` [n, 6] are passed, from rest to rest, shape [n].
+
+    Args:
+        speed, acceleration: Of the tool's centre [m/s], [m/s^2].
+        turn_speed: Greatest angular speed [rad/s].
+        pause: Time added before the start [s].
+    """
+    from limber.robot.kinematics import matrices
+
+    turns = matrices(poses)[:, :3, :3]
+    angles = np.arccos(np.clip((np.einsum("nij,nij->n", turns[1:], turns[:-1]) - 1) / 2, -1, 1))
+    steps = np.maximum(np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1),
+                       angles * speed / turn_speed)
+    steps = np.maximum(steps, 1e-9)
+    way = np.r_[0.0, np.cumsum(steps)]
+    bound = np.minimum(speed, np.sqrt(2 * acceleration * np.minimum(way, way[-1] - way)))
+    durations = 2 * steps / np.maximum(bound[1:] + bound[:-1], 1e-6)
+    return pause + np.r_[0.0, np.cumsum(durations)]
+
+
+def densely(poses: np.ndarray, spacing: float = 0.002, angle: float = 0.02) -> np.ndarray:
+    """Return poses close together along straight lines and turns between ``poses`` [n, 6]."""
+    from scipy.spatial.transform import Rotation
+
+    result = [poses[0]]
+    for first, second in pairwise(poses):
+        way = float(np.linalg.norm(second[:3] - first[:3]))
+        turn = (Rotation.from_rotvec(second[3:]) * Rotation.from_rotvec(first[3:]).inv())
+        count = max(int(np.ceil(max(way / spacing, turn.magnitude() / angle))), 1)
+        result += [pose_between(first, second, part) for part in np.linspace(0, 1, count + 1)[1:]]
+    return np.array(result)
