@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError
-from limber.jobs.process import end_with_parent
 from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
 
 
@@ -200,18 +199,18 @@ class HeldBranch:
 
 
 def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
-    end_with_parent()
     solver = _Solver(setting)
-    pipe.send(("ready", {"points": solver.seen()}))
-    while True:
-        try:
+    try:
+        pipe.send(("ready", {"points": solver.seen()}))
+        while True:
             kind, content = pipe.recv()
-        except EOFError:
-            return
-        if kind == "grasp":
-            pipe.send(("grasped", solver.grasp(np.array(content))))
-        else:
-            pipe.send(("solved", solver.solve(content)))
+            if kind == "grasp":
+                pipe.send(("grasped", solver.grasp(np.array(content))))
+            else:
+                pipe.send(("solved", solver.solve(content)))
+    except (EOFError, OSError):
+        # The robot is gone, and nobody else asks.
+        return
 
 
 class _Solver:
