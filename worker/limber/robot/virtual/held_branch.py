@@ -219,7 +219,7 @@ class _Solver:
     def __init__(self, setting: BranchSetting):
         from limber.geometry.tets.tet_mesh import TetMesh
         from limber.mechanics.model import BranchModel
-        from limber.recordings.points import point_operator
+        from limber.mechanics.points import point_operator
 
         mesh = TetMesh.read(setting.mesh)
         data = mesh.cell_data
