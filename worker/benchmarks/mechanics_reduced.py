@@ -35,7 +35,7 @@ YOUNG = 5e7
 KNOWN = ReducedSettings(size=62, vibration_count=1, field_count=100)
 CHANGED = ReducedSettings(size=66, vibration_count=0, field_count=110)
 CLAMPED = ReducedSettings(size=90, vibration_count=0, field_count=140)
-SESSION = {"mode": "pinned", "grasps": 2, "size": 62, "fields": 100}
+SESSION = {"mode": "pinned", "gravity": False, "grasps": 2, "size": 62, "fields": 100}
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ def _put_in_cache(path: Path, cache: Path, reduced: ReducedModel, snapshots: Sna
     """Let the session find the model that is there already instead of making one."""
     settings = SessionSettings(**SESSION)
     held = load_held(path, settings)
-    grasp = Grasp.from_mesh(held.model.mesh, "pinned")
+    grasp = held.loaded.marked_grasp("pinned")
     key = model_key(held.model, grasp, held.weights, held.young, reduced_settings(settings))
     ReducedCache(cache).store(key, reduced, snapshots)
 
