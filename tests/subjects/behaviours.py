@@ -84,6 +84,8 @@ def main(name: str) -> int:
 
     signal.signal(signal.SIGTERM, _interrupted)
     end_with_parent_pipe(grace_seconds=1.0)
+    # A library that asks for input must not wait for ever.
+    assert sys.stdin.read() == ""
     code, outcome = 0, {"command": name, "status": "done", "error": None}
     try:
         outcome |= globals()[name](Progress(JsonSink(interval_seconds=0.0)))

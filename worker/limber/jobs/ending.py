@@ -36,13 +36,19 @@ def end_with_parent_pipe(grace_seconds: float = 10.0) -> None:
     if os.environ.pop(PARENT_PIPE, None) != "stdin":
         return
 
+    # Nobody else shall wait for input there, nor hold it open.
+    handle = os.dup(0)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+
     def closed() -> None:
         _thread.interrupt_main(signal.SIGTERM)
         timer = threading.Timer(grace_seconds, os._exit, (1,))
         timer.daemon = True
         timer.start()
 
-    _when_closed(0, closed)
+    _when_closed(handle, closed)
 
 
 def _when_closed(handle: int, then: Callable[[], None]) -> None:
