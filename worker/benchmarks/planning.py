@@ -153,10 +153,10 @@ def _trial(model: GraspModel, field: EnergyField, goal: GraspGoal, seed: int) ->
     except WorkError as error:
         return _Trial(seed, planned - started, time.perf_counter() - planned, {}, {}, np.nan,
                       str(error))
-    off = field.energy(plan.poses[:, :3]) - np.maximum(plan.energies, 0.0)
+    off = field.energy(plan.solved.poses[:, :3]) - np.maximum(plan.solved.energies, 0.0)
     return _Trial(seed, planned - started, time.perf_counter() - planned,
                   asdict(baseline.measures), asdict(plan.measures),
-                  float(np.sqrt(np.mean(off**2) / np.mean(plan.energies**2))))
+                  float(np.sqrt(np.mean(off**2) / np.mean(plan.solved.energies**2))))
 
 
 def _trial_rows(branch: PaperBranch, trials: list[_Trial], good: list[_Trial]) -> list[Row]:

@@ -54,6 +54,7 @@ class GraspSamples:
         tips: Position of the branch's tip [m], shape [m, 3].
         min_det_f: Least determinant of the deformation gradient, shape [m].
         rejected_poses: Poses without an acceptable solution, shape [q, 6].
+        targets: Positions of the named targets [m], shape [m, targets, 3].
     """
 
     poses: np.ndarray
@@ -62,6 +63,7 @@ class GraspSamples:
     tips: np.ndarray
     min_det_f: np.ndarray
     rejected_poses: np.ndarray
+    targets: np.ndarray | None = None
 
     @property
     def positions(self) -> np.ndarray:
@@ -70,6 +72,7 @@ class GraspSamples:
     def take(self, index: np.ndarray) -> "GraspSamples":
         """Return the samples of ``index``; rejected poses stay."""
         names = ("poses", "energies", "forces", "tips", "min_det_f")
+        names = names if self.targets is None else (*names, "targets")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
 
@@ -163,6 +166,8 @@ class EnergyField:
             "energy_error": np.array(self.errors["energy_error"]),
             "force_error": np.array(self.errors["force_error"]),
         }
+        if samples.targets is not None:
+            arrays["targets_m"] = samples.targets
         for name in ("energy_fit", "shape_fit"):
             arrays |= getattr(self, name).to_arrays(f"{name}_")
         np.savez_compressed(path, **arrays, **(extra or {}))
@@ -179,7 +184,8 @@ class EnergyField:
                 arrays = dict(file)
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
-                arrays["min_det_f"], arrays["rejected_poses"])
+                arrays["min_det_f"], arrays["rejected_poses"],
+                arrays.get("targets_m"))
             chart = Chart(arrays["chart_base_m"], float(arrays["chart_radius_m"]),
                           float(arrays["chart_stretch"]))
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")

@@ -106,11 +106,11 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
 
 def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:
     """Return the peak strain, and how far the field was from the full model along the path."""
-    points = path.poses[:, :3]
-    off = field.energy(points) - np.maximum(path.energies, 0.0)
-    size = float(np.sqrt(np.mean(path.energies**2)))
-    return {"peak_strain": float(path.strains.max()),
-            "tip_end_m": path.tips[-1],
+    solved = path.solved
+    off = field.energy(solved.poses[:, :3]) - np.maximum(solved.energies, 0.0)
+    size = float(np.sqrt(np.mean(solved.energies**2)))
+    return {"peak_strain": float(solved.strains.max()),
+            "tip_end_m": solved.tips[-1],
             "field_energy_error": float(np.sqrt(np.mean(off**2))) / size if size else 0.0,
             "field_energy_error_max_j": float(np.abs(off).max()),
             "unsolved_count": path.unsolved_count}

@@ -6,6 +6,7 @@ import numpy as np
 
 from limber.errors import ConvergenceError
 from limber.jobs import run_tasks
+from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.grasp_model import GraspModel, refusal
 from limber.progress import SILENT, Progress
@@ -15,30 +16,75 @@ _MOST_UNSOLVED = 0.1  # share of a path's poses
 
 
 @dataclass(frozen=True)
-class ResolvedPath:
-    """A path solved by finite elements.
+class SolvedPoses:
+    """States of the branch at poses of the gripper.
 
     Attributes:
         poses: Positions [m] and natural rotations [rad], shape [n, 6].
         energies: Potential of strain and weight above the hanging state [J], shape [n].
-        forces: Magnitude of the gripper's force [N], shape [n].
+        forces, torques: Of the gripper on the branch [N, Nm], shape [n, 3].
         strains: Largest principal Green-Lagrange strain anywhere in the branch, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].
+        targets: Positions of the named targets [m], shape [n, targets, 3].
         displacements: Of all nodes [m], shape [n, node_count, 3].
-        unsolved_count: Poses of the planned path that had no acceptable solution.
     """
 
     poses: np.ndarray
     energies: np.ndarray
     forces: np.ndarray
+    torques: np.ndarray
     strains: np.ndarray
     tips: np.ndarray
+    targets: np.ndarray
     displacements: np.ndarray
+
+    @classmethod
+    def of(cls, grasp_model: GraspModel, results: list[StaticResult]) -> "SolvedPoses":
+        """Return what solutions say."""
+        moved = [result.displacement for result in results]
+        return cls(
+            poses=np.array([grasp_model.pose(u) for u in moved]),
+            energies=np.array([grasp_model.energy(result) for result in results]),
+            forces=np.array([result.reaction_force for result in results]),
+            torques=np.array([result.reaction_torque for result in results]),
+            strains=np.array([grasp_model.peak_strain(u) for u in moved]),
+            tips=np.array([grasp_model.tip(u) for u in moved]),
+            targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
+            displacements=np.array(moved))
+
+    @property
+    def force_sizes(self) -> np.ndarray:
+        """Magnitude of the gripper's force [N], shape [n]."""
+        return np.linalg.norm(self.forces, axis=1)
+
+    def take(self, index: np.ndarray) -> "SolvedPoses":
+        """Return the states of ``index``, in its order."""
+        return SolvedPoses(**{name: values[index] for name, values in vars(self).items()})
+
+    def joined(self, other: "SolvedPoses") -> "SolvedPoses":
+        """Return these states and those of ``other`` behind them."""
+        return SolvedPoses(**{name: np.concatenate([values, getattr(other, name)])
+                              for name, values in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class ResolvedPath:
+    """A path solved by finite elements.
+
+    Attributes:
+        solved: The states along it.
+        approach: Those on the way from rest, the hanging state first, to before the path.
+        unsolved_count: Poses of the planned path that had no acceptable solution.
+    """
+
+    solved: SolvedPoses
+    approach: SolvedPoses
     unsolved_count: int
 
     @property
     def measures(self) -> PathMeasures:
-        return measure_path(self.poses[:, :3], self.energies, self.forces)
+        return measure_path(self.solved.poses[:, :3], self.solved.energies,
+                            self.solved.force_sizes)
 
 
 def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray,
@@ -48,11 +94,11 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
     Raises:
         ConvergenceError: over a tenth of the poses has no acceptable solution, or the last.
     """
-    state = grasp_model.rest.displacement
+    before = [grasp_model.rest]
     for point in resample(approach, _APPROACH_STEP)[1:-1]:
-        result = grasp_model.follow(point[None], state)[0]
-        state = state if refusal(result) else result.displacement
-    good, reasons = [], []
+        result = grasp_model.follow(point[None], before[-1].displacement)[0]
+        before += [] if refusal(result) else [result]
+    good, reasons, state = [], [], before[-1].displacement
     for number, point in enumerate(path):
         progress(number / len(path), "path on the full model")
         result = grasp_model.follow(point[None], state)[0]
@@ -65,14 +111,8 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
             raise _unsolved(reasons, len(path))
     if reason:
         raise _unsolved(reasons, len(path))
-    displacements = np.array([r.displacement for r in good])
-    poses = np.array([grasp_model.pose(u) for u in displacements])
-    return ResolvedPath(
-        poses=poses, energies=np.array([grasp_model.energy(r) for r in good]),
-        forces=np.array([np.linalg.norm(r.reaction_force) for r in good]),
-        strains=np.array([grasp_model.peak_strain(u) for u in displacements]),
-        tips=np.array([grasp_model.tip(u) for u in displacements]),
-        displacements=displacements, unsolved_count=len(reasons))
+    return ResolvedPath(SolvedPoses.of(grasp_model, good), SolvedPoses.of(grasp_model, before),
+                        len(reasons))
 
 
 def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,

@@ -38,6 +38,7 @@ class _Solved:
     tip: np.ndarray
     min_det_f: float
     trouble: Status | None
+    targets: np.ndarray
 
 
 def sample_positions(reach: Reach, rest: np.ndarray, count: int, *, deflection: float,
@@ -98,7 +99,8 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
     solved = [one for share in found for one in share]
     rest = grasp_model.rest
     at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, np.zeros(3),
-                      grasp_model.tip(rest.displacement), rest.min_det_f, None)
+                      grasp_model.tip(rest.displacement), rest.min_det_f, None,
+                      grasp_model.branch.target_positions(rest.displacement))
     good = [at_rest, *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
     bad = sorted((s for s in solved if s.trouble), key=lambda s: s.target)
     reasons = [s.trouble for s in bad]
@@ -108,7 +110,7 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
         poses=np.array([s.pose for s in good]), energies=np.array([s.energy for s in good]),
         forces=np.array([s.force for s in good]),
         tips=np.array([s.tip for s in good]), min_det_f=np.array([s.min_det_f for s in good]),
-        rejected_poses=rejected)
+        rejected_poses=rejected, targets=np.array([s.targets for s in good]))
     return samples, {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
 
 
@@ -127,7 +129,8 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
         found = _Solved(
             int(numbers[target]), grasp_model.pose(result.displacement),
             grasp_model.energy(result), result.reaction_force,
-            grasp_model.tip(result.displacement), float(result.min_det_f), refusal(result))
+            grasp_model.tip(result.displacement), float(result.min_det_f), refusal(result),
+            grasp_model.branch.target_positions(result.displacement))
         if not found.trouble:
             positions.append(targets[target])
             states.append(result.displacement)

@@ -228,10 +228,11 @@ def _plans(branch: Branch) -> list[Callable[[Branch], Section]]:
 
 
 def _plan(branch: Branch, name: str) -> Section:
+    from limber.planning.plan_file import read_plan
     from limber.report import plan_figures
 
     section = Section(f"Paths: {name}")
-    plan = json.loads(branch.path(f"plans/{name}.json").read_text(encoding="utf-8"))
+    plan = read_plan(branch.path(f"plans/{name}.json")).summary
     section.tables.append(("RRT* (length alone) against D-RRT* (deformation-aware), both scored "
                            "on the full model", comparison_rows(plan)))
     section.text.append(

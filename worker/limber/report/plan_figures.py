@@ -1,12 +1,12 @@
 """Figures of a plan: energy along both paths, and both paths over a slice of the energy field."""
 
-import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from limber.planning.cost import arc_lengths
 from limber.planning.field import EnergyField
+from limber.planning.plan_file import PlanFile, Way, read_plan
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -19,12 +19,12 @@ _GRID = 160  # points of the slice along its longer side
 
 def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
     """Return the figures of plan ``name`` with their captions."""
-    plan = json.loads(branch.path(f"plans/{name}.json").read_text(encoding="utf-8"))
+    plan = read_plan(branch.path(f"plans/{name}.json"))
     field = EnergyField.read(branch.path("energy.npz"))
     return [
-        (along_paths(plan), "Strain energy, gripper force and largest strain along both paths, "
-                            "on the full model; the energy of the field that the planner saw is "
-                            "dashed."),
+        (along_paths(plan), "Energy above the hanging state (strain and weight), gripper force and "
+                            "largest strain along both paths, on the full model; the energy of the "
+                            "field that the planner saw is dashed."),
         (paths_over_slice(field, plan), "Both paths over the energy field, in the plane that "
                                         "fits them best; white where the branch was not sampled. "
                                         "The cross is the rest pose."),
@@ -33,23 +33,21 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
     ]
 
 
-def along_paths(plan: dict[str, Any]) -> "Figure":
+def along_paths(plan: PlanFile) -> "Figure":
     """Draw energy, force and strain over the length of both paths."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = figure.subplots(1, 3)
-    for key in ("baseline", "plan"):
-        path = plan[key]
-        along = 1e3 * arc_lengths(np.array(path["poses"])[:, :3])
+    for key, path in _ways(plan).items():
+        along = 1e3 * arc_lengths(path.poses[:, :3])
         style = {"color": _COLOURS[key], "label": _LABELS[key]}
-        axes[0].plot(along, 1e3 * np.array(path["energies_j"]), **style)
-        if "field_energies_j" in path:
-            axes[0].plot(along, 1e3 * np.array(path["field_energies_j"]), "--", lw=1,
-                         color=_COLOURS[key])
-        axes[1].plot(along, path["forces_n"], **style)
-        axes[2].plot(along, 100 * np.array(path["strains"]), **style)
-    for axis, label in zip(axes, ("strain energy above rest [mJ]", "gripper force [N]",
+        axes[0].plot(along, 1e3 * path.energies, **style)
+        if path.field_energies is not None:
+            axes[0].plot(along, 1e3 * path.field_energies, "--", lw=1, color=_COLOURS[key])
+        axes[1].plot(along, path.force_sizes, **style)
+        axes[2].plot(along, 100 * path.strains, **style)
+    for axis, label in zip(axes, ("energy above rest [mJ]", "gripper force [N]",
                                   "largest strain [%]"), strict=True):
         axis.set(xlabel="along the path [mm]", ylabel=label)
         axis.grid(alpha=0.25)
@@ -57,12 +55,12 @@ def along_paths(plan: dict[str, Any]) -> "Figure":
     return figure
 
 
-def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
+def paths_over_slice(field: EnergyField, plan: PlanFile) -> "Figure":
     """Draw both paths over the energy field in their common plane."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    paths = {key: np.array(plan[key]["poses"])[:, :3] for key in ("baseline", "plan")}
+    paths = {key: way.poses[:, :3] for key, way in _ways(plan).items()}
     origin, across, up = _plane(np.concatenate(list(paths.values())))
     flat = {key: (path - origin) @ np.stack([across, up], axis=1) for key, path in paths.items()}
     rest = (field.rest - origin) @ np.stack([across, up], axis=1)
@@ -72,11 +70,11 @@ def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
     figure = Figure(figsize=(8, float(np.clip(height, 2.8, 6.5))), layout="constrained")
     axis = figure.subplots()
     # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
-    top = max(1.5 * max(max(plan[key]["energies_j"]) for key in paths), 1e-9)
+    top = max(1.5 * max(way.energies.max() for way in _ways(plan).values()), 1e-9)
     levels = MaxNLocator(14).tick_values(0.0, 1e3 * top)
     filled = axis.contourf(1e3 * x, 1e3 * y, np.ma.masked_invalid(1e3 * energy), levels=levels,
                            cmap="viridis", extend="max")
-    figure.colorbar(filled, ax=axis, label="strain energy above rest [mJ]")
+    figure.colorbar(filled, ax=axis, label="energy above rest [mJ]")
     for key, points in flat.items():
         axis.plot(*(1e3 * points.T), color="white", lw=4)
         axis.plot(*(1e3 * points.T), color=_COLOURS[key], lw=2, label=_LABELS[key])
@@ -89,13 +87,13 @@ def paths_over_slice(field: EnergyField, plan: dict[str, Any]) -> "Figure":
     return figure
 
 
-def convergence(plan: dict[str, Any]) -> "Figure":
+def convergence(plan: PlanFile) -> "Figure":
     """Draw the cost of the best path over iterations, both relative to their last."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     axis = figure.subplots()
-    for key, history in plan["convergence"].items():
+    for key, history in plan.summary["convergence"].items():
         if history:
             cost = np.array([entry["cost"] for entry in history])
             axis.plot([entry["iteration"] for entry in history], cost / cost[-1],
@@ -104,6 +102,10 @@ def convergence(plan: dict[str, Any]) -> "Figure":
     axis.grid(alpha=0.25)
     axis.legend(frameon=False)
     return figure
+
+
+def _ways(plan: PlanFile) -> dict[str, Way]:
+    return {"baseline": plan.baseline, "plan": plan.plan}
 
 
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

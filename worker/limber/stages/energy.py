@@ -49,6 +49,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             progress.warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); "
                           "paths keep away from them.")
         field.write(stage.path("energy.npz"), {
+            "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
             "rest_pose": samples.poses[0], "arc_length_m": np.array(grasp_model.reach.arc_length)})
         stage.result.update(
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,

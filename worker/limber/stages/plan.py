@@ -29,12 +29,14 @@ if TYPE_CHECKING:
     from limber.planning.field import EnergyField
     from limber.planning.grasp_model import GraspModel
     from limber.planning.plan import PlannedMotion
-    from limber.planning.resolve import ResolvedPath
+    from limber.planning.plan_file import Way
 
 
 _FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
 _COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
             "strain")
+_MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx_n", "fy_n", "fz_n",
+                   "tx_nm", "ty_nm", "tz_nm", "energy_j", "strain")
 
 
 class PlanInputs(BranchInputs):
@@ -61,9 +63,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
     from limber.planning.sampling import energy_inputs
     from limber.stages.loading import load_grasp_model
 
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith("-baseline"):
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
+            ("-baseline", "-motion")):
         raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names, and -baseline is the other path's.",
+                         "It becomes part of file names; -baseline and -motion are its own tables.",
                          "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field_path = branch.require("energy.npz", "energy")
@@ -84,50 +87,65 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
         field = EnergyField.read(field_path)
         found = plan_motion(field, grasp_model, settings, workers=workers, progress=progress)
         progress(0.95, "writing")
-        _write(stage, name, grasp_model, field, found)
+        _write(stage, name, settings, grasp_model, field, found)
         stage.result.update(found.summary)
     progress(1.0, "planned")
     return branch.manifest.stages[key].result
 
 
-def _write(stage: Stage, name: str, grasp_model: GraspModel, field: EnergyField,
-           found: PlannedMotion) -> None:
+def _write(stage: Stage, name: str, settings: PlanSettings, grasp_model: GraspModel,
+           field: EnergyField, found: PlannedMotion) -> None:
     from limber.mechanics.frames import surface_fields, write_pc2
     from limber.mechanics.strain import strain_state
+    from limber.planning.plan_file import limits_of_motion, plan_text, way_of, whole_motion
 
-    detailed = dict(found.summary)
-    baseline, plan = found.baseline, found.plan
-    for key, path in (("baseline", baseline), ("plan", plan)):
-        detailed[key] = found.summary[key] | {
-            "poses": path.poses, "energies_j": path.energies, "forces_n": path.forces,
-            "strains": path.strains, "tips_m": path.tips,
-            "field_energies_j": field.energy(path.poses[:, :3])}
+    names = tuple(target.name for target in grasp_model.branch.targets)
+    baseline, plan = (way_of(path.solved, names,
+                             field_energies=field.energy(path.solved.poses[:, :3]))
+                      for path in (found.baseline, found.plan))
+    motion = whole_motion(found.plan, names)
+    limits = limits_of_motion(motion, settings.max_energy, settings.max_force)
     stage.path(f"plans/{name}.json").write_text(
-        json.dumps(plain(detailed), allow_nan=False, indent=1) + "\n", encoding="utf-8")
+        plan_text(found.summary, baseline, plan, motion, limits), encoding="utf-8")
     stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
     stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
+    stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")
+    displacements = found.plan.solved.displacements
     vertices = np.unique(grasp_model.mesh.surface_faces())
-    frames = grasp_model.mesh.nodes[vertices] + plan.displacements[:, vertices]
+    frames = grasp_model.mesh.nodes[vertices] + displacements[:, vertices]
     write_pc2(stage.path(f"frames/{name}.pc2"), frames, 0.0, 1.0)
     stage.path(f"frames/{name}.json").write_text(json.dumps(plain({
         "frame_count": len(frames), "rate": _FRAME_RATE, "vertex_count": len(vertices),
-        "energies_j": plan.energies, "forces_n": plan.forces, "path": name})) + "\n",
+        "energies_j": plan.energies, "forces_n": plan.force_sizes, "path": name})) + "\n",
         encoding="utf-8")
     # What the scene can colour the surface by, at the vertices and in the order of the frames.
     model, mesh = grasp_model.model, grasp_model.mesh
-    states = [strain_state(model, u) for u in plan.displacements]
+    states = [strain_state(model, u) for u in displacements]
     np.savez_compressed(stage.path(f"frames/{name}.npz"), **surface_fields(mesh, states))
 
 
-def _table(path: ResolvedPath) -> str:
+def _table(way: Way) -> str:
     from limber.planning.cost import arc_lengths
 
+    along = arc_lengths(way.poses[:, :3])
+    return _csv(_COLUMNS, np.column_stack(
+        [along, way.poses, way.energies, way.force_sizes, way.strains]))
+
+
+def _motion_table(motion: Way) -> str:
+    targets = [f"{name}_{axis}_m" for name in motion.targets for axis in "xyz"]
+    rows = np.column_stack([motion.times, motion.poses, motion.forces, motion.torques,
+                            motion.energies, motion.strains, *motion.targets.values()])
+    return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
+
+
+def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | None = None) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    along = arc_lengths(path.poses[:, :3])
-    rows = np.column_stack([along, path.poses, path.energies, path.forces, path.strains])
-    writer.writerows([f"{value:.9g}" for value in row] for row in rows)
+    writer.writerow((*columns, *(() if phases is None else ("phase",))))
+    for number, row in enumerate(rows):
+        writer.writerow([*(f"{value:.9g}" for value in row),
+                         *(() if phases is None else (phases[number],))])
     return text.getvalue()
 
 
@@ -148,5 +166,6 @@ STAGE = StageDescription(
     "plan", 100, run, PlanInputs, PlanSettings, ParallelOptions, key="plan:{name}",
     reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
-            "frames/{name}.pc2", "frames/{name}.json", "frames/{name}.npz"),
+            "plans/{name}-motion.csv", "frames/{name}.pc2", "frames/{name}.json",
+            "frames/{name}.npz"),
     tables=_tables)

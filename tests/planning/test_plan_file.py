@@ -1,0 +1,123 @@
+"""Plan files: the whole motion of format 2, format 1 as it was, and what is refused."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.planning.plan_file import (
+    SPEED,
+    limits_of_motion,
+    plan_text,
+    read_plan,
+    way_of,
+    whole_motion,
+)
+from limber.planning.resolve import ResolvedPath, SolvedPoses
+
+OLD = Path(__file__).parents[2] / "blend_files/bending_branch/plans/to-goal.json"
+
+
+def solved(xs):
+    """States whose values tell where they are: x [m] alone changes."""
+    xs = np.asarray(xs, float)
+    poses = np.zeros((len(xs), 6))
+    poses[:, 0] = xs
+    vector = np.stack([xs, 0 * xs, 1 + xs], axis=1)
+    return SolvedPoses(poses, xs**2, vector, 0.1 * vector, 0.01 * xs, 2 * vector,
+                       np.stack([vector, 3 * vector], axis=1), np.zeros((len(xs), 4, 3)))
+
+
+@pytest.fixture
+def path():
+    return ResolvedPath(solved([0.1, 0.15, 0.2]), solved([0.0, 0.05]), 0)
+
+
+def test_motion_goes_there_and_back(path):
+    """Approach from rest, path, and back by the same states; times ascend at one speed."""
+    motion = whole_motion(path, ("flower", "leaf"))
+    wanted = [0, 0.05, 0.1, 0.15, 0.2, 0.15, 0.1, 0.05, 0]
+    np.testing.assert_allclose(motion.poses[:, 0], wanted)
+    assert motion.phases == ("approach",) * 2 + ("path",) * 3 + ("return",) * 4
+    np.testing.assert_allclose(motion.times[-1], 0.4 / SPEED)
+    assert (np.diff(motion.times) > 0).all()
+    np.testing.assert_allclose(motion.targets["leaf"][:, 0], 3 * np.array(wanted))
+    np.testing.assert_allclose(motion.torques, 0.1 * motion.forces)
+
+
+def test_motion_from_rest_has_no_approach():
+    """A path that begins at rest is not preceded by the same pose again."""
+    motion = whole_motion(ResolvedPath(solved([0.0, 0.1]), solved([0.0]), 0))
+    np.testing.assert_allclose(motion.poses[:, 0], [0, 0.1, 0])
+    assert motion.phases == ("path", "path", "return")
+
+
+def test_limits_tell_their_margin(path):
+    """Over the whole motion; what was not asked for is not there."""
+    limits = limits_of_motion(whole_motion(path), None, 2.0)
+    assert set(limits) == {"force_n"}
+    assert limits["force_n"]["peak"] == pytest.approx(np.hypot(0.2, 1.2))
+    assert limits["force_n"]["margin"] == pytest.approx(2.0 - np.hypot(0.2, 1.2))
+
+
+def written(path, folder):
+    ways = [way_of(path.solved, ("flower", "leaf"), field_energies=np.ones(3))] * 2
+    motion = whole_motion(path, ("flower", "leaf"))
+    summary = {"seed": 3, "baseline": {"length_m": 0.1}, "plan": {"length_m": 0.1}}
+    file = folder / "plan.json"
+    file.write_text(plan_text(summary, *ways, motion, limits_of_motion(motion, 0.1, None)))
+    return file
+
+
+def test_what_is_written_is_read(path, tmp_path):
+    """All columns, vectors as vectors; summary, limits and timing with them."""
+    plan = read_plan(written(path, tmp_path))
+    assert plan.version == 2 and plan.summary["seed"] == 3
+    assert plan.summary["timing"]["kind"] == "constant speed"
+    assert plan.summary["limits"]["energy_j"]["limit"] == 0.1 and plan.summary["robot"] is None
+    motion = whole_motion(path, ("flower", "leaf"))
+    for name in ("poses", "energies", "forces", "torques", "strains", "tips", "times"):
+        np.testing.assert_allclose(getattr(plan.motion, name), getattr(motion, name))
+    assert plan.motion.phases == motion.phases
+    np.testing.assert_allclose(plan.plan.targets["flower"], path.solved.targets[:, 0])
+    np.testing.assert_allclose(plan.plan.force_sizes, path.solved.force_sizes)
+    assert plan.plan.joints is None
+
+
+def test_format_1_is_read():
+    """A plan of the first format: sizes of forces, no vectors, no motion."""
+    plan = read_plan(OLD)
+    stored = json.loads(OLD.read_text())
+    assert "format_version" not in stored and plan.version == 1
+    assert plan.motion is None and plan.plan.forces is None and plan.plan.times is None
+    np.testing.assert_array_equal(plan.plan.force_sizes, stored["plan"]["forces_n"])
+    assert plan.baseline.poses.shape == (len(stored["baseline"]["energies_j"]), 6)
+
+
+@pytest.mark.parametrize(("spoil", "words"), [
+    (lambda content: content.update(format_version=3), "format 3"),
+    (lambda content: content["plan"]["energies_j"].pop(), "unequal"),
+    (lambda content: content.pop("motion"), "motion"),
+    (lambda content: content["plan"]["poses"].__setitem__(0, [0.0] * 5), "not a plan"),
+    (lambda content: content["motion"]["forces_n"][0].__setitem__(0, float("nan")), "finite"),
+])
+def test_damaged_plans_are_refused(path, tmp_path, spoil, words):
+    """With what is wrong; a newer format by its number."""
+    file = written(path, tmp_path)
+    content = json.loads(file.read_text())
+    spoil(content)
+    file.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=words):
+        read_plan(file)
+
+
+def test_joints_are_carried(path, tmp_path):
+    """Where a robot is given its joint angles stand beside the poses."""
+    way = replace(way_of(path.solved), joints=np.ones((3, 6)))
+    summary = {"baseline": {}, "plan": {}}
+    file = tmp_path / "plan.json"
+    file.write_text(plan_text(summary, way, way, way, {}))
+    np.testing.assert_array_equal(read_plan(file).motion.joints, np.ones((3, 6)))

@@ -1,0 +1,196 @@
+"""The file ``plans/NAME.json``: what a plan asks of gripper and branch, pose by pose.
+
+Format 2. Beside the summary (goal, scores of both paths, seeds) it has three ways, ``baseline`` and
+``plan`` between start and goal, and ``motion``: the whole of what a gripper does, from the hanging
+branch to the start (``approach``), along the plan (``path``) and back by the way it came
+(``return``). Each way is a table of columns of one length:
+
+``times_s``, ``poses`` [m, rad] [n][6], ``energies_j``, ``forces_n`` and ``torques_nm`` [n][3] (of
+the gripper on the branch, the torque about the pose's position), ``strains`` (largest in the
+branch), ``tips_m`` [n][3], ``targets_m`` {name: [n][3]}, ``field_energies_j`` (what the field had
+promised), ``joints_rad`` [n][6] where a robot is given; ``motion`` also ``phases``.
+
+``timing`` says where times come from: today one speed of the gripper throughout, no acceleration
+limited. ``limits`` has for each limit asked for its value, the peak of the motion and the margin.
+``robot`` is null until plans are made for one.
+
+Format 1 had no version, no motion, and the sizes of forces alone. It is read as well.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.plain import plain
+from limber.planning.cost import arc_lengths
+from limber.planning.resolve import ResolvedPath, SolvedPoses
+
+FORMAT = 2
+SPEED = 0.02
+"""Of the gripper along a motion [m/s], until motions are timed: slow enough that nothing swings."""
+
+_WAYS = ("baseline", "plan")
+_COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "tips": "tips_m",
+            "torques": "torques_nm", "times": "times_s", "field_energies": "field_energies_j",
+            "joints": "joints_rad"}
+
+
+@dataclass(frozen=True)
+class Way:
+    """States along a way; None where a file does not have them.
+
+    Attributes:
+        poses: [m, rad], shape [n, 6].
+        energies: Potential of strain and weight above the hanging state [J], shape [n].
+        force_sizes: Of the gripper's force [N], shape [n].
+        strains: Largest in the branch, shape [n].
+        forces, torques: Of the gripper on the branch [N, Nm], shape [n, 3].
+        times: [s], ascending, shape [n].
+        tips: Position of the branch's tip [m], shape [n, 3].
+        targets: Positions [m], shape [n, 3] each, by name.
+        field_energies: What the energy field had promised [J], shape [n].
+        joints: Of the robot [rad], shape [n, joints].
+        phases: ``approach``, ``path`` or ``return``, n of them.
+    """
+
+    poses: np.ndarray
+    energies: np.ndarray
+    force_sizes: np.ndarray
+    strains: np.ndarray
+    forces: np.ndarray | None = None
+    torques: np.ndarray | None = None
+    times: np.ndarray | None = None
+    tips: np.ndarray | None = None
+    targets: dict[str, np.ndarray] = field(default_factory=dict)
+    field_energies: np.ndarray | None = None
+    joints: np.ndarray | None = None
+    phases: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class PlanFile:
+    """A plan as read.
+
+    Attributes:
+        version: Of the file's format.
+        summary: All of the file that is no column.
+        baseline, plan: Between start and goal.
+        motion: The whole of it, None in format 1.
+    """
+
+    version: int
+    summary: dict[str, Any]
+    baseline: Way
+    plan: Way
+    motion: Way | None
+
+
+def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
+           field_energies: np.ndarray | None = None, phases: tuple[str, ...] | None = None) -> Way:
+    """Return the way of solved poses, at one speed.
+
+    Args:
+        targets: Names, in the order of the solution's.
+    """
+    return Way(
+        poses=solved.poses, energies=solved.energies, force_sizes=solved.force_sizes,
+        strains=solved.strains, forces=solved.forces, torques=solved.torques,
+        times=arc_lengths(solved.poses[:, :3]) / SPEED, tips=solved.tips,
+        targets={name: solved.targets[:, k] for k, name in enumerate(targets)},
+        field_energies=field_energies, phases=phases)
+
+
+def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = ()) -> Way:
+    """Return approach from rest, path, and the way back, which is the same in reverse.
+
+    Equilibria have no memory: on the way back the branch takes the states that it came by.
+    """
+    there, approach = path.solved, path.approach
+    near = np.linalg.norm(approach.poses[-1, :3] - there.poses[0, :3]) < 1e-9
+    approach = approach.take(np.arange(len(approach.poses) - near))
+    count, ahead = len(approach.poses), approach.joined(there)
+    back = np.arange(len(ahead.poses) - 1)[::-1]
+    phases = ("approach",) * count + ("path",) * len(there.poses) + ("return",) * len(back)
+    return way_of(ahead.joined(ahead.take(back)), targets, phases=phases)
+
+
+def limits_of_motion(motion: Way, max_energy: float | None,
+                     max_force: float | None) -> dict[str, dict[str, float]]:
+    """Return value, peak along the motion and margin of each limit that was asked for."""
+    asked = {"energy_j": (max_energy, motion.energies), "force_n": (max_force, motion.force_sizes)}
+    return {name: {"limit": limit, "peak": float(values.max()),
+                   "margin": limit - float(values.max())}
+            for name, (limit, values) in asked.items() if limit is not None}
+
+
+def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,
+              limits: dict[str, dict[str, float]]) -> str:
+    """Return the content of a file of format 2.
+
+    Args:
+        summary: With an entry for ``baseline`` and for ``plan``.
+    """
+    content = {
+        "format_version": FORMAT, **summary, "targets": sorted(plan.targets),
+        "timing": {"kind": "constant speed", "speed_m_s": SPEED}, "limits": limits, "robot": None,
+        "baseline": summary["baseline"] | _columns(baseline),
+        "plan": summary["plan"] | _columns(plan), "motion": _columns(motion)}
+    return json.dumps(plain(content), allow_nan=False, indent=1) + "\n"
+
+
+def read_plan(path: Path) -> PlanFile:
+    """Read a plan of format 1 or 2.
+
+    Raises:
+        InputError: it is no plan, damaged, or of a newer program.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        version = content.get("format_version", 1)
+    except (OSError, ValueError, AttributeError) as error:
+        raise _not_a_plan(path, str(error)) from error
+    if version not in (1, FORMAT):
+        raise InputError(f"{path} is a plan of format {version}.",
+                         f"This program knows formats 1 and {FORMAT}.", "Update Limber.")
+    try:
+        ways = {name: _way(content[name]) for name in _WAYS}
+        motion = _way(content["motion"]) if version > 1 else None
+    except (KeyError, TypeError, ValueError) as error:
+        raise _not_a_plan(path, f"{type(error).__name__}: {error}") from error
+    kept = {name: value for name, value in content.items() if name != "motion"}
+    return PlanFile(version, kept, ways["baseline"], ways["plan"], motion)
+
+
+def _columns(way: Way) -> dict[str, Any]:
+    found = {column: getattr(way, name) for name, column in _COLUMNS.items()
+             if getattr(way, name) is not None}
+    found |= {"forces_n": way.forces, "targets_m": way.targets}
+    return found if way.phases is None else found | {"phases": way.phases}
+
+
+def _way(content: dict[str, Any]) -> Way:
+    values = {name: np.array(content[column], float) for name, column in _COLUMNS.items()
+              if content.get(column) is not None}
+    count = len(values["poses"])
+    forces = np.array(content["forces_n"], float)
+    known = forces.ndim == 2
+    targets = {name: np.array(positions, float)
+               for name, positions in content.get("targets_m", {}).items()}
+    phases = tuple(content["phases"]) if "phases" in content else None
+    columns = [*values.values(), forces, *targets.values(), *([] if phases is None else [phases])]
+    if values["poses"].shape != (count, 6) or any(len(column) != count for column in columns):
+        raise ValueError("columns of unequal length")
+    if any(not np.isfinite(column).all() for column in [*values.values(), forces]):
+        raise ValueError("values that are not finite")
+    return Way(force_sizes=np.linalg.norm(forces, axis=1) if known else forces,
+               forces=forces if known else None, targets=targets, phases=phases, **values)
+
+
+def _not_a_plan(path: Path, why: str) -> InputError:
+    return InputError(f"{path} is not a plan ({why}).",
+                      "It was not written by `limber plan`, or is damaged.",
+                      "Run `limber plan` again with --force.")
