@@ -183,6 +183,20 @@ def test_a_simulation_has_its_own_times_and_moves_its_marks(tmp_path, mesh):
         assert moved[-1, 0] - moved[0, 0] == pytest.approx(height**2, rel=0.15)
 
 
+def test_the_newest_motion_is_the_one_finished_last(tmp_path, mesh):
+    """By the manifest, not by the files' own times, which a copy changes."""
+    import os
+
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    branch = _branch(tmp_path / "a.branch", mesh,
+                     simulate={"frames/b.pc2": _pc2(_bending(surface, 3))},
+                     other={"frames/a.pc2": _pc2(_bending(surface, 2))})
+    branch.manifest.stages["simulate"].finished = "2026-01-01T00:00:00+00:00"
+    branch.manifest.stages["other"].finished = "2026-01-02T00:00:00+00:00"
+    os.utime(branch.path("frames/a.pc2"), (1, 1))
+    assert scene_data(branch).info["frames"]["name"] == "a"
+
+
 def test_motions_are_named(tmp_path, mesh):
     """Of several motions the plan's is shown, or the one that is named; another name is refused."""
     surface = mesh.nodes[np.unique(mesh.surface_faces())]
@@ -267,7 +281,8 @@ def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
     """What `limber target` wrote is in the file that the add-on opens."""
     from limber.stages.scene import scene
 
-    targets = {"targets": [{"name": "flower", "position_m": [0.0, 0.0, 0.4], "mass_kg": 0.01}]}
+    targets = {"format_version": 1, "targets": [
+        {"name": "flower", "position_m": [0.0, 0.0, 0.4], "mass_kg": 0.01}]}
     _branch(tmp_path / "a.branch", mesh.with_data(
         cell_data={"young": np.full(mesh.tet_count, 1e8)}),
         target={"targets.json": json.dumps(targets)})

@@ -41,7 +41,7 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
                                 "Name one of them, or run `limber simulate`.")
     name = motion or (plan if plan in names else None)
     if name is None and plan is None and names:
-        name = max(names, key=lambda each: branch.path(f"frames/{each}.pc2").stat().st_mtime)
+        name = max(names, key=lambda each: _finished(branch, each))
     if name is None:
         return
     positions = _read_frames(branch.path(f"frames/{name}.pc2"), len(data.arrays["vertices"]))
@@ -90,6 +90,12 @@ def _held_on(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
             last = np.searchsorted(seen, np.arange(len(positions)), side="right") - 1
             found[:, point] = positions[seen[np.maximum(last, 0)], point]
     return found
+
+
+def _finished(branch: Branch, name: str) -> str:
+    """Return when frames were written, as the manifest says: a file's own time a copy changes."""
+    return max((entry.finished for entry in branch.manifest.stages.values()
+                if f"frames/{name}.pc2" in entry.writes), default="")
 
 
 def _about(branch: Branch, name: str) -> dict[str, Any]:
