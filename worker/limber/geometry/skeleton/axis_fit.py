@@ -14,6 +14,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from limber.geometry.skeleton.noisy_rings import mean_places, seen_sides
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
 from limber.geometry.surface.sweep import resample, tangents
 from limber.progress import SILENT, Progress
@@ -23,6 +24,7 @@ _REACH = 2.0  # how far an axis may move from where the contraction saw it, in i
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
 _PROBE = 128  # nodes between two whose radii are taken as independent of each other
 _TUKEY = 4.685  # 95 % efficiency for normal noise
+_ENOUGH = 200  # points that tell the noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
 
@@ -58,17 +60,18 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
     spread = 0.35 * float(np.median(radius))
     floor = 0.05 * float(np.median(radius))
-    bias = 0.0
     for number in range(rounds):
         match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
         # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
         noise = max(_robust_sigma(match.residual, radius[match.segment]), 1e-4 * floor)
         spread = max(noise, 0.6 * spread)
-        weight = _tukey(match.residual, np.minimum(
-            _TUKEY * spread, 0.9 * radius[match.segment] + noise))
+        weight = _tukey(match.residual, _limit(spread, noise, radius[match.segment]))
         # While axes are still far off, the misfit is no noise that smoothing could help against.
         trusted = noise if number > rounds // 2 else 0.0
-        system = _system(skeleton, nodes, radius, match, weight, trusted)
+        place = match.normal
+        if trusted:
+            place = _places(skeleton.parent, nodes, match, weight, noise)
+        system = _system(skeleton, nodes, radius, match, weight, trusted, place)
         step = system.solve()
         limit = 0.5 * radius
         size = np.linalg.norm(step[:, :3], axis=1)
@@ -77,7 +80,6 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         radius = radius + np.clip(step[:, 3], -0.4 * radius, 0.8 * radius)
         nodes, radius = _near_start(skeleton, nodes, radius)
         progress((number + 1) / rounds, "fitting axes", noise_m=noise)
-        bias = noise
         if number > rounds // 2 + 1 and size.max() < 1e-3 * floor and spread <= 1.01 * noise:
             break
     match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
@@ -87,10 +89,24 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
         sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
         state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
-    # Noise across the axis makes points lie farther from it on average, by sigma^2 / 2r.
-    radius = np.maximum(radius - np.minimum(bias**2 / (2 * radius), 0.25 * radius), 0.1 * floor)
-    fitted = replace(skeleton, nodes=nodes, radius=radius, radius_sigma=sigma, radius_state=state)
+    fitted = replace(skeleton, nodes=nodes, radius=np.maximum(radius, 0.1 * floor),
+                     radius_sigma=sigma, radius_state=state)
     return AxisFit(fitted, match.segment, match.residual, noise)
+
+
+def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
+    """Residual [m] from which a point belongs to something else, shape [m]."""
+    return np.minimum(_TUKEY * spread, 0.9 * radius + 3 * np.minimum(noise, radius))
+
+
+def _places(parent: np.ndarray, nodes: np.ndarray, match: "_Match", weight: np.ndarray,
+            noise: float) -> np.ndarray:
+    """Mean direction to where on its cylinder each point comes from, shape [m, 3]."""
+    axis = nodes[match.segment] - nodes[parent[match.segment]]
+    axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+    sharpness = match.thick * (match.residual + match.thick) / max(noise, 1e-12)**2
+    seen = seen_sides(match.normal, axis, sharpness, weight)
+    return mean_places(match.normal, axis, sharpness, seen)
 
 
 def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
@@ -254,6 +270,7 @@ class _Match:
     share: np.ndarray
     normal: np.ndarray
     residual: np.ndarray
+    thick: np.ndarray
     own_radius: np.ndarray
 
 
@@ -278,14 +295,19 @@ def _match(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.
     chosen = distance[rows, best]
     normal = offset[rows, best] / np.maximum(chosen, 1e-300)[:, None]
     return _Match(near[rows, best], share[rows, best], normal, chosen - thick[rows, best],
-                  own[rows, best])
+                  thick[rows, best], own[rows, best])
 
 
 def _robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
-    near = residual[np.abs(residual) < radius]
-    if len(near) < 10:
-        near = residual
-    return float(1.4826 * np.median(np.abs(near - np.median(near))))
+    """Noise [m] of points on the thicker half: around thin twigs, part of it passes for radius."""
+    near = np.abs(residual) < radius
+    if near.sum() < 10:
+        near = np.ones(len(residual), bool)
+    thick = near & (radius >= np.median(radius[near]))
+    if thick.sum() >= _ENOUGH:
+        near = thick
+    middle = np.median(residual[near])
+    return float(1.4826 * np.median(np.abs(residual[near] - middle)))
 
 
 def _tukey(residual: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -304,8 +326,8 @@ class _System:
 
 
 def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _Match,
-            weight: np.ndarray, noise: float) -> _System:
-    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight)
+            weight: np.ndarray, noise: float, place: np.ndarray | None = None) -> _System:
+    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place)
     smooth = _smoothness(skeleton, nodes, radius, per_node, noise)
     state = np.column_stack([nodes, radius]).ravel()
     anchor = _anchor(skeleton, nodes, per_node)
@@ -314,28 +336,39 @@ def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _M
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: _Match, weight: np.ndarray,
+                place: np.ndarray | None = None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
-    """Normal equations of the residuals in (x, y, z, r) of both ends, and weight a node."""
+    """Normal equations of the residuals in (x, y, z, r) of both ends, and weight a node.
+
+    Args:
+        place: Mean direction of each point's true place (:mod:`noisy_rings`), shape [m, 3]; None:
+            the nearest place on the circle is the true one.
+    """
     count = len(nodes)
+    place = match.normal if place is None else place
     low = np.where(match.own_radius, 0.0, 1 - match.share)
     high = np.where(match.own_radius, 1.0, match.share)
     jacobian = np.column_stack([
         -(1 - match.share)[:, None] * match.normal, -low,
         -match.share[:, None] * match.normal, -high])
+    distance = match.residual + match.thick
+    pull = distance[:, None] * match.normal - match.thick[:, None] * place
+    grow = distance * np.einsum("mj,mj->m", match.normal, place) - match.thick
+    gradient = np.column_stack([
+        (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
     block = np.empty((count, 8, 8))
     right = np.empty((count, 8))
     for i in range(8):
-        right[:, i] = -np.bincount(
-            match.segment, weight * jacobian[:, i] * match.residual, count)
+        right[:, i] = np.bincount(match.segment, weight * gradient[:, i], count)
         for j in range(i, 8):
             block[:, i, j] = block[:, j, i] = np.bincount(
                 match.segment, weight * jacobian[:, i] * jacobian[:, j], count)
     ends = np.arange(1, count)
-    place = (4 * np.stack([parent[ends], ends], axis=1)[:, :, None] + np.arange(4)).reshape(-1, 8)
-    rows = np.repeat(place, 8, axis=1).ravel()
-    columns = np.tile(place, (1, 8)).ravel()
+    index = (4 * np.stack([parent[ends], ends], axis=1)[:, :, None] + np.arange(4)).reshape(-1, 8)
+    rows = np.repeat(index, 8, axis=1).ravel()
+    columns = np.tile(index, (1, 8)).ravel()
     matrix = sparse.coo_matrix((block[1:].ravel(), (rows, columns)), (4 * count, 4 * count))
-    vector = np.bincount(place.ravel(), right[1:].ravel(), 4 * count)
+    vector = np.bincount(index.ravel(), right[1:].ravel(), 4 * count)
     per_node = np.bincount(match.segment, weight * match.share, count)
     per_node += np.bincount(parent[match.segment], weight * (1 - match.share), count)
     return matrix.tocsc(), vector, per_node

@@ -25,7 +25,8 @@ class CurveGraph:
         edges: Node pairs of the forest, shape [e, 2].
         thickness: Distance that a node's points were drawn [m]: a first radius, shape [n].
         support: Number of points of each node, shape [n].
-        bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m].
+        bridges: Each gap that was closed: ``from``, ``to`` [m, 3], ``length`` [m], ``price``
+            (1: an end goes straight on; more: the odder).
         split_off: Each piece that was left away: ``points``, ``distance`` [m], ``at``.
         loops: Length of each closed loop that was opened [m].
         plants: Pieces that look like plants of their own: ``points`` of the smaller, ``distance``
@@ -224,14 +225,15 @@ def keep_largest(graph: CurveGraph, joined: Joined, gap: float) -> np.ndarray:
     Returns:
         Whether each node was kept.
     """
-    weight = np.bincount(joined.label, graph.support)
+    weight = np.bincount(joined.label, joined.support)
     main = joined.label == int(np.argmax(weight))
+    graph.nodes, graph.thickness, graph.support = joined.nodes, joined.thickness, joined.support
     graph.edges = joined.edges
-    for one, other in joined.bridges[main[joined.bridges[:, 0]]]:
+    for (one, other), price in zip(joined.bridges, joined.prices, strict=True):
         length = float(np.linalg.norm(graph.nodes[one] - graph.nodes[other]))
-        if length > gap:
+        if main[one] and length > gap:
             graph.bridges.append({"from": graph.nodes[one], "to": graph.nodes[other],
-                                  "length": length})
+                                  "length": length, "price": float(price)})
     graph.plants = [{"points": int(weight[joined.label[pair]].min()),
                      "distance": float(np.linalg.norm(np.subtract(*graph.nodes[pair]))),
                      "at": graph.nodes[pair].mean(axis=0)} for pair in joined.plants]

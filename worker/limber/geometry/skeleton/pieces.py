@@ -7,9 +7,9 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from limber.geometry.skeleton.bridges import Ends, Hypotheses, filled, free_ends, hypotheses
 from limber.geometry.skeleton.skeleton import Skeleton
 
-_NEAR = 5  # nodes of other pieces that each node is tried with
 _SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any size
 _REACH = 5.0  # the longest bridge beyond, in what the smaller piece reaches
 _PLANT_SHARE = 0.2  # of all points, from which a piece may be a plant of its own
@@ -24,21 +24,30 @@ class Joined:
     """What joining the pieces gave.
 
     Attributes:
+        nodes: All nodes [m], those along bridges after the given ones, shape [n, 3].
+        thickness: First radii [m], shape [n].
+        support: Number of points of each node, none along bridges, shape [n].
         edges: All edges, the bridges included, shape [e, 2].
         bridges: Node pairs that were joined, shape [b, 2].
+        prices: What each bridge cost over its length: 1 where an end goes straight on into
+            another as thick, more the odder the bridge is, shape [b].
         plants: Node pairs between pieces that are plants of their own, shape [p, 2].
         label: Which piece each node belongs to now, shape [n].
     """
 
+    nodes: np.ndarray
+    thickness: np.ndarray
+    support: np.ndarray
     edges: np.ndarray
     bridges: np.ndarray
+    prices: np.ndarray
     plants: np.ndarray
     label: np.ndarray
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
                 *, gap: float, bridge_limit: float, up: np.ndarray, join_plants: bool) -> Joined:
-    """Join pieces over gaps, nearest first.
+    """Join pieces over gaps by the bridges that their directions and radii speak for.
 
     The smaller piece of a long bridge must have some length itself: so a severed twig comes back to
     its branch, and a stray clump of pixels is joined to nothing far away.
@@ -51,39 +60,74 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
         thickness: First radii [m], shape [n].
         support: Number of points of each node, shape [n].
         gap: Steps up to this length [m] are no gap (the paper's gamma rule).
-        bridge_limit: No bridge is longer [m].
+        bridge_limit: No bridge is longer [m], unless its end points straight at what it reaches.
         up: Which way is up, shape [3].
         join_plants: Join even what looks like two plants.
     """
-    bridges: list[tuple[int, int]] = []
+    state = Joined(nodes, thickness, support, edges, np.empty((0, 2), np.int64), np.empty(0),
+                   np.empty((0, 2), np.int64), _labels(len(nodes), edges))
     while True:
-        label = _labels(len(nodes), edges)
-        weight = np.bincount(label, support)
+        weight = np.bincount(state.label, state.support)
         if len(weight) == 1:
             break
-        made = []
-        for one, other, length in _candidates(nodes, label, weight, bridge_limit):
-            a, b = label[one], label[other]
-            if a == b:
-                continue
-            small = np.flatnonzero(label == (a if weight[a] <= weight[b] else b))
-            end = one if weight[a] <= weight[b] else other
-            reach = float(np.linalg.norm(nodes[small] - nodes[end], axis=1).max()) + thickness[end]
-            large = min(weight[a], weight[b]) > _PLANT_SHARE * support.sum()
-            if length > max(_REACH * reach, _SHORT * bridge_limit) or (
-                    large and length > gap and not join_plants
-                    and _are_plants(nodes, thickness, label, (one, other), up)):
-                continue
-            made.append((one, other))
-            label = np.where(label == b, a, label)
-            weight[a], weight[b] = weight[a] + weight[b], 0
-        if not made:
+        found = hypotheses(state.nodes, state.edges, state.thickness, state.label, weight,
+                           bridge_limit)
+        chosen = _mutual(found, state, weight, gap, bridge_limit, up, join_plants)
+        if not chosen:
             break
-        bridges += made
-        edges = np.vstack([edges, made])
-    plants = _apart(nodes, thickness, support, label, up)
-    return Joined(edges, np.array(bridges, np.int64).reshape(-1, 2),
-                  np.array(plants, np.int64).reshape(-1, 2), label)
+        ends = free_ends(state.nodes, state.edges, state.thickness)
+        for place in chosen:
+            _bridge(state, ends, found, place, gap / 3)
+        state.label = _labels(len(state.nodes), state.edges)
+    plants = _apart(state.nodes, state.thickness, state.support, state.label, up)
+    state.plants = np.array(plants, np.int64).reshape(-1, 2)
+    return state
+
+
+def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, limit: float,
+            up: np.ndarray, join_plants: bool) -> list[int]:
+    """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first."""
+    best: dict[int, int] = {}
+    first: list[tuple[int, int, int]] = []
+    for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
+        a, b = int(state.label[one]), int(state.label[other])
+        if a in best and b in best:
+            continue
+        if not _allowed(state, weight, (int(one), int(other)), float(found.length[place]), gap,
+                        limit, up, join_plants):
+            continue
+        if a not in best and b not in best:
+            first.append((place, a, b))
+        best.setdefault(a, place)
+        best.setdefault(b, place)
+    return [place for place, a, b in first if best[a] == best[b] == place]
+
+
+def _allowed(state: Joined, weight: np.ndarray, pair: tuple[int, int], length: float, gap: float,
+             limit: float, up: np.ndarray, join_plants: bool) -> bool:
+    """Whether the smaller piece is large enough for the bridge, and no plant of its own."""
+    a, b = state.label[list(pair)]
+    small, end = (a, pair[0]) if weight[a] <= weight[b] else (b, pair[1])
+    own = state.nodes[state.label == small]
+    reach = float(np.linalg.norm(own - state.nodes[end], axis=1).max()) + state.thickness[end]
+    if length > max(_REACH * reach, _SHORT * limit):
+        return False
+    large = min(weight[a], weight[b]) > _PLANT_SHARE * state.support.sum()
+    return not (large and length > gap and not join_plants
+                and _are_plants(state.nodes, state.thickness, state.label, pair, up))
+
+
+def _bridge(state: Joined, ends: Ends, found: Hypotheses, place: int, step: float) -> None:
+    """Add a bridge, with nodes along it that others may be joined to."""
+    one, other = int(found.one[place]), int(found.other[place])
+    curve, thick = filled(state.nodes, state.thickness, ends, one, other, step)
+    chain = np.concatenate([[one], len(state.nodes) + np.arange(len(curve)), [other]])
+    state.edges = np.vstack([state.edges, np.stack([chain[:-1], chain[1:]], axis=1)])
+    state.nodes = np.vstack([state.nodes, curve])
+    state.thickness = np.concatenate([state.thickness, thick])
+    state.support = np.concatenate([state.support, np.zeros(len(curve), state.support.dtype)])
+    state.bridges = np.vstack([state.bridges, [one, other]])
+    state.prices = np.append(state.prices, found.price[place] / found.length[place])
 
 
 def second_base(skeleton: Skeleton, up: np.ndarray) -> np.ndarray | None:
@@ -112,22 +156,6 @@ def second_base(skeleton: Skeleton, up: np.ndarray) -> np.ndarray | None:
 def _labels(count: int, edges: np.ndarray) -> np.ndarray:
     matrix = sparse.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count))
     return connected_components(matrix, directed=False)[1]
-
-
-def _candidates(nodes: np.ndarray, label: np.ndarray, weight: np.ndarray, limit: float,
-                ) -> list[tuple[int, int, float]]:
-    """Possible bridges from each piece to others: both nodes and length, shortest first."""
-    found = []
-    for piece in np.setdiff1d(np.flatnonzero(weight > 0), np.argmax(weight)):
-        inside = label == piece
-        own, others = np.flatnonzero(inside), np.flatnonzero(~inside)
-        distance, near = cKDTree(nodes[others]).query(
-            nodes[own], k=min(_NEAR, len(others)), distance_upper_bound=limit)
-        distance, near = distance.reshape(len(own), -1), near.reshape(len(own), -1)
-        place, which = np.nonzero(distance < np.inf)
-        found += zip(own[place].tolist(), others[near[place, which]].tolist(),
-                     distance[place, which].tolist(), strict=True)
-    return sorted(found, key=lambda bridge: bridge[2])
 
 
 def _base(nodes: np.ndarray, thickness: np.ndarray, up: np.ndarray) -> np.ndarray:

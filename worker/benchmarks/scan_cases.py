@@ -1,0 +1,138 @@
+"""Generated scans for the bench `scans`: the truth, the points as a file has them, how to read it.
+
+Seeds are fresh in each run of the bench; what is easy or hard about a case is drawn from its seed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.generated import GeneratedBranch, generate_branch
+from limber.geometry.skeleton.skeleton import Skeleton
+
+
+@dataclass(frozen=True)
+class ScanCase:
+    """One scan with truth.
+
+    Attributes:
+        name: Of its files.
+        seed: What it was made from.
+        truth: True axes and radii in the file's frame [m].
+        points: As the file has them [m], shape [n, 3].
+        volume: Of the true branch [m^3]; None where it was not computed.
+        settings: What the user would say beside the file's name.
+    """
+
+    name: str
+    seed: int
+    truth: Skeleton
+    points: np.ndarray
+    volume: float | None = None
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    def write(self, folder: Path) -> Path:
+        """Write the scan as a PLY file; returns its path."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.name}.ply"
+        Cloud(self.points).write_ply(path)
+        return path
+
+
+def branch_of(seed: int, **changes: object) -> GeneratedBranch:
+    """A generated branch whose sizes, fork count and bend vary with the seed."""
+    rng = np.random.default_rng([seed, 1])
+    spec = {"length": float(rng.uniform(0.6, 1.2)), "radius_root": float(rng.uniform(0.007, 0.013)),
+            "radius_tip": float(rng.uniform(0.003, 0.005)), "bend": float(rng.uniform(0.2, 1.0)),
+            "fork_count": int(rng.integers(0, 6)), "noise": 0.001,
+            "gap_count": int(rng.integers(0, 3) == 2)}
+    return generate_branch(seed, **(spec | changes))
+
+
+def round_case(seed: int) -> ScanCase:
+    """Scanned from all around, noise 1 mm."""
+    return _case(branch_of(seed), f"round_{seed}")
+
+
+def one_sided_case(seed: int, noise: float = 0.001) -> ScanCase:
+    """Scanned from one side."""
+    return _case(branch_of(seed, view="one-sided", noise=noise),
+                 f"one_sided_{1000 * noise:.0f}mm_{seed}")
+
+
+def gap_case(seed: int) -> ScanCase:
+    """A ball of 20 to 80 mm without points on the main axis; of odd seeds around a fork."""
+    rng = np.random.default_rng([seed, 2])
+    branch = branch_of(seed, gap_count=0, fork_count=int(rng.integers(1, 6)),
+                       view=("round", "one-sided")[int(rng.integers(2))])
+    truth = branch.skeleton
+    main = truth.runs()[0]
+    if seed % 2:
+        forks = np.intersect1d(truth.forks(), main)
+        at = truth.nodes[rng.choice(forks)]
+    else:
+        at = truth.point_at(rng.uniform(0.15, 0.85))
+    size = rng.uniform(0.02, 0.08)
+    points = branch.cloud.points
+    points = points[np.linalg.norm(points - at, axis=1) > size / 2]
+    place = "fork" if seed % 2 else "axis"
+    return ScanCase(f"gap_{1000 * size:.0f}mm_{place}_{seed}", seed, truth, points,
+                    branch.surface.volume)
+
+
+def single_view_case(seed: int) -> ScanCase:
+    """What a depth camera 0.7 to 1.2 m away sees: a reading a pixel, noise growing with depth.
+
+    The file is in the camera's frame (x right, y down, z forward). Pixels at edges fly: some of
+    their readings lie between the branch and what would be behind it.
+    """
+    rng = np.random.default_rng([seed, 3])
+    branch = branch_of(seed, gap_count=0, occlusion=0.0, unevenness=0.0, noise=0.0,
+                       point_spacing=0.0008)
+    centre = branch.skeleton.nodes.mean(axis=0)
+    turn = rng.uniform(0, 2 * np.pi)
+    forward = np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    eye = centre - forward * rng.uniform(0.7, 1.2)
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return (points - eye) @ axes.T
+
+    pixels = _depth_image(seen(branch.cloud.points), pitch=1 / 900, rng=rng)
+    truth = branch.skeleton.moved(seen(branch.skeleton.nodes))
+    return ScanCase(f"single_view_{seed}", seed, truth, pixels, branch.surface.volume,
+                    {"up": tuple((axes @ [0.0, 0.0, 1.0]).tolist())})
+
+
+def _depth_image(points: np.ndarray, pitch: float, rng: np.random.Generator) -> np.ndarray:
+    """Nearest point of each pixel as its reading [m], with noise and flying pixels."""
+    pixel = np.round(points[:, :2] / points[:, 2:] / pitch).astype(np.int64)
+    order = np.argsort(points[:, 2], kind="stable")
+    _, first = np.unique(pixel[order], axis=0, return_index=True)
+    which = order[first]
+    depth, pixel = points[which, 2], pixel[which]
+    # As a stereo camera has it: errors grow with the square of the depth, together over patches.
+    patch = rng.normal(size=(40, 3)) * 60.0
+    waves = np.sin(np.column_stack([pixel * pitch, depth]) @ patch.T
+                   + rng.uniform(0, 2 * np.pi, 40)).mean(axis=1) * np.sqrt(2 * 40)
+    depth = depth + depth**2 * (0.001 * rng.normal(size=len(depth)) + 0.0007 * waves)
+    beside = cKDTree(pixel).query_ball_point(pixel, 1.5, return_length=True) < 8
+    flying = beside & (rng.uniform(size=len(depth)) < 0.08)
+    depth = np.where(flying, depth + rng.exponential(0.03, len(depth)), depth)
+    return np.column_stack([pixel * pitch, np.ones(len(depth))]) * depth[:, None]
+
+
+def _case(branch: GeneratedBranch, name: str) -> ScanCase:
+    return ScanCase(name, branch.seed, branch.skeleton, branch.cloud.points,
+                    branch.surface.volume)
+
+
+Make = Callable[[int], ScanCase]

@@ -1,0 +1,128 @@
+"""What the bench `scans` asks of a reconstruction whose truth is known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
+
+_STEP = 0.001  # [m] between the places on the axes that are compared
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Places on a skeleton's axes, a millimetre apart: each stands for as much length.
+
+    Attributes:
+        points: Where [m], shape [n, 3].
+        radius: Of the axis there [m], shape [n].
+        low, high: The nodes before and after, shape [n] each.
+        share: Of the way from ``low`` to ``high``, shape [n].
+    """
+
+    points: np.ndarray
+    radius: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    share: np.ndarray
+
+    @classmethod
+    def of(cls, skeleton: Skeleton, chain: np.ndarray | None = None, step: float = _STEP,
+           ) -> "Dense":
+        """Of the whole skeleton, or of one ``chain`` of nodes from the root outwards."""
+        low = skeleton.parent[1:] if chain is None else chain[:-1]
+        high = np.arange(1, skeleton.node_count) if chain is None else chain[1:]
+        length = np.linalg.norm(skeleton.nodes[high] - skeleton.nodes[low], axis=1)
+        count = np.maximum(np.round(length / step).astype(int), 1)
+        share = np.concatenate([(np.arange(n) + 0.5) / n for n in count])
+        low, high = np.repeat(low, count), np.repeat(high, count)
+        points = (1 - share)[:, None] * skeleton.nodes[low] + share[:, None] * skeleton.nodes[high]
+        own = skeleton.branch[low] != skeleton.branch[high]
+        radius = np.where(own, skeleton.radius[high],
+                          (1 - share) * skeleton.radius[low] + share * skeleton.radius[high])
+        return cls(points, radius, low, high, share)
+
+
+def seen_part(truth: Skeleton, points: np.ndarray) -> Skeleton:
+    """The truth as far as a scan shows it: ends beyond the last point near them are cut off.
+
+    A stretch between points is asked for, whatever its length; what lies past all points is not.
+    """
+    distance, _ = cKDTree(points).query(truth.nodes)
+    shown = distance < truth.radius + 2 * _STEP + 0.25 * truth.radius
+    below = shown.copy()
+    for node in range(truth.node_count - 1, 0, -1):
+        below[truth.parent[node]] |= below[node]
+    start = 0
+    children = truth.child_counts()
+    while not shown[start] and children[start] == 1:
+        start = int(np.flatnonzero(truth.parent == start)[0])
+    below[:start] = False
+    parent = truth.parent[below]
+    parent = np.where(np.arange(len(parent)) == 0, -1, (np.cumsum(below) - 1)[parent])
+    return Skeleton.from_edges(truth.nodes[below], parent, truth.radius[below])
+
+
+def fork_matches(truth: Skeleton, found: Skeleton) -> tuple[int, np.ndarray]:
+    """How many forks were found, and which of the found forks are true ones, shape [forks].
+
+    A fork is found within three radii of the true one, each once.
+    """
+    got = found.forks()
+    right = np.zeros(len(got), bool)
+    for fork in truth.forks():
+        free = np.flatnonzero(~right)
+        if len(free) == 0:
+            break
+        distance = np.linalg.norm(found.nodes[got[free]] - truth.nodes[fork], axis=1)
+        if distance.min() < 3 * truth.radius[fork]:
+            right[free[int(np.argmin(distance))]] = True
+    return int(right.sum()), right
+
+
+def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
+    """Compare centrelines, radii, stated intervals, forks, root, main axis and lengths."""
+    there, here = Dense.of(truth), Dense.of(found)
+    away, near = cKDTree(there.points).query(here.points)
+    back, _ = cKDTree(here.points).query(there.points)
+    in_radii = np.concatenate([away / there.radius[near], back / there.radius])
+    error = here.radius / there.radius[near] - 1
+    hits, right = fork_matches(truth, found)
+    on_axis = away < 1.5 * there.radius[near]
+    sigma = found.radius_sigma[here.high]
+    covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
+    main_off = main_axis_error(truth, found)
+    return {
+        "centre_m": float(np.concatenate([away, back]).mean()),
+        "centre_radii": float(in_radii.mean()), "centre_worst_radii": float(in_radii.max()),
+        "radius_error": float(np.median(np.abs(error))), "radius_bias": float(np.median(error)),
+        "sigma_m": float(np.median(sigma)), "covered": float(covered[on_axis].mean()),
+        "measured": float((found.radius_state[here.high] == MEASURED).mean()),
+        "forks": len(truth.forks()), "forks_found": hits, "forks_false": int((~right).sum()),
+        "root_diameters": float(np.linalg.norm(found.nodes[0] - truth.nodes[0])
+                                / (2 * truth.radius[0])),
+        "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
+        "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
+        "right": float((away < np.maximum(there.radius[near], 0.001)).mean())}
+
+
+def main_axis_error(truth: Skeleton, found: Skeleton) -> float:
+    """Farthest that the way to the true main tip is off the true main axis, in its radii.
+
+    Both ways: what was found must lie on the true axis, and the true axis on what was found.
+    """
+    main = truth.runs()[0]
+    axis = Dense.of(truth, main)
+    tip = int(np.argmin(np.linalg.norm(found.nodes - truth.nodes[main[-1]], axis=1)))
+    way = [tip]
+    while found.parent[way[-1]] >= 0:
+        way.append(int(found.parent[way[-1]]))
+    if len(way) < 2:
+        return np.inf
+    ours = Dense.of(found, np.array(way[::-1]))
+    away, near = cKDTree(axis.points).query(ours.points)
+    back, _ = cKDTree(ours.points).query(axis.points)
+    # The ends may be a radius short: no scan shows where exactly a round tip's axis ends.
+    inner = slice(int(2 * truth.radius[0] / _STEP), len(back) - int(3 * axis.radius[-1] / _STEP))
+    return float(max((away / axis.radius[near]).max(), (back / axis.radius)[inner].max()))
