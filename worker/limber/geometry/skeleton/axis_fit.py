@@ -24,6 +24,8 @@ _REACH = 2.0  # how far an axis may move from where the contraction saw it, in i
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
 _PROBE = 128  # nodes between two whose radii are taken as independent of each other
 _TUKEY = 4.685  # 95 % efficiency for normal noise
+_HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and that tell where
+_KINK = np.deg2rad(50.0)
 _ENOUGH = 200  # points that tell the noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
@@ -105,8 +107,9 @@ def _places(parent: np.ndarray, nodes: np.ndarray, match: "_Match", weight: np.n
     axis = nodes[match.segment] - nodes[parent[match.segment]]
     axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
     sharpness = match.thick * (match.residual + match.thick) / max(noise, 1e-12)**2
-    seen = seen_sides(match.normal, axis, sharpness, weight)
-    return mean_places(match.normal, axis, sharpness, seen)
+    seen = seen_sides(match.normal, axis, match.residual, sharpness, weight)
+    stout = (match.thick / max(noise, 1e-12))**2
+    return mean_places(match.normal, axis, sharpness, stout, seen)
 
 
 def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
@@ -165,7 +168,7 @@ def attached(skeleton: Skeleton) -> Skeleton:
         distance, near = cKDTree(skeleton.nodes[carrier]).query(skeleton.nodes[members])
         outside = distance > 1.05 * skeleton.radius[carrier[near]]
         first = int(np.argmax(outside)) if outside.any() else len(members) - 1
-        first = min(first, max(len(members) - 2, 0))
+        first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
         keep[members[:first]] = False
         ahead = members[first:first + 5]
         if len(ahead) < 2:
@@ -183,6 +186,19 @@ def attached(skeleton: Skeleton) -> Skeleton:
     return Skeleton.from_edges(skeleton.nodes[keep], moved, skeleton.radius[keep],
                                radius_sigma=skeleton.radius_sigma[keep],
                                radius_state=skeleton.radius_state[keep])
+
+
+def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
+    """The place in a twig from which it goes the way that it goes on: its start may be a hook."""
+    nodes = skeleton.nodes
+    last = min(first + _HOOK, len(members) - _AHEAD)
+    for place in range(first, last):
+        step = nodes[members[place + 1]] - nodes[members[place]]
+        ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place + 1]]
+        size = np.linalg.norm(step) * np.linalg.norm(ahead)
+        if size > 0 and step @ ahead > np.cos(_KINK) * size:
+            return place
+    return max(first, last)
 
 
 def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:

@@ -12,12 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-_PLACES = 32  # on the circle, of which each is weighed
-_SHARP = 60.0  # concentration from which a point's place is known to within a few degrees
+_PLACES = 48  # on the circle, of which each is weighed
+_SHARP = 150.0  # square of radius over noise from which places are known to within 5 degrees
 _CLEAR = 12.0  # concentration from which a point tells which sides were seen
 _ONE_SIDED = 0.3  # length of the mean normal, from which one side may be all that was seen
 _BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not seen
 _FEW = 0.12  # share of points there that noise can put
+_FRONT, _EDGE = np.deg2rad(40.0), np.deg2rad(65.0)
+_ALONG = 0.65  # scatter at the edges over that in front, under which it is along the sight alone
 _GRAZING = np.deg2rad(84.0)  # beyond that no sensor sees a surface
 _LEAST_SEEN = 0.01
 _ANGLE = 2 * np.pi * (np.arange(_PLACES) + 0.5) / _PLACES
@@ -31,19 +33,20 @@ class SeenSides:
         view: Mean outward normal of the points: towards the camera where there was one, shape [3].
         share: Density of points over the places of a cross-section, from the side that faces
             ``view`` around, shape [places].
+        along_sight: Points scatter along ``view`` alone, as a depth camera's do.
     """
 
     view: np.ndarray
     share: np.ndarray
-
-    @property
-    def one_sided(self) -> bool:
-        return float(self.share.min()) < 1.0
+    along_sight: bool = False
 
 
-def seen_sides(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight: np.ndarray,
-               ) -> SeenSides:
+def seen_sides(out: np.ndarray, axis: np.ndarray, residual: np.ndarray, sharpness: np.ndarray,
+               weight: np.ndarray) -> SeenSides:
     """Tell whether points show branches from all around or from one side.
+
+    A depth camera's readings scatter along its sight, and say where a silhouette ends: none of
+    their places is open.
 
     Estimated as a density, the sides that were seen would grow with the noise that blurs them: a
     thin ring with points all around it looks like half of a thicker one. So it is one of the two.
@@ -51,6 +54,7 @@ def seen_sides(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight:
     Args:
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
+        residual: Distance of each point from its cylinder [m], shape [m].
         sharpness: Radius times distance over the noise's square, shape [m].
         weight: How far each counts, shape [m].
     """
@@ -62,16 +66,20 @@ def seen_sides(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, weight:
     if size < _ONE_SIDED:
         return SeenSides(np.array([0.0, 0.0, 1.0]), around)
     side, _ = _sides(axis[clear], view / size)
-    behind = np.einsum("mj,mj->m", out[clear], side) < np.cos(_BEHIND)
-    if behind.mean() > _FEW:
+    facing = np.einsum("mj,mj->m", out[clear], side)
+    if np.mean(facing < np.cos(_BEHIND)) > _FEW:
         return SeenSides(view / size, around)
+    front, edge = (np.abs(residual[clear[chosen]]) for chosen in (
+        facing > np.cos(_FRONT), facing < np.cos(_EDGE)))
+    if len(front) and len(edge) and np.median(edge) < _ALONG * np.median(front):
+        return SeenSides(view / size, around, along_sight=True)
     angle = np.minimum(_ANGLE, 2 * np.pi - _ANGLE)
     width = 2 * np.pi / _PLACES
     return SeenSides(view / size, np.clip((_GRAZING - angle) / width + 0.5, _LEAST_SEEN, 1.0))
 
 
-def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, seen: SeenSides,
-                ) -> np.ndarray:
+def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
+                seen: SeenSides) -> np.ndarray:
     """Return the mean direction from the axis to each point's true place, shape [m, 3].
 
     Shorter than 1 by how much the place is open.
@@ -80,10 +88,14 @@ def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, seen: 
         out: Unit vectors from the axis to the points, shape [m, 3].
         axis: Unit vectors along the axis at each, shape [m, 3].
         sharpness: Radius times distance over the noise's square, shape [m].
+        stout: Square of radius over noise, shape [m].
         seen: What was seen.
     """
     mean = out * np.where(sharpness > 1, 1 - 0.5 / np.maximum(sharpness, 1.0), 0.5)[:, None]
-    blurred = np.flatnonzero(sharpness < _SHARP)
+    if seen.along_sight:
+        return mean
+    # By the radius alone: chosen by their distance too, near points would count otherwise than far.
+    blurred = np.flatnonzero(stout < _SHARP)
     side, cross = _sides(axis[blurred], seen.view)
     angle = np.arctan2(np.einsum("mj,mj->m", out[blurred], cross),
                        np.einsum("mj,mj->m", out[blurred], side))

@@ -1,0 +1,71 @@
+"""Bridges over gaps: ends go on in their own direction, twigs meet their carrier at an angle."""
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.bridges import filled, free_ends, hypotheses
+from limber.geometry.skeleton.pieces import join_pieces
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def _line(start, end, count=12):
+    return np.linspace(np.array(start, float), np.array(end, float), count)
+
+
+def _forest(*chains):
+    edges, begin = [], 0
+    for chain in chains:
+        index = begin + np.arange(len(chain))
+        edges.append(np.stack([index[:-1], index[1:]], axis=1))
+        begin += len(chain)
+    return np.vstack(chains), np.vstack(edges)
+
+
+def _fork_in_a_gap(gap: float):
+    """A stem with a gap, whose twig starts out of it, nearer to each end than these are."""
+    low, high = _line([0, 0, 0], [0, 0, 0.3]), _line([0, 0, 0.3 + gap], [0, 0, 0.7])
+    side = 0.4 * gap
+    twig = _line([side, 0, 0.3 + gap / 2 + side], [side + 0.15, 0, 0.3 + gap / 2 + side + 0.15])
+    return low, high, twig
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.07, 0.1])
+def test_the_stem_does_not_go_along_a_twig_and_back(gap: float) -> None:
+    """Where a fork is missing, stem joins stem, and the twig joins what fills the gap."""
+    low, high, twig = _fork_in_a_gap(gap)
+    nodes, edges = _forest(low, high, twig)
+    thickness = np.concatenate([np.full(24, 0.008), np.full(12, 0.005)])
+    joined = join_pieces(nodes, edges, thickness, np.full(len(nodes), 20), gap=0.03,
+                         bridge_limit=0.3, up=Z, join_plants=False)
+    assert joined.label.max() == 0
+    assert sorted(joined.bridges[0].tolist()) == [11, 12]
+    one, other = joined.bridges[1]
+    met = other if one >= 24 else one
+    # On the line from twig to stem, in the gap or beside it, and not at the twig's far end.
+    assert abs(joined.nodes[met, 0]) < 1e-9 and abs(joined.nodes[met, 2] - 0.3 - gap / 2) < 0.03
+    assert joined.prices[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_an_end_prefers_what_it_points_at() -> None:
+    """A twig beside the stem reaches past the nearest node for where its line leads."""
+    stem, twig = _line([0, 0, 0], [0, 0, 0.6], 40), _line([0.06, 0, 0.36], [0.2, 0, 0.5], 10)
+    nodes, edges = _forest(stem, twig)
+    label = np.repeat([0, 1], [40, 10])
+    found = hypotheses(nodes, edges, np.full(50, 0.005), label, np.array([800, 200]), 0.2)
+    best = nodes[found.other[0]] if found.other[0] < 40 else nodes[found.one[0]]
+    assert best[2] == pytest.approx(0.30, abs=0.03)
+    assert np.all(np.diff(found.price) >= 0)
+
+
+def test_a_bridge_bends_as_its_ends_do() -> None:
+    """Between two parts of an arc the filled nodes lie on the arc, not on its chord."""
+    turn = np.concatenate([np.linspace(0, 0.5, 20), np.linspace(0.7, 1.2, 20)])
+    arc = 0.5 * np.stack([1 - np.cos(turn), np.zeros(40), np.sin(turn)], axis=1)
+    nodes, edges = _forest(arc[:20], arc[20:])
+    thickness = np.full(40, 0.004)
+    curve, thick = filled(nodes, thickness, free_ends(nodes, edges, thickness), 19, 20, 0.01)
+    off = np.abs(np.linalg.norm(curve - [0.5, 0, 0], axis=1) - 0.5)
+    chord = 0.5 * (1 - np.cos(0.1))
+    assert len(curve) > 5 and off.max() < 0.4 * chord
+    assert thick == pytest.approx(0.004)

@@ -1,0 +1,57 @@
+"""Radii under noise: a straight branch seen from all around, or from one side."""
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.axis_fit import fit_axes
+from limber.geometry.skeleton.noisy_rings import mean_places, seen_sides
+from limber.geometry.skeleton.skeleton import Skeleton
+
+
+def _points(radius: float, noise: float, half: bool, count: int = 6000, seed: int = 0):
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-np.pi / 2, np.pi / 2, count) if half else rng.uniform(0, 2 * np.pi, count)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle),
+                       rng.uniform(0, 0.5, count)], axis=1)
+    return points + rng.normal(0, noise, points.shape)
+
+
+def _axis(radius: float) -> Skeleton:
+    nodes = np.stack([np.zeros(40), np.zeros(40), np.linspace(0, 0.5, 40)], axis=1)
+    return Skeleton.from_edges(nodes, np.arange(40) - 1, np.full(40, radius))
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("share", [0.1, 0.25, 0.4])
+def test_radius_under_noise_has_no_bias(half: bool, share: float) -> None:
+    """Noise of a tenth to four tenths of the radius moves the radius by less than 6 %.
+
+    The nearest place on the circle taken for the true one, half a circle came out 13 % too thin
+    at 0.3 of the radius.
+    """
+    fit = fit_axes(_axis(0.006), _points(0.006, share * 0.006, half), rounds=30)
+    inner = fit.skeleton.radius[5:-5]
+    assert np.median(inner) == pytest.approx(0.006, rel=0.06)
+    assert fit.noise == pytest.approx(share * 0.006, rel=0.08)
+
+
+def test_sides_are_told_apart() -> None:
+    """Half a circle is one side, a full one is all around, scatter along the sight is a camera's.
+    """
+    axis = np.tile([0.0, 0.0, 1.0], (6000, 1))
+
+    def seen(points):
+        distance = np.linalg.norm(points[:, :2], axis=1)
+        out = np.column_stack([points[:, :2] / distance[:, None], np.zeros(len(points))])
+        sharpness = 0.006 * distance / 0.001**2
+        return out, sharpness, seen_sides(out, axis, distance - 0.006, sharpness, np.ones(6000))
+
+    assert seen(_points(0.006, 0.001, False))[2].share.min() == 1.0
+    out, sharpness, half = seen(_points(0.006, 0.001, True))
+    assert half.share.min() < 0.1 and half.view @ [1, 0, 0] > 0.95 and not half.along_sight
+    camera = _points(0.006, 0.0, True)
+    camera[:, 0] += np.random.default_rng(1).normal(0, 0.001, len(camera))
+    assert seen(camera)[2].along_sight
+    # The mean place is shorter the less is known, and never longer than the circle's radius.
+    size = np.linalg.norm(mean_places(out, axis, sharpness, np.full(6000, 36.0), half), axis=1)
+    assert size.max() <= 1 + 1e-9 and size.min() > 0.3
