@@ -9,6 +9,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -40,9 +41,30 @@ def compiled(function: Callable) -> Callable:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(folder)
     try:
-        return numba.njit(cache=True, **options)(function)
+        return _forgetful(numba.njit(cache=True, **options)(function))
     finally:
         numba.config.CACHE_DIR = before
+
+
+def _forgetful(kernel: Any) -> Any:
+    """Let a kernel be compiled anew where what is kept of it cannot be read any more.
+
+    Types of arguments are kept by module and name. After an update that moves one, numba reads
+    the old entry before it sees that the source has changed, and fails.
+    """
+    cache = getattr(kernel, "_cache", None)  # there is none where numba is told not to compile
+    if cache is None:
+        return kernel
+    load = cache.load_overload
+
+    def load_or_forget(signature: Any, target: Any) -> Any:
+        try:
+            return load(signature, target)
+        except (ImportError, AttributeError):
+            cache.flush()
+            return None
+    cache.load_overload = load_or_forget
+    return kernel
 
 
 def for_kernels(array: np.ndarray) -> np.ndarray:
