@@ -1,7 +1,10 @@
 """Rules of the layout: the core never imports bpy, the add-on holds no mathematics."""
 
 import ast
+import graphlib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[1]
 
@@ -60,3 +63,174 @@ def test_nothing_names_an_index_or_this_machine():
     wrong = [name for name in tracked if name != "tests/test_structure.py"
              and (ROOT / name).is_file() and pattern.search((ROOT / name).read_bytes())]
     assert not wrong
+
+
+CORE = ROOT / "worker" / "limber"
+
+# What may import what: a layer imports those before it, never one beside it or after it.
+LAYERS = (
+    ("version", "constants", "errors", "lazy", "threads", "compiled", "sparse", "alignment",
+     "owner", "files", "plain", "progress", "settings", "terminal"),
+    ("jobs",),
+    ("store", "geometry"),
+    ("mechanics",),
+    ("recordings",),
+    ("perception",),
+    ("estimation", "planning", "robot"),
+    ("stages.loading",),
+    ("session",),
+    ("report", "scene"),
+    ("stages",),
+    ("options",),
+    ("cli",),
+    ("commands", "__main__"),
+)
+NUMERICAL = ("geometry", "mechanics", "recordings", "perception", "estimation", "planning")
+# The same between the parts of two packages; what is a plain file there is not ordered.
+PARTS = {"geometry": ("cloud", "skeleton", "surface", "tets"),
+         "mechanics": ("elements", "linear", "statics", "dynamics", "reduced"),
+         "estimation": ("forward", "online")}
+
+
+def core_imports() -> dict[str, set[str]]:
+    """Return, for each module of the core (dotted, without ``limber``), those that it imports.
+
+    Imports inside functions count; those for type checkers alone do not.
+    """
+    files = {}
+    for path in CORE.rglob("*.py"):
+        parts = path.relative_to(CORE).with_suffix("").parts
+        files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return {module: _imported(ast.parse(path.read_text(encoding="utf-8")), files)
+            for module, path in files.items()}
+
+
+def _imported(tree: ast.AST, files: dict[str, Path]) -> set[str]:
+    found: set[str] = set()
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "limber":
+            base = (node.module or "").removeprefix("limber").strip(".")
+            for alias in node.names:
+                inside = f"{base}.{alias.name}".strip(".")
+                found.add(inside if inside in files else base)
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.removeprefix("limber.") for alias in node.names
+                      if alias.name.startswith("limber.")}
+        found |= _imported(node, files)
+    return found - {""}
+
+
+def place_of(module: str) -> tuple[int, str]:
+    """Return the layer of a module and the entry of LAYERS that it belongs to, the closest."""
+    fitting = [(name, number) for number, layer in enumerate(LAYERS) for name in layer
+               if module == name or module.startswith(name + ".")]
+    assert fitting, f"limber.{module} stands in no layer of this test: give it one"
+    name, number = max(fitting, key=lambda entry: len(entry[0]))
+    return number, name
+
+
+def test_layers_import_downwards():
+    """Every module imports its own package or a lower layer; among small ones is no circle."""
+    wrong = []
+    graph: dict[str, set[str]] = {}
+    for module, imported in core_imports().items():
+        if not module:
+            continue
+        layer, name = place_of(module)
+        for other in imported:
+            below, other_name = place_of(other)
+            if layer == below == 0:
+                graph.setdefault(name, set()).add(other_name)
+            elif name != other_name and below >= layer:
+                wrong.append(f"limber.{module} imports limber.{other}")
+    assert not wrong
+    graphlib.TopologicalSorter({name: others - {name} for name, others in graph.items()}).prepare()
+
+
+@pytest.mark.parametrize("package", list(PARTS))
+def test_parts_of_a_package_import_downwards(package):
+    """No part imports one after it, nor a plain file of the package that imports it back."""
+    order = PARTS[package]
+    wrong = []
+    for module, imported in core_imports().items():
+        words = module.split(".")
+        if words[0] != package or len(words) < 2 or words[1] not in order:
+            continue
+        for other in imported:
+            others = other.split(".")
+            if others[0] == package and len(others) > 1 and others[1] in order and (
+                    order.index(others[1]) > order.index(words[1])):
+                wrong.append(f"limber.{module} imports limber.{other}")
+    assert not wrong
+    assert not _circles(package)
+
+
+def _circles(package: str) -> list[str]:
+    """Parts and files of a package that import each other in a circle."""
+    graph: dict[str, set[str]] = {}
+    for module, imported in core_imports().items():
+        words = module.split(".")
+        if words[0] == package and len(words) > 1:
+            others = {other.split(".")[1] for other in imported
+                      if other.startswith(package + ".")}
+            graph.setdefault(words[1], set()).update(others - {words[1]})
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_numerical_packages_know_no_branch_folder():
+    """They take and return values: only stages, and what stands above, open a branch folder."""
+    wrong = {module for module, imported in core_imports().items()
+             if module.split(".")[0] in NUMERICAL
+             and any(other.split(".")[0] == "store" for other in imported)}
+    assert not wrong
+
+
+def test_only_stages_open_branch_folders():
+    """Branch.open and Branch.create are called by stages, the session and the store alone."""
+    allowed = {"stages", "session", "store", "commands"}
+    wrong = []
+    for path in CORE.rglob("*.py"):
+        if path.relative_to(CORE).parts[0] in allowed:
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Attribute) and node.attr in ("open", "create") and (
+                    getattr(node.value, "id", "") == "Branch"):
+                wrong.append(f"{path.relative_to(CORE)}:{node.lineno}")
+    assert not wrong
+
+
+@pytest.mark.parametrize("package", ["geometry", "mechanics", "recordings", "estimation",
+                                     "planning"])
+def test_public_names_are_there(package):
+    """All that a package exports loads, and the example in its docstring runs."""
+    import doctest
+    import importlib
+
+    module = importlib.import_module(f"limber.{package}")
+    for name in module.__all__:
+        assert getattr(module, name).__doc__, name
+    flags = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+    failed, tried = doctest.testmod(module, optionflags=flags)
+    assert tried and not failed
+
+
+def test_dependencies_are_imported():
+    """Every dependency in pyproject.toml is imported by the core or called by it by name."""
+    import re
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    imported = set().union(*imported_modules(CORE).values())
+    modules = {"pillow": "PIL", "ur-rtde": "rtde_control"}
+    unused = []
+    for wanted in project["dependencies"]:
+        name = re.split(r"[^\w-]", wanted)[0]
+        if modules.get(name, name).replace("-", "_") not in imported:
+            unused.append(name)
+    assert not unused

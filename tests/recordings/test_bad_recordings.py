@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from limber.cli import call
-from limber.perception.camera import D455, write_camera
+from limber.geometry.cloud.camera import D455, write_camera
 from limber.perception.observe import write_depth
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.streams import Stream, read_stream, write_stream

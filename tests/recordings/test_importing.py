@@ -11,10 +11,10 @@ from PIL import Image
 
 from limber.cli import call
 from limber.errors import InputError
-from limber.perception.camera import D455, read_camera, write_camera
-from limber.perception.masks import read_mask
+from limber.geometry.cloud.camera import D455, read_camera, write_camera
 from limber.perception.observe import list_frames, read_depth, write_depth
 from limber.recordings.importing import ImportSettings, markers_from_c3d
+from limber.recordings.masks import read_mask
 from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.registration import rigid_fit
 from limber.recordings.streams import Stream, read_stream, write_stream

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from limber.errors import InputError, MissingDependencyError
-from limber.perception.masks import YoloSegmenter, read_mask, segment_by_depth
+from limber.recordings.masks import YoloSegmenter, read_mask, segment_by_depth
 
 
 def test_depth_range_and_small_pieces():

@@ -11,7 +11,7 @@ from limber.geometry.generated import BranchSpec, scan
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
-from limber.geometry.surface.sweep import frames, tangents
+from limber.geometry.skeleton.sweep import frames, tangents
 from limber.progress import Progress
 
 CROWNS = ((0, 8.0, 0.12, 0.035, 0.004), (1, 12.0, 0.2, 0.05, 0.008), (2, 6.0, 0.08, 0.025, 0.004),

@@ -7,3 +7,5 @@ GRAVITY = (0.0, 0.0, -STANDARD_GRAVITY)
 FORCE_UNITS_N = {"N": 1.0, "gf": 1e-3 * STANDARD_GRAVITY, "mN": 1e-3,
                  "lbf": 0.45359237 * STANDARD_GRAVITY, "kgf": STANDARD_GRAVITY, "kN": 1e3}
 """Newtons in one of the units that force sensors report."""
+UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
+"""Metres in one of the units that scans, surfaces and skeletons come in."""

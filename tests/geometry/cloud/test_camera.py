@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
-from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.perception.camera import (
+from limber.geometry.cloud.camera import (
     D455,
     Camera,
     depth_to_cloud,
@@ -13,6 +12,7 @@ from limber.perception.camera import (
     read_camera,
     write_camera,
 )
+from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.perception.simulated_camera import render_depth, with_noise
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
-from limber.geometry.cloud.cloud import Cloud, read_cloud
+from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.depth_files import read_depth
-from limber.geometry.cloud.files import read_points
+from limber.geometry.cloud.files import read_cloud, read_points
 
 POINTS = np.random.default_rng(0).normal(size=(200, 3)).round(5)
 

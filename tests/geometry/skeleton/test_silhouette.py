@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
+from limber.geometry.cloud.camera import D455, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
+from limber.geometry.cloud.sight import View
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.silhouette import View, within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
-from limber.perception.camera import D455, depth_to_cloud
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.stages.reconstruct import reconstruct
 

@@ -1,6 +1,6 @@
 """What a scan leaves open of axis and radii, carried to Young's modulus through the pulls.
 
-Branches as likely as the fitted one (:mod:`limber.geometry.skeleton.likely_shapes`) are pulled
+Branches as likely as the fitted one (:mod:`limber.geometry.likely_shapes`) are pulled
 as the branch was, with the moduli found. By how much their points and forces differ, the fit
 would have taken up in the moduli: that is how far off these may be. Errors of neighbouring
 places, of axis and radius, and of several moduli go together as they do in the scan.
@@ -14,7 +14,7 @@ from limber.estimation.forward.forward import Forward
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.preparation import Subject
-from limber.geometry.skeleton.likely_shapes import likely_skeletons, reshaped
+from limber.geometry.likely_shapes import likely_skeletons, reshaped
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights

@@ -16,6 +16,7 @@ from limber.errors import InputError
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.model_error import refined
 from limber.estimation.settings import VirtualPullSettings
+from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import base_nodes
@@ -26,7 +27,6 @@ from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.young_field import young_weights
-from limber.perception.camera import D455, Camera, write_camera
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.progress import SILENT, Progress

@@ -9,8 +9,8 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.settings import BranchSpec
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import frames, tangents
 from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.sweep import frames, tangents
 from limber.settings import checked_settings
 
 _STEP = 0.004  # [m] between nodes of the true axes

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import splu
 
 from limber.geometry.skeleton.axis_fit import fit_precision, on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.surface.sweep import tangents
+from limber.geometry.skeleton.sweep import tangents
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
 POINT_LIMIT = 60_000

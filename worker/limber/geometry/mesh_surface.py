@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from limber.alignment import Alignment
+from limber.constants import UNIT_METRES
 from limber.errors import InputError, MeshingError
 from limber.geometry.reconstruct import gravity_after, peak_memory_mb
 from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
-from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.upright import shortest_turn
 from limber.geometry.surface.surface import Surface

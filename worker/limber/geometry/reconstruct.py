@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 
 from limber.alignment import Alignment
-from limber.constants import STANDARD_GRAVITY
+from limber.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import Prepared, prepare
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.control_points import FRACTIONS
-from limber.geometry.skeleton.files import UNIT_METRES
 from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise

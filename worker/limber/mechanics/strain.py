@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel
@@ -108,3 +109,13 @@ def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray) -> np.ndarray:
         return mu / det * left + ((lam + mu) * (det - 1) - mu) * eye
     trace = np.trace(green, axis1=2, axis2=3)[..., None, None]
     return F @ (lam * trace * eye + 2 * mu * green) @ np.swapaxes(F, 2, 3) / det
+
+
+def gradient_metric(model: BranchModel) -> sp.csr_matrix:
+    """Return the H1 seminorm: the integral of grad u : grad u [m^3], [node_count, node_count]."""
+    tets, n = model.mesh.tets, model.mesh.node_count
+    gradients = model.gradients
+    blocks = np.einsum("eq,eqia,eqib->eab", model.weights, gradients, gradients, optimize=True)
+    width = tets.shape[1]
+    rows, columns = np.repeat(tets, width, axis=1).ravel(), np.tile(tets, (1, width)).ravel()
+    return sp.csr_matrix((blocks.ravel(), (rows, columns)), (n, n))

@@ -8,12 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
+from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.perception.camera import Camera, SeenCloud, depth_to_cloud, read_camera
-from limber.perception.masks import read_mask, segment_by_depth
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import poses_at
+from limber.recordings.masks import read_mask, segment_by_depth
 from limber.recordings.recording import Observations, Pull
 
 CAMERA_OFFSET_M = 4e-3
@@ -140,7 +140,7 @@ def _loader(folder: Path, kind: str) -> Callable[[Path], SeenCloud]:
 
 
 def _read_cloud(path: Path, camera: Camera | None) -> SeenCloud:
-    from limber.geometry.cloud.cloud import read_cloud
+    from limber.geometry.cloud.files import read_cloud
 
     try:
         points = read_cloud(path, unit="m").points

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from limber.perception.camera import Camera, project
+from limber.geometry.cloud.camera import Camera, project
 
 
 def render_depth(camera: Camera, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from limber.geometry.cloud.camera import SeenCloud
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.perception.camera import SeenCloud
 from limber.perception.curve import BentCurve, RestCurve
 
 BEND_SIGMA = 0.6

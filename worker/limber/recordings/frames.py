@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
-from limber.perception.camera import Camera, read_camera, write_camera
+from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.progress import SILENT, Progress
 from limber.recordings.tables import LENGTH_UNITS_M
 
@@ -246,7 +246,7 @@ def _nearest(listed: list[tuple[float, Path]], wanted: float, stamps: list[float
 def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
     from PIL import Image
 
-    from limber.perception.masks import YoloSegmenter
+    from limber.recordings.masks import YoloSegmenter
 
     images = _listed(source, "rgb", settings)
     if not images:

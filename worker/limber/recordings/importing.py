@@ -11,12 +11,12 @@ import numpy as np
 from limber.alignment import Alignment
 from limber.constants import GRAVITY
 from limber.errors import InputError
-from limber.estimation.forward.hung_load import settled
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
 from limber.recordings.checks import clean
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
 from limber.recordings.frames import copy_clouds, copy_rgbd
+from limber.recordings.hung_load import settled
 from limber.recordings.recording import (
     POSE_COLUMNS,
     WRENCH_COLUMNS,

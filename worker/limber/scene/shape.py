@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.geometry.cloud.cloud import read_cloud
+from limber.geometry.cloud.files import read_cloud
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import NamedTarget

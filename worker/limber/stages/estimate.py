@@ -189,7 +189,7 @@ def _followed(branch: Branch, settings: EstimateSettings) -> str:
 
 
 def _cloud(branch: Branch) -> np.ndarray | None:
-    from limber.geometry.cloud.cloud import read_cloud
+    from limber.geometry.cloud.files import read_cloud
 
     return read_cloud(branch.path("cloud.ply")).points if branch.has("cloud.ply") else None
 

@@ -40,8 +40,8 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
             :func:`limber.geometry.surface.input.usable_surface`.
         MeshingError: fTetWild failed.
     """
+    from limber.constants import UNIT_METRES
     from limber.geometry.mesh_surface import mesh_body
-    from limber.geometry.skeleton.files import UNIT_METRES
     from limber.geometry.surface.input import usable_surface
     from limber.geometry.surface.surface import Surface
 

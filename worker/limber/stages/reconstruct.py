@@ -66,10 +66,11 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         InputError: the scan, the skeleton or the folder cannot be used.
         WorkError: the work failed; the folder is as it was.
     """
+    from limber.constants import UNIT_METRES
     from limber.geometry.cloud.depth_files import read_depth
     from limber.geometry.cloud.files import read_points
     from limber.geometry.reconstruct import reconstruct_cloud
-    from limber.geometry.skeleton.files import UNIT_METRES, read_skeleton
+    from limber.geometry.skeleton.files import read_skeleton
 
     settings = settings or ReconstructSettings()
     raw = read_points(cloud_path) if camera_path is None else read_depth(
@@ -159,7 +160,7 @@ def _eye(camera_path: Path | None) -> np.ndarray | None:
     """Where the depth image's camera stood [m], shape [3]."""
     if camera_path is None:
         return None
-    from limber.perception.camera import read_camera
+    from limber.geometry.cloud.camera import read_camera
 
     return read_camera(camera_path).origin
 

@@ -60,12 +60,3 @@ def _columns(name: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
     if name == "color":
         values = values.astype(np.uint8)
     return [(part, values[:, k]) for k, part in enumerate(parts)]
-
-
-def read_cloud(path: Path, unit: str = "m") -> "Cloud":
-    """Read a cloud of any known format, in metres; see :mod:`limber.geometry.cloud.files`."""
-    from limber.geometry.cloud.files import read_points
-    from limber.geometry.skeleton.files import UNIT_METRES
-
-    cloud = read_points(path)
-    return cloud.with_points(cloud.points * UNIT_METRES[unit])

@@ -13,13 +13,13 @@ def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = Non
 
     Args:
         depth_path: 16-bit PNG; a value divided by the camera's ``depth_scale`` is metres.
-        camera_path: ``camera.toml`` (see :mod:`limber.perception.camera`).
+        camera_path: ``camera.toml`` (see :mod:`limber.geometry.cloud.camera`).
         mask_path: PNG of the same size, over 0 on the branch; None takes every reading.
 
     Raises:
         InputError: an image or the camera cannot be read, or they do not belong together.
     """
-    from limber.perception.camera import depth_to_cloud, read_camera
+    from limber.geometry.cloud.camera import depth_to_cloud, read_camera
 
     camera = read_camera(camera_path)
     depth = _image(depth_path).astype(float) / camera.depth_scale

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.constants import UNIT_METRES
 from limber.errors import InputError, MissingDependencyError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.text import read_table
@@ -189,3 +190,9 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
     ".npz": _read_npz, ".npy": _read_npy,
 }
 """Suffix to reader; each may raise what its package raises, :func:`read_points` explains it."""
+
+
+def read_cloud(path: Path, unit: str = "m") -> Cloud:
+    """Read a cloud of any known format, in metres."""
+    cloud = read_points(path)
+    return cloud.with_points(cloud.points * UNIT_METRES[unit])

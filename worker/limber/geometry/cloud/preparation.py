@@ -8,9 +8,8 @@ from scipy.spatial import cKDTree
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.sheets import find_sheet
-from limber.geometry.cloud.sight import find_sight, flying_pixels
+from limber.geometry.cloud.sight import View, find_sight, flying_pixels
 from limber.geometry.settings import PreparationSettings
-from limber.geometry.skeleton.silhouette import View
 
 POINT_MINIMUM = 50
 _LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans as a branch

@@ -21,6 +21,19 @@ _LEAST = 200  # readings under which nothing is told of an image
 
 
 @dataclass(frozen=True)
+class View:
+    """Where a cloud was seen from.
+
+    Attributes:
+        eye: The camera's place [m], shape [3].
+        pitch: Width of a pixel at distance 1.
+    """
+
+    eye: np.ndarray
+    pitch: float
+
+
+@dataclass(frozen=True)
 class Sight:
     """A cloud as the image of one camera.
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.noisy_rings import mean_places, seen_sides
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
-from limber.geometry.surface.sweep import resample, tangents
+from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
 _CANDIDATES = 6

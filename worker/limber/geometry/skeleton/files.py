@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.constants import UNIT_METRES
 from limber.errors import InputError
 from limber.geometry.skeleton.skeleton import Skeleton
-
-UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:

@@ -5,10 +5,11 @@ millimetres or centimetres, together over whole patches. So a twig that only sti
 line of sight is taken for such scatter, and no branch is thicker than its silhouette is wide.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from limber.geometry.cloud.sight import View
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 
@@ -16,19 +17,6 @@ _ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouet
 _WINDOW = 3  # nodes to each side whose silhouette is taken together
 _SLACK = 1.2  # times as thick as its silhouette a branch may be
 _LEAST = 8  # pixels that make a silhouette
-
-
-@dataclass(frozen=True)
-class View:
-    """Where a cloud was seen from.
-
-    Attributes:
-        eye: The camera's place [m], shape [3].
-        pitch: Width of a pixel at distance 1.
-    """
-
-    eye: np.ndarray
-    pitch: float
 
 
 def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,

@@ -16,11 +16,11 @@ import numpy as np
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import polygon_factor, tangents
 from limber.geometry.surface.checks import SurfaceCheck, check_surface
 from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.rounded_union import distances, fillet_level, near_box, segments
 from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.sweep import polygon_factor, tangents
 from limber.geometry.surface.tubes import SPACING, largest_piece, run_axis, sides_of_runs, solid
 
 ROUNDING = 0.5

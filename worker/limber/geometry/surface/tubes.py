@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.sweep import frames, polygon_factor, resample, rings, tangents
 from limber.geometry.surface.checks import crossings
 from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.sweep import frames, polygon_factor, resample, rings, tangents
 
 
 @dataclass(frozen=True)

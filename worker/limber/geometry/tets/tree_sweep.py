@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.surface.sweep import any_normal, bending_factor, frames, rings, tangents
+from limber.geometry.skeleton.sweep import any_normal, bending_factor, frames, rings, tangents
 from limber.geometry.tets.cylinder_mesh import split_wedges
 from limber.geometry.tets.tet_mesh import TetMesh
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from limber.errors import InputError
-from limber.mechanics.dynamics.motion import MotionState
 from limber.mechanics.dynamics.pose_path import PosePath
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Equations
 from limber.mechanics.model import BranchModel
+from limber.mechanics.motion_state import MotionState
 from limber.mechanics.statics.problem import checked_forces
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static

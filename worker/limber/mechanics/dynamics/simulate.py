@@ -17,7 +17,6 @@ from limber.mechanics.dynamics.motion import (
     DEFAULT_SETTINGS,
     DynamicResult,
     DynamicSensitivities,
-    MotionState,
     NewmarkSettings,
 )
 from limber.mechanics.dynamics.motion_tangents import MotionTangents
@@ -25,6 +24,7 @@ from limber.mechanics.dynamics.newmark import NewmarkStepper
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.model import BranchModel
+from limber.mechanics.motion_state import MotionState
 from limber.mechanics.sensitivities import ParameterSet, reactions
 from limber.mechanics.statics.problem import base_forces, checked_forces, strain_warnings
 from limber.mechanics.statics.result import StaticResult

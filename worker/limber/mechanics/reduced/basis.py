@@ -16,6 +16,7 @@ from limber.errors import InputError
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.training import Snapshots
+from limber.mechanics.strain import gradient_metric
 
 # Shares and steps weigh what a basis is made of against each other: chosen, not measured one by
 # one; the errors that come out are (scripts/bench mechanics, rows of the reduced model).
@@ -186,16 +187,6 @@ def elastic_lifts(model: BranchModel, coordinates: GraspCoordinates) -> np.ndarr
         held[grasp.nodes] = patch
         lifts.append(held + tangent.solve(-model.tangent_times(zero, held)))
     return np.array(lifts)
-
-
-def gradient_metric(model: BranchModel) -> sp.csr_matrix:
-    """Return the H1 seminorm: the integral of grad u : grad u [m^3], [node_count, node_count]."""
-    tets, n = model.mesh.tets, model.mesh.node_count
-    gradients = model.gradients
-    blocks = np.einsum("eq,eqia,eqib->eab", model.weights, gradients, gradients, optimize=True)
-    width = tets.shape[1]
-    rows, columns = np.repeat(tets, width, axis=1).ravel(), np.tile(tets, (1, width)).ravel()
-    return sp.csr_matrix((blocks.ravel(), (rows, columns)), (n, n))
 
 
 def tangent_steps(model: BranchModel, snapshots: Snapshots) -> np.ndarray:

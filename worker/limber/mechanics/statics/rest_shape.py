@@ -17,7 +17,7 @@ from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
-from limber.mechanics.strain import deformation_gradients
+from limber.mechanics.strain import deformation_gradients, gradient_metric
 from limber.progress import SILENT, Progress
 from limber.sparse import NotPositiveDefiniteError
 
@@ -159,8 +159,6 @@ def _gradients(model: BranchModel, field: np.ndarray) -> np.ndarray:
 def _integrated(model: BranchModel, gradient: np.ndarray) -> np.ndarray:
     """Return the field, 0 at fixed nodes, whose gradient is nearest in least squares."""
     from scipy.sparse.linalg import splu
-
-    from limber.mechanics.reduced.basis import gradient_metric
 
     mesh = model.mesh
     right = np.zeros_like(mesh.nodes)
