@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -296,3 +297,23 @@ def test_the_command_is_a_session(branch_folder, tmp_path):
     done = subprocess.run([*command, str(tmp_path)], input=b"", capture_output=True, check=False)
     assert done.returncode == 2
     assert json.loads(done.stdout)["event"] == "failed"
+
+
+def test_named_targets_are_followed(branch_folder, tmp_path):
+    """A target of the folder is in each frame, where the surface about it has gone."""
+    folder = tmp_path / "beam.branch"
+    shutil.copytree(branch_folder, folder)
+    targets = [{"name": "flower", "position_m": [0.0, 0.0, 0.18], "mass_kg": 0.002}]
+    with Branch.open(folder).stage("target") as stage:
+        stage.path("targets.json").write_text(json.dumps(
+            {"format_version": 1, "targets": targets}))
+    with InteractiveSession(folder, reduced=False, mode="pinned") as session:
+        assert session.hello["targets"] == ["flower"]
+        rest = session.latest()
+        np.testing.assert_allclose(rest.targets, [[0, 0, 0.18]], atol=1e-6)
+        pose = np.array(session.hello["rest_pose"]) + [0.02, 0, 0, 0, 0, 0]
+        frame = settled(session, session.move(pose))
+        about = np.abs(rest.positions[:, 2] - 0.18) < 0.011
+        moved = (frame.positions - rest.positions)[about].mean(axis=0)
+        np.testing.assert_allclose(frame.targets[0] - rest.targets[0], moved, atol=1e-3)
+        assert frame.targets[0, 0] > 0.02
