@@ -5,6 +5,8 @@ Blender's and the user's Python differ, so it goes to the user's cache folder in
 NUMBA_CACHE_DIR wins. Where no folder can be written the kernels are compiled for the process.
 """
 
+import functools
+import hashlib
 import os
 import tempfile
 from collections.abc import Callable
@@ -19,13 +21,27 @@ import platformdirs
 def cache_folder() -> Path | None:
     """Return the folder for compiled kernels, or None if it cannot be written to."""
     folder = Path(os.environ.get("NUMBA_CACHE_DIR")
-                  or platformdirs.user_cache_path("limber") / "numba")
+                  or platformdirs.user_cache_path("limber") / "numba" / _layout())
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
         return None
+
+
+@functools.cache
+def _layout() -> str:
+    """Digest of the modules' names and of how kernels are compiled.
+
+    numba finds by itself that a kernel's source has changed. A kernel kept for a module that has
+    been renamed since would fail to load; one that was compiled otherwise would be used.
+    """
+    package = Path(__file__).parent
+    names = sorted(path.relative_to(package).as_posix() for path in package.rglob("*.py"))
+    digest = hashlib.sha256("\n".join(names).encode())
+    digest.update(Path(__file__).read_bytes())
+    return digest.hexdigest()[:12]
 
 
 def compiled(function: Callable) -> Callable:
