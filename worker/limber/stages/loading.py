@@ -6,6 +6,7 @@ computation comes through here.
 
 import hashlib
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -85,8 +86,8 @@ def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
     return tuple(map(float, load_skeleton(branch).point_at(float(fraction))))
 
 
-def load_branch(branch: Branch, *, gravity: bool, warn: Warn, **overrides: object,
-                ) -> LoadedBranch:
+def load_branch(branch: Branch, *, gravity: bool = True, warn: Warn = warnings.warn,
+                **overrides: object) -> LoadedBranch:
     """Return the branch as everything computes on it: as it hangs, with targets and grasp.
 
     Args:

@@ -1,0 +1,115 @@
+"""Weight in estimates: a branch that hangs as it was scanned, whatever its modulus comes out as."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.estimation.fit import fit_pulls
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.objective import Objective
+from limber.estimation.parameters import ParameterSpace
+from limber.estimation.preparation import forwards_of, subject_of
+from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.virtual_pull import TrueBranch, simulate_pull
+from limber.geometry.tets.cylinder_mesh import curved_beam
+from limber.geometry.tets.marks import mark
+from limber.mechanics.model import PointMass
+from limber.stages.mesh import mesh_surface
+from limber.stages.virtual_pull import virtual_pull
+from limber.store import Branch
+
+GRAVITY = (9.0, 0.0, -3.9)
+TRUTH = np.array([1.2e8, 0.9e8, 0.7e8, 0.5e8])
+SETTINGS = {"mesh_check": False, "shapes": 0, "hold_out": False, "key_frames": 4}
+
+
+@pytest.fixture(scope="module")
+def scanned(small):
+    """Mesh and axes of a soft branch that lies nearly level, with a fruit on its tip."""
+    skeleton = small.skeleton
+    mesh = curved_beam(skeleton.nodes, skeleton.radius, slice_length=4.0, sides=5)
+    return mark(mesh, skeleton, young=1e8, poisson=0.36, density=900.0), skeleton
+
+
+def subject(scanned, **settings):
+    mesh, skeleton = scanned
+    fruit = (PointMass(tuple(skeleton.nodes[-1]), 0.02),)
+    return subject_of(mesh, skeleton, fruit, GRAVITY, EstimateSettings(**SETTINGS, **settings))
+
+
+@pytest.fixture(scope="module")
+def pull(scanned):
+    hanging = subject(scanned)
+    truth = TrueBranch(hanging.mesh, hanging.skeleton, hanging.control_points,
+                       (0.2, 0.4, 0.6, 0.8), TRUTH, GRAVITY)
+    settings = VirtualPullSettings(frames=6, reach=0.15, position_noise=0.0, force_noise=0.0,
+                                   poisson=0.36, density=900.0, phase=0.4)
+    made = simulate_pull(truth, "pull", settings)[0]
+    assert not made.entry.weightless
+    return made
+
+
+def fitted(scanned, pull, **settings):
+    about = EstimateSettings(**SETTINGS, **settings)
+    start = replace(subject(scanned, **settings))
+    if settings.get("gravity", True):
+        # The truth has no fruit.
+        start = replace(start, model=start.model.without_point_masses())
+    forwards = forwards_of([pull], start, about, lambda _message: None)
+    objective = Objective(forwards, ParameterSpace.separate(start.start), force_sigma=[0.01])
+    return fit_pulls(objective, start.start, about, lambda _message: None).values.young
+
+
+def test_estimate_knows_that_the_branch_hangs(scanned, pull):
+    """Moduli come out exactly with weight; without it the model is another one, and they do not."""
+    with_weight = fitted(scanned, pull)
+    np.testing.assert_allclose(with_weight, TRUTH, rtol=2e-3)
+    without = fitted(scanned, pull, gravity=False)
+    assert np.abs(without / TRUTH - 1).max() > 5 * np.abs(with_weight / TRUTH - 1).max()
+
+
+def test_forward_derivatives_under_weight(scanned, pull):
+    """Positions and forces to log E and log density against central differences, fruit and all."""
+    start = subject(scanned)
+    forward = forwards_of([pull], start, EstimateSettings(**SETTINGS), lambda _message: None)[0]
+    assert isinstance(forward, QuasiStaticForward)
+    values = replace(start.start, young=TRUTH)
+    found = forward.simulate(values, ("density",), True)
+    step = 1e-3
+    for column in (0, 2, 4):
+        changed = [replace(values, young=TRUTH * np.exp(sign * step * (np.arange(4) == column)),
+                           density=900.0 * float(np.exp(sign * step * (column == 4))))
+                   for sign in (1, -1)]
+        ahead, behind = (forward.simulate(each, (), False) for each in changed)
+        slope = (ahead.positions - behind.positions) / (2 * step)
+        size = np.abs(found.d_positions).max()
+        assert np.abs(found.d_positions[..., column] - slope).max() < 5e-3 * size
+        slope = (ahead.forces - behind.forces) / (2 * step)
+        assert np.abs(found.d_forces[..., column] - slope).max() < 5e-3 * np.abs(
+            found.d_forces).max()
+
+
+def test_virtual_pull_takes_the_body_that_was_meshed(tmp_path):
+    """After `limber mesh --up`: its own tetrahedra, under gravity as it was turned with them."""
+    from trimesh.creation import box
+
+    box(extents=(0.3, 0.012, 0.006)).export(tmp_path / "slat.stl")
+    from limber.geometry.settings import MeshSurfaceSettings
+
+    folder = tmp_path / "slat.branch"
+    mesh_surface(tmp_path / "slat.stl", folder,
+                 MeshSurfaceSettings(up=(0.0, 0.0, 1.0), unit="m", root=(-0.15, 0.0, 0.0)))
+    gravity = np.array(Branch.open(folder).gravity)
+    assert abs(gravity[2]) < 1e-6 * np.linalg.norm(gravity), "the slat lay level"
+    settings = VirtualPullSettings(young=(3e9,) * 4, weight=0.5, frames=2, position_noise=0.0)
+    virtual_pull(folder, "hung", settings)
+    from limber.recordings.recording import read_pull
+
+    hung = read_pull(folder / "pulls" / "hung")
+    assert not hung.entry.weightless
+    moved = hung.poses[-1, :3] - hung.poses[0, :3]
+    # It bends about its thin side, and to where weight points: a round rod would be stiffer.
+    arm = 0.92 * 0.3
+    thin = 0.5 * arm**3 / (3 * 3e9 * 0.012 * 0.006**3 / 12)
+    assert np.dot(moved, gravity) / np.linalg.norm(gravity) == pytest.approx(thin, rel=0.1)
