@@ -84,7 +84,8 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
     pull = import_pull(branch, recording, name, ImportSettings(
         nominal=str(branch.parent / "nominal.csv"), coordinates="scan", weight=load,
         own_weight=True, grasp_point=(float(x), float(y), float(z)), grasp_radius=0.012))
-    found = estimate(branch, EstimateSettings(pull=(name,), fractions=(0.5,)), force=True)
+    found = estimate(branch, EstimateSettings(pull=(name,), fractions=(0.5,), density_sigma=0.02),
+                     force=True)
     down = -np.array(pull["load_n"]) / load
     measured = -np.mean(np.array(pull["displacement_m"])[TIPS] @ down)
     deviation = found["young_deviation"]

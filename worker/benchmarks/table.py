@@ -2,7 +2,9 @@
 
 import argparse
 import importlib
+import inspect
 import json
+import secrets
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -11,7 +13,7 @@ from pathlib import Path
 from limber.plain import plain
 from limber.progress import BarSink, Progress
 
-NAMES = ("geometry", "mechanics", "estimation", "planning")
+NAMES = ("geometry", "mechanics", "estimation", "truth", "planning")
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("name", choices=NAMES)
     parser.add_argument("--quick", action="store_true", help="fewer seeds")
     parser.add_argument("--json", action="store_true", help="last line: the table as JSON")
+    parser.add_argument("--seed", type=int, help="repeat what a printed base seed drew")
     parser.add_argument("--out", type=Path, help="folder for pictures and raw numbers")
     options = parser.parse_args(arguments)
     module = importlib.import_module(f"benchmarks.{options.name}")
@@ -58,10 +61,14 @@ def show(rows: list[Row]) -> None:
 
 
 def _measure(module: object, options: argparse.Namespace) -> list[Row]:
+    drawn = {}
+    if "seed" in inspect.signature(module.rows).parameters:
+        drawn["seed"] = secrets.randbits(31) if options.seed is None else options.seed
+        print(f"base seed {drawn['seed']} (--seed repeats it)", flush=True)
     if not sys.stderr.isatty():
-        return module.rows(options.quick, Progress(), options.out)
+        return module.rows(options.quick, Progress(), options.out, **drawn)
     with BarSink(options.name) as bar:
-        return module.rows(options.quick, Progress(bar), options.out)
+        return module.rows(options.quick, Progress(bar), options.out, **drawn)
 
 
 if __name__ == "__main__":

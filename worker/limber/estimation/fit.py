@@ -10,28 +10,32 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled
+from limber.errors import Cancelled, WorkError
+from limber.estimation.causes import largest, variance_parts
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward
 from limber.estimation.identifiability import (
+    SCALE_DEVIATION,
     Identifiability,
     identifiability,
     link_unresolved,
     require_scale,
 )
 from limber.estimation.model_error import ModelError, geometry_error, mesh_error
+from limber.estimation.nuisances import in_words, told
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
-from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.parameters import Values
 from limber.estimation.preparation import (
     Subject,
     forwards_of,
+    parameter_space,
     require_scale_in_principle,
 )
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.shape_error import shape_error
-from limber.estimation.start import scaled_start
+from limber.estimation.start import led_start, scaled_start
 from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
 from limber.mechanics.points import point_operator
 from limber.progress import SILENT, Progress
@@ -44,12 +48,10 @@ MISFIT_FACTOR = 4.0
 twice the stated noise. Of 10 branches reconstructed from scans, all sound ones stayed under 1.3,
 and the one whose axis ran into a twig and back came to 13, with moduli threefold off."""
 
+UNEXPLAINED_FACTOR = 1.5
+"""The same, from which something acts that is not in the model."""
 WIDE = 0.15
-"""Standard deviation of a log E from which it is worth a word what would narrow it: chosen."""
-ADVICE = {"sensor": "More pulls, in other directions or farther, would narrow it.",
-          "geometry": "A scan from more sides, or with less noise, would narrow it.",
-          "mesh": "A finer mesh (--mesh-spacing of reconstruct) would narrow it."}
-"""What to do about the part of an interval that is the largest."""
+"""Standard deviation of a log E from which it is worth a word what would narrow it."""
 
 
 @dataclass
@@ -82,6 +84,7 @@ class Estimate:
 
     @property
     def values(self) -> Values:
+        """Of the model on its mesh."""
         return self.objective.space.unpack(self.fit.evaluation.free)
 
     @property
@@ -92,6 +95,48 @@ class Estimate:
         error = self.model_error
         return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
                 "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
+
+    @property
+    def young(self) -> np.ndarray:
+        """Of the material [Pa], shape [K]: without what the mesh is known to be too stiff by."""
+        return self.values.young * self.model_error.mesh_factor
+
+    @property
+    def cell_errors(self) -> list[dict[str, Any]]:
+        """Each error of cell and sensors with its value and interval."""
+        errors = self.fit.evaluation.errors
+        return [] if errors is None else told(self.objective.cell_errors.nuisances, errors,
+                                              self.uncertainty.covariance)
+
+    @property
+    def causes(self) -> dict[str, np.ndarray]:
+        """Variance of log E at the control points by where it comes from, each of shape [K]."""
+        sure = self.uncertainty
+        parts = variance_parts(self.fit.evaluation, self.objective,
+                               sure.variance_factor * sure.repetition)
+        if self.model_error.geometry is not None:
+            parts["shape of the scan"] = self.model_error.geometry**2
+        if self.model_error.mesh is not None:
+            parts["mesh"] = self.model_error.mesh**2
+        return parts
+
+    @property
+    def is_bad(self) -> str | None:
+        """Why there is no result to pass on; None: there is one."""
+        space = self.objective.space
+        bound = [name for name in space.on_bound(self.fit.evaluation.free)
+                 if name not in {prior for prior, _, _ in space.priors}]
+        if bound:
+            return (f"{', '.join(bound)} ran to a bound: the data ask for a value beyond it, as "
+                    "they do with a wrong unit, grasp point or frame of reference, or with "
+                    "markers that are mirrored or mistaken for each other.")
+        scale = identifiability(self.fit.evaluation, space).scale_deviation
+        if not np.isfinite(scale) or scale > SCALE_DEVIATION:
+            return ("The data do not tell the moduli: all of them together are known only to "
+                    f"within a factor of {np.exp(min(2 * scale, 20)):.2g}.")
+        if not self.fit.converged:
+            return f"The optimiser did not converge: {self.fit.reason}"
+        return None
 
 
 def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, *,
@@ -112,7 +157,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
     sigma = [pull.entry.sensor.force_sigma_n for pull in pulls]
-    objective = Objective(forwards, ParameterSpace.separate(subject.start, _extra(settings)),
+    objective = Objective(forwards, parameter_space(subject, forwards, settings),
                           log=log, force_sigma=sigma, progress=progress,
                           expected_count=20 if settings.method == "gauss-newton" else 200)
     return fit_pulls(objective, subject.start, settings, progress.warn, cache=cache, digest=digest)
@@ -141,6 +186,8 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
             suspicion = force_unit_suspicion(float(np.mean(start.young)))
             if suspicion:
                 tell(suspicion)
+    if settings.method == "gauss-newton" and reduction is None:
+        start = led_start(judged_on, start)
     first = _evaluated(judged_on, start)
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
@@ -177,16 +224,8 @@ def _force_is_measured(objective: Objective) -> bool:
     return False
 
 
-def _extra(settings: EstimateSettings) -> tuple[str, ...]:
-    wanted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
-              "alpha": settings.fit_damping, "beta": settings.fit_damping}
-    return tuple(name for name, chosen in wanted.items() if chosen)
-
-
 def _evaluated(objective: Objective, values: Values) -> Evaluation:
     """Evaluate with derivatives; softer or stiffer where there is no equilibrium."""
-    from limber.errors import WorkError
-
     for factor in (1.0, 3.0, 0.3, 10.0, 0.1):
         scaled = replace(values, young=values.young * factor)
         found = objective.evaluate(objective.space.pack(scaled), jacobian=True)
@@ -286,21 +325,21 @@ def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSetting
 
 
 def _judge(found: Estimate, tell: Callable[[str], None]) -> None:
-    space, free = found.objective.space, found.fit.evaluation.free
-    for name in space.on_bound(free):
-        tell(f"{name} ran to its bound: the data ask for a value beyond it. Check units, grasp "
-             "point and frame of reference.")
     if found.uncertainty.variance_factor > MISFIT_FACTOR:
         tell(f"The fit is poor: residuals are {found.uncertainty.variance_factor**0.5:.1f} times "
              "the stated noise, and the intervals do not hold. Is this a pull of this branch, in "
              "its frame of reference? Does the skeleton run where the branch does?")
+    elif found.uncertainty.variance_factor > UNEXPLAINED_FACTOR:
+        tell(f"Residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated noise: "
+             "something acts that is not in the model, or the sensors are worse than stated. The "
+             "intervals were widened by as much.")
+    for sentence in in_words(found.cell_errors):
+        tell(sentence)
     named = outliers(found.fit.evaluation, found.objective)
     if named:
         worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "
                           f"({entry['deviations']:.0f} deviations)" for entry in named[:4])
         tell(f"Outliers: {worst}{' ...' if len(named) > 4 else ''}.")
-    if not found.fit.converged and not found.stopped:
-        tell(f"The optimiser did not converge: {found.fit.reason}")
 
 
 def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str, Any]]:
@@ -342,6 +381,20 @@ def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSe
     found.held_out[pull.name] = _score(forward[0], distance, force, in_fit=False)
 
 
+def require_result(found: Estimate) -> None:
+    """Refuse a fit that ended at no result.
+
+    Raises:
+        WorkError: with the reason.
+    """
+    reason = found.is_bad
+    if reason is not None:
+        young = ", ".join(f"{value / 1e6:.4g}" for value in found.values.young)
+        raise WorkError("The pulls give no estimate.", reason,
+                        f"The fit stood at {young} MPa; nothing was written. Check what the "
+                        "warnings say of the recording, or use more pulls.")
+
+
 def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: EstimateSettings,
                 *, axes: Path | None, cloud: np.ndarray | None,
                 progress: Progress = SILENT) -> None:
@@ -356,10 +409,12 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         progress(1.0, "how much the mesh is too stiff")
         inside = point_operator(subject.mesh, subject.control_points)
         model = subject.model.with_parameters(poisson=found.values.poisson)
-        error = replace(error, mesh=mesh_error(model, grasp_on(subject.mesh, grasp), inside,
-                                               subject.weights, found.values.young))
+        stiff = mesh_error(model, grasp_on(subject.mesh, grasp), inside, subject.weights,
+                           found.values.young)
+        if stiff is not None:
+            error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
     found.model_error = error
-    _tell_largest_part(found.deviations, progress.warn)
+    _tell_largest_part(found, progress.warn)
 
 
 def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
@@ -375,15 +430,16 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
     return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
 
 
-def _tell_largest_part(deviations: dict[str, Any], tell: Callable[[str], None]) -> None:
-    """Say what would narrow a wide interval: the part that makes up most of its variance."""
-    total = deviations["total"]
+def _tell_largest_part(found: Estimate, tell: Callable[[str], None]) -> None:
+    """Say what would narrow a wide interval: what makes up most of its variance."""
+    parts = found.causes
+    total = np.sqrt(np.sum(list(parts.values()), axis=0))
     worst = int(np.argmax(total))
     if total[worst] < WIDE:
         return
-    parts = {name: float(deviations[name][worst]) for name in ADVICE
-             if deviations[name] is not None}
-    largest = max(parts, key=parts.get)
-    each = ", ".join(f"{name} {100 * part:.0f} %" for name, part in parts.items())
-    tell(f"E at control point {worst + 1} has a standard deviation of {100 * total[worst]:.0f} % "
-         f"({each}). {ADVICE[largest]}")
+    each = "; ".join(f"{cause['cause']} {100 * cause['deviation']:.0f} % ({cause['advice']})"
+                     for cause in largest({name: part[worst:worst + 1]
+                                           for name, part in parts.items()}))
+    tell(f"E at control point {worst + 1} has a standard deviation of "
+         f"{100 * min(total[worst], 99.0):.0f} %. Most of it comes from, and would be less with: "
+         f"{each}.")

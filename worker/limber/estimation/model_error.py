@@ -26,7 +26,9 @@ REFINED_LIMIT = 60_000
 SMALL_FORCE_N = 1e-6
 """Far below what bends any branch visibly: the response is linear."""
 REMAINING = 4 / 3
-"""Error over its drop when edges are halved, at second order. Singular corners converge slower."""
+"""Error over its drop when edges are halved, at second order."""
+UNSURE = 1 / 3
+"""Part of that drop by which the error may be another: singular corners converge slower."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,14 @@ class ModelError:
         mesh: From the mesh, shape [K]; None where it was not measured.
         axis_is_exact: Whether ``geometry`` is of the radii alone (:func:`geometry_error`), not
             of axis and radii (:func:`limber.estimation.shape_error.shape_error`).
+        mesh_factor: Young's modulus of the material over that of the model on its mesh, which is
+            too stiff by as much; shape [K]. ``mesh`` is what that leaves open.
     """
 
     geometry: np.ndarray | None = None
     mesh: np.ndarray | None = None
     axis_is_exact: bool = True
+    mesh_factor: np.ndarray | float = 1.0
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
@@ -81,9 +86,23 @@ def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.nd
     return RADIUS_POWER * (share.T @ relative[nearest]) / share.sum(axis=0)
 
 
+@dataclass(frozen=True)
+class MeshStiffness:
+    """How much a mesh is too stiff.
+
+    Attributes:
+        factor: Young's modulus of the material over that with which the mesh bends as the
+            material does, at the control points, shape [K].
+        deviation: Relative standard deviation of that factor, shape [K].
+    """
+
+    factor: np.ndarray
+    deviation: np.ndarray
+
+
 def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.ndarray,
-               young: np.ndarray) -> np.ndarray | None:
-    """Relative standard deviation of E at the control points from the mesh, shape [K].
+               young: np.ndarray) -> MeshStiffness | None:
+    """Find how much the mesh is too stiff.
 
     A small force bends the branch on this mesh and on a refined one; the moduli that make this
     one bend like the refined one differ by the mesh's error.
@@ -125,7 +144,11 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
     alike = float(missing @ together / (together @ together))
     # Around the change alike everywhere, as far as the response tells the moduli apart.
     apart = np.linalg.lstsq(slopes, missing - alike * together, rcond=0.03)[0]
-    return REMAINING * np.maximum(np.abs(alike + apart), abs(alike))
+    # What all moduli have in common is told well and corrected; the rest shows how unevenly the
+    # mesh errs, and is left open.
+    count = len(young)
+    return MeshStiffness(np.full(count, np.exp(-REMAINING * alike)),
+                         np.hypot(UNSURE * alike, REMAINING * apart) * np.ones(count))
 
 
 def _across(grasp: Grasp, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,15 +170,16 @@ def refined(mesh: TetMesh) -> TetMesh:
 
 
 def total_interval(young: np.ndarray, sensor: np.ndarray, error: ModelError) -> np.ndarray:
-    """95 % interval [Pa] of all parts together, shape [K, 2].
+    """95 % interval [Pa] of the material's modulus, all parts together, shape [K, 2].
 
     Args:
-        young: Estimated [Pa], shape [K].
+        young: Estimated on the mesh [Pa], shape [K].
         sensor: 95 % interval from the sensors alone [Pa], shape [K, 2].
         error: What the fit does not see.
     """
     other = 1.96 * error.total(np.zeros(len(young)))
     middle, low, high = (np.log(values) for values in (young, *sensor.T))
     # The sensors' part may be one-sided, where a bound of the modulus cuts it.
-    return np.exp(np.column_stack([middle - np.hypot(middle - low, other),
-                                   middle + np.hypot(high - middle, other)]))
+    spread = np.column_stack([middle - np.hypot(middle - low, other),
+                              middle + np.hypot(high - middle, other)])
+    return np.exp(spread) * np.reshape(error.mesh_factor, (-1, 1))

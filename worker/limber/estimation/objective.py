@@ -1,6 +1,6 @@
 """What an optimiser minimises: differences of simulated and measured, each over its deviation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,12 +8,19 @@ from limber.errors import Cancelled
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.input_force import Response
-from limber.estimation.parameters import ParameterSpace
+from limber.estimation.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
+from limber.estimation.parameters import ParameterSpace, Values
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
 
 FAILED_OBJECTIVE = 1e12
 """Objective of parameters under which the simulation finds no equilibrium."""
+SETTLING_ROUNDS = 8
+STILL_SETTLING = 0.6
+"""A change of the force that moves the gripper by more than this part of the last one did leads
+nowhere."""
+SETTLED_FORCE_M = 5e-4
+"""Change of the gripper's place by a change of its force at which the force stays."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +32,10 @@ class Evaluation:
         residual: Differences over standard deviations, shape [r].
         jacobian: Its derivative to the free vector, shape [r, p], or None.
         loss: The paper's J: sum of squared distances of all seen points [m^2].
-        pulls: The simulated pulls.
-        unknown_count: Unknowns of measured input forces that were eliminated from it.
+        pulls: The simulated pulls as cell and sensors would show them, their errors as fitted.
+        unknown_count: Unknowns of measured input forces, and errors of cell and sensors, that
+            were eliminated from it.
+        errors: These errors; None: there are none.
     """
 
     free: np.ndarray
@@ -35,11 +44,31 @@ class Evaluation:
     loss: float
     pulls: tuple[Simulated, ...]
     unknown_count: int = 0
+    errors: Eliminated | None = None
 
     @property
     def objective(self) -> float:
         """Half the sum of squared residuals."""
         return 0.5 * float(self.residual @ self.residual)
+
+
+@dataclass(frozen=True)
+class RawSlopes:
+    """Derivatives of a pull's r standardised residuals.
+
+    Attributes:
+        free: To the free vector, shape [r, p].
+        errors: To the errors of cell and sensors, shape [r, k].
+        response: To the unknowns of its force, shape [r, L]; None: it has none.
+        residual: With the errors as fitted, shape [r].
+        kinds: What each residual is of, as a cause of uncertainty; length r.
+    """
+
+    free: np.ndarray
+    errors: np.ndarray
+    response: np.ndarray | None
+    residual: np.ndarray
+    kinds: list[str]
 
 
 class Stopped(Cancelled):
@@ -62,6 +91,7 @@ class Objective:
         self._last: Evaluation | None = None
         self._whitening = [_whitening(forward.frames) for forward in forwards]
         self._spans: dict[int, tuple[Response, np.ndarray, np.ndarray]] = {}
+        self.cell_errors = CellErrors(forwards)
 
     def with_space(self, space: ParameterSpace) -> "Objective":
         """Return an objective on other parameters that goes on with the same log and count."""
@@ -94,9 +124,7 @@ class Objective:
             return last
         values = self.space.unpack(free)
         try:
-            pulls = [forward.simulate(values, self.space.extra, jacobian)
-                     for forward in self.forwards]
-            found = None if any(pull is None for pull in pulls) else self._compare(free, pulls)
+            found = self._simulated(free, values, jacobian)
             if last is None or not np.array_equal(last.free, free):
                 # The derivative at a state that is known already is not another simulation.
                 self.forward_count += 1
@@ -132,58 +160,155 @@ class Objective:
         Returns whether there are any; what was evaluated before is then of another linearisation.
         """
         moved = False
-        for index, simulated in enumerate(evaluation.pulls):
-            response = self.forwards[index].response
-            if response is None:
+        for index, forward in enumerate(self.forwards):
+            if forward.response is None or forward.watches_pose:
                 continue
-            columns, triangle = self._span(index, response)
-            residual, _ = self._rows(index, simulated)
-            change = -np.linalg.lstsq(triangle, columns.T @ residual, rcond=1e-9)[0]
-            self.forwards[index].shift_force(change)
+            forward.shift_force(self._force_change(index, evaluation.pulls[index]))
             moved = True
         if moved:
             self.forget()
         return moved
 
+    def _simulated(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
+        """Simulate all pulls; forces that are unknowns beside a recorded path are settled."""
+        settling = [index for index, forward in enumerate(self.forwards) if forward.watches_pose]
+        if not settling:
+            return self._compared(free, values, jacobian)
+        last = np.inf
+        for _ in range(SETTLING_ROUNDS):
+            found = self._compared(free, values, False)
+            if found is None:
+                break
+            # Linear in what is left of the way, the comparison has it already.
+            changes = [self._force_change(index, found.pulls[index]) for index in settling]
+            moved = max(self.forwards[index].moved_by(change)
+                        for index, change in zip(settling, changes, strict=True))
+            if moved < SETTLED_FORCE_M:
+                found = self._compared(free, values, True) if jacobian else found
+                self.keep_forces()
+                return found
+            if moved > STILL_SETTLING * last:
+                break
+            last = moved
+            for index, change in zip(settling, changes, strict=True):
+                self.forwards[index].shift_force(change)
+        # Parameters under which the force finds no rest are too far off: no step there.
+        self.step_back()
+        return None
+
+    def keep_forces(self) -> None:
+        """Remember the forces of pulls that settle; :meth:`step_back` returns to them."""
+        for forward in self.forwards:
+            if forward.watches_pose:
+                forward.keep()
+
+    def step_back(self) -> None:
+        """Return to the forces that were kept last."""
+        self._last = None
+        for forward in self.forwards:
+            if forward.watches_pose:
+                forward.step_back()
+
+    def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
+        pulls = [forward.simulate(values, self.space.extra, jacobian) for forward in self.forwards]
+        return None if any(pull is None for pull in pulls) else self._compare(free, pulls)
+
+    def _force_change(self, index: int, simulated: Simulated) -> np.ndarray:
+        """How the unknowns of a pull's force would have to change to explain its residuals."""
+        columns, triangle = self._span(index, self.forwards[index].response)
+        residual, _ = self._rows(index, simulated)
+        return -np.linalg.lstsq(triangle, columns.T @ residual, rcond=1e-9)[0]
+
     def _compare(self, free: np.ndarray, pulls: list[Simulated]) -> Evaluation:
-        residuals, jacobians, loss, unknown_count = [], [], 0.0, 0
+        residuals, jacobians, columns, slopes, unknown_count = [], [], [], [], 0
+        with_errors = self.cell_errors.count > 0
         for index, simulated in enumerate(pulls):
-            frames = self.forwards[index].frames
-            loss += float(np.sum((simulated.positions - frames.positions)[_seen(frames)]**2))
             residual, jacobian = self._rows(index, simulated)
+            of_errors, by_errors = (self._by_errors(index, simulated) if with_errors
+                                    else (None, None))
             response = self.forwards[index].response
             if response is not None:
                 # What another force would explain is no sign of the moduli.
-                columns, _ = self._span(index, response)
-                residual = residual - columns @ (columns.T @ residual)
-                if jacobian is not None:
-                    jacobian = jacobian - columns @ (columns.T @ jacobian)
-                unknown_count += columns.shape[1]
+                span, _ = self._span(index, response)
+                residual, jacobian, by_errors = (
+                    None if each is None else each - span @ (span.T @ each)
+                    for each in (residual, jacobian, by_errors))
+                unknown_count += span.shape[1]
             residuals.append(residual)
+            columns.append(by_errors)
+            slopes.append(of_errors)
             if jacobian is not None:
                 jacobians.append(jacobian)
-        links = self.space.link_rows()
-        residuals.append(links @ free)
-        jacobian = np.vstack([self._on_free(np.vstack(jacobians)), links]) if jacobians else None
-        return Evaluation(free, np.concatenate(residuals), jacobian, loss, tuple(pulls),
-                          unknown_count)
+        residual = np.concatenate(residuals)
+        jacobian = self.on_free(np.vstack(jacobians)) if jacobians else None
+        errors = None
+        if with_errors:
+            residual, jacobian, errors = eliminated(residual, jacobian, np.vstack(columns))
+            pulls = [_shown(simulated, of_errors, errors.values)
+                     for simulated, of_errors in zip(pulls, slopes, strict=True)]
+            unknown_count += self.cell_errors.count
+        rows, offsets = self.space.own_rows()
+        residual = np.concatenate([residual, rows @ free - offsets])
+        jacobian = None if jacobian is None else np.vstack([jacobian, rows])
+        loss = sum(float(np.sum((pull.positions - forward.frames.positions)[
+            _seen(forward.frames)]**2)) for pull, forward in zip(pulls, self.forwards,
+                                                                strict=True))
+        return Evaluation(free, residual, jacobian, loss, tuple(pulls), unknown_count, errors)
+
+    def raw_slopes(self, evaluation: Evaluation) -> list[RawSlopes]:
+        """Derivatives of each pull's standardised residuals, nothing eliminated.
+
+        Args:
+            evaluation: With derivatives.
+        """
+        found = []
+        for index, (forward, simulated) in enumerate(
+                zip(self.forwards, evaluation.pulls, strict=True)):
+            residual, jacobian = self._rows(index, simulated)
+            seen, force, torque = self._known(index, simulated.torques is not None)
+            kinds = ["noise of the points"] * (3 * int(seen.sum()))
+            kinds += ["noise of the force"] * (3 * sum(
+                int(known.sum()) for known in (force, torque) if known is not None))
+            if forward.watches_pose:
+                kinds += ["single poses of the gripper"] * (3 * len(forward.frames))
+            errors = (self._by_errors(index, simulated)[1] if self.cell_errors.count
+                      else np.zeros((len(kinds), 0)))
+            response = None
+            if forward.response is not None:
+                span, triangle = self._span(index, forward.response)
+                response = span @ triangle
+            found.append(RawSlopes(self.on_free(jacobian), errors, response, residual, kinds))
+        return found
+
+    def _by_errors(self, index: int, simulated: Simulated) -> tuple[ErrorSlopes, np.ndarray]:
+        """What errors of cell and sensors do to a pull, and to its standardised residuals."""
+        found = self.cell_errors.slopes(index, simulated.positions, simulated.forces)
+        torques = None if simulated.torques is None else found.torques
+        return found, self._standardised_slopes(index, found.points, found.forces, torques,
+                                                found.grasps)
 
     def _rows(self, index: int, simulated: Simulated) -> tuple[np.ndarray, np.ndarray | None]:
         """Standardised residuals of a pull's points, forces and torques, and their derivative."""
         seen, force, torque = self._known(index, simulated.torques is not None)
+        forward = self.forwards[index]
         residual = [self._points(index, simulated)[seen].ravel()]
         if force is not None:
             residual.append(self._forces(index, simulated)[force].ravel())
         if torque is not None:
-            off = simulated.torques - self.forwards[index].frames.wrenches[:, 3:]
+            off = simulated.torques - forward.frames.wrenches[:, 3:]
             residual.append((off / self._torque_sigma(index)[:, None])[torque].ravel())
+        if forward.watches_pose:
+            off = simulated.grasps - forward.frames.poses[:, :3]
+            residual.append((off / forward.pose_sigma).ravel())
         if simulated.d_positions is None:
             return np.concatenate(residual), None
         return np.concatenate(residual), self._standardised_slopes(
-            index, simulated.d_positions, simulated.d_forces, simulated.d_torques)
+            index, simulated.d_positions, simulated.d_forces, simulated.d_torques,
+            simulated.d_grasps)
 
     def _standardised_slopes(self, index: int, points: np.ndarray, forces: np.ndarray,
-                             torques: np.ndarray | None) -> np.ndarray:
+                             torques: np.ndarray | None, grasps: np.ndarray | None,
+                             ) -> np.ndarray:
         seen, force, torque = self._known(index, torques is not None)
         slope = np.einsum("fmij,fmjp->fmip", self._whitening[index], points)
         rows = [slope[seen].reshape(-1, slope.shape[-1])]
@@ -193,6 +318,9 @@ class Objective:
         if torque is not None:
             slope = torques / self._torque_sigma(index)[:, None, None]
             rows.append(slope[torque].reshape(-1, slope.shape[-1]))
+        if self.forwards[index].watches_pose:
+            slope = grasps / self.forwards[index].pose_sigma
+            rows.append(slope.reshape(-1, slope.shape[-1]))
         return np.vstack(rows)
 
     def _known(self, index: int, has_torque: bool,
@@ -211,11 +339,12 @@ class Objective:
             wrenches = response.wrenches
             columns = self._standardised_slopes(
                 index, response.points, wrenches[:, :3],
-                wrenches[:, 3:] if wrenches.shape[1] == 6 else None)
+                wrenches[:, 3:] if wrenches.shape[1] == 6 else None, response.grasps)
             known = self._spans[index] = (response, *np.linalg.qr(columns))
         return known[1], known[2]
 
-    def _on_free(self, jacobian: np.ndarray) -> np.ndarray:
+    def on_free(self, jacobian: np.ndarray) -> np.ndarray:
+        """Derivatives to the free vector from those to the physical parameters, [r, p]."""
         count = len(self.space.groups)
         return np.hstack([jacobian[:, :count] @ self.space.membership, jacobian[:, count:]])
 
@@ -235,6 +364,17 @@ class Objective:
     def _sigma(self, index: int) -> np.ndarray:
         counts = np.maximum(self.forwards[index].frames.wrench_counts, 1)
         return self.force_sigma[index] / np.sqrt(counts)
+
+
+def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Simulated:
+    """Return a pull as cell and sensors with these errors would show it."""
+    def moved(measured: np.ndarray | None, slope: np.ndarray) -> np.ndarray | None:
+        return None if measured is None else measured + slope @ values
+
+    return replace(simulated, positions=moved(simulated.positions, slopes.points),
+                   forces=moved(simulated.forces, slopes.forces),
+                   torques=moved(simulated.torques, slopes.torques),
+                   grasps=moved(simulated.grasps, slopes.grasps))
 
 
 def _seen(frames: Frames) -> np.ndarray:

@@ -7,6 +7,7 @@ import numpy as np
 YOUNG_BOUNDS_PA = (1e4, 1e11)
 POISSON_BOUNDS = (0.0, 0.495)
 DENSITY_BOUNDS = (50.0, 5000.0)
+FORM_BOUNDS = (-5.0, 5.0)
 LINK_DEVIATION = 1.2
 """Deviation of the logarithm of the ratio of two neighbouring moduli, before anything is measured:
 the nine ratios in the paper's table have a root mean square of 1.1."""
@@ -21,33 +22,40 @@ class Values:
         poisson: Poisson's ratio.
         density: [kg/m^3].
         damping: Rayleigh's alpha [1/s] and beta [s].
+        form: How the modulus runs between the control points, in deviations from what is
+            expected (:mod:`limber.estimation.field_form`); empty: as expected.
     """
 
     young: np.ndarray
     poisson: float
     density: float
     damping: tuple[float, float] = (0.0, 0.0)
+    form: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class ParameterSpace:
     """Which of the values are free, and which control points share one modulus.
 
-    The free vector holds log E of each group, then Poisson's ratio, log density, log alpha and
-    log beta as far as they are free.
+    The free vector holds log E of each group, then the form of the field, Poisson's ratio, log
+    density, log alpha and log beta as far as they are free.
 
     Attributes:
         base: Values of what is not free, and the start of what is.
         groups: Group of each control point, shape [K]; groups are numbered from 0.
-        extra: Free ones out of "poisson", "density", "alpha", "beta", in this order.
+        extra: Free ones: all that describe the form, named "form ...", or none; then out of
+            "poisson", "density", "alpha", "beta", in this order.
         links: Pairs of groups of which the data do not tell the first: it is taken to differ from
             the second as neighbours do.
+        priors: Names out of ``extra`` with what is known of their free value beforehand: its mean
+            and standard deviation.
     """
 
     base: Values
     groups: tuple[int, ...]
     extra: tuple[str, ...] = ()
     links: tuple[tuple[int, int], ...] = ()
+    priors: tuple[tuple[str, float, float], ...] = ()
 
     @classmethod
     def separate(cls, base: Values, extra: tuple[str, ...] = ()) -> "ParameterSpace":
@@ -77,9 +85,11 @@ class ParameterSpace:
         """Return the free vector; members of a group enter by their geometric mean."""
         member = self.membership
         young = member.T @ np.log(values.young) / member.sum(axis=0)
+        form = [name for name in self.extra if name.startswith("form")]
         tail = {"poisson": values.poisson, "density": np.log(values.density),
                 "alpha": np.log(max(values.damping[0], 1e-9)),
-                "beta": np.log(max(values.damping[1], 1e-9))}
+                "beta": np.log(max(values.damping[1], 1e-9)),
+                **dict(zip(form, values.form or np.zeros(len(form)), strict=True))}
         return np.r_[young, [tail[name] for name in self.extra]]
 
     def unpack(self, free: np.ndarray) -> Values:
@@ -88,15 +98,18 @@ class ParameterSpace:
         young = np.exp(self.membership @ free[:self.group_count])
         tail = dict(zip(self.extra, free[self.group_count:], strict=True))
         alpha, beta = self.base.damping
+        form = tuple(float(value) for name, value in tail.items() if name.startswith("form"))
         return Values(young, float(tail.get("poisson", self.base.poisson)),
                       float(np.exp(tail["density"])) if "density" in tail else self.base.density,
                       (float(np.exp(tail["alpha"])) if "alpha" in tail else alpha,
-                       float(np.exp(tail["beta"])) if "beta" in tail else beta))
+                       float(np.exp(tail["beta"])) if "beta" in tail else beta),
+                      form or self.base.form)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the free vector."""
         tail = {"poisson": POISSON_BOUNDS, "density": np.log(DENSITY_BOUNDS),
-                "alpha": np.log((1e-6, 1e4)), "beta": np.log((1e-8, 1.0))}
+                "alpha": np.log((1e-6, 1e4)), "beta": np.log((1e-8, 1.0)),
+                **{name: FORM_BOUNDS for name in self.extra if name.startswith("form")}}
         pairs = [np.log(YOUNG_BOUNDS_PA)] * self.group_count + [tail[name] for name in self.extra]
         lower, upper = np.array(pairs, float).T
         return lower, upper
@@ -107,6 +120,23 @@ class ParameterSpace:
         for row, (group, neighbour) in zip(rows, self.links, strict=True):
             row[[group, neighbour]] = 1 / LINK_DEVIATION, -1 / LINK_DEVIATION
         return rows
+
+    def own_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """What is known beforehand as standardised rows: priors, then links; R and d of R x - d.
+
+        Shapes [priors + links, p] and [priors + links].
+        """
+        rows = np.zeros((len(self.priors), self.size))
+        offsets = np.zeros(len(self.priors))
+        for number, (name, mean, sigma) in enumerate(self.priors):
+            rows[number, self.group_count + self.extra.index(name)] = 1 / sigma
+            offsets[number] = mean / sigma
+        links = self.link_rows()
+        return np.vstack([rows, links]), np.r_[offsets, np.zeros(len(links))]
+
+    @property
+    def own_row_count(self) -> int:
+        return len(self.priors) + len(self.links)
 
     def linked(self, links: tuple[tuple[int, int], ...]) -> "ParameterSpace":
         """Return the space with these links instead of its own."""

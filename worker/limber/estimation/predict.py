@@ -67,8 +67,10 @@ def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down
 
 def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np.ndarray,
              ) -> tuple[QuasiStaticForward, Values]:
-    values = Values(np.array(known["young_pa"]), float(known["poisson"]),
-                    float(known.get("density", subject.start.density)))
+    # The modulus with which this mesh bends as the branch does.
+    values = Values(np.array(known.get("young_mesh_pa", known["young_pa"])),
+                    float(known["poisson"]), float(known.get("density", subject.start.density)),
+                    form=tuple(known.get("field_form", ())))
     points = np.array(subject.control_points if entry.rest_points_m is None
                       else entry.rest_points_m)
     wrenches = np.full((2, 6), np.nan)
@@ -82,14 +84,14 @@ def _forward(known: dict[str, Any], subject: Subject, entry: PullEntry, load: np
         driven = driven.model_copy(update={
             "grasp": entry.grasp.model_copy(update={"mode": "pinned"})})
     return QuasiStaticForward("prediction", subject.model, subject.weights, driven, frames,
-                              points, key_count=1), values
+                              points, key_count=1, field=subject.field), values
 
 
 def _space(known: dict[str, Any], values: Values) -> ParameterSpace:
     """The parameters that the estimate's covariance is about."""
     groups = tuple(known.get("groups") or range(len(values.young)))
     extra = tuple(name for name in known.get("parameters", ())
-                  if name in ("poisson", "density"))
+                  if name.startswith("form") or name in ("poisson", "density"))
     return ParameterSpace(replace(values), groups, extra)
 
 
@@ -98,11 +100,14 @@ def _uncertain(moved: np.ndarray, slope: np.ndarray, down: np.ndarray, space: Pa
     """Mean drop [m], standard deviations of each point's displacement and of the drop [m].
 
     Of the modulus only what the data leave open: an error of radius or mesh is in the modulus
-    and in this prediction with opposite signs.
+    and in this prediction with opposite signs. Under another load the branch is another time as
+    much stiffer or softer as it is from recording to recording.
     """
     count = len(space.groups)
     free = np.concatenate([slope[..., :count] @ space.membership, slope[..., count:]], axis=-1)
-    covariance = np.array(known["covariance"])[:space.size, :space.size]
+    covariance = np.array(known["covariance"])[:space.size, :space.size].copy()
+    group_count = space.group_count
+    covariance[:group_count, :group_count] += float(known.get("recording_spread", 0.0))**2
     each = np.einsum("mip,pq,miq->mi", free, covariance, free)
     size = np.linalg.norm(moved, axis=1)
     along = moved / np.maximum(size, 1e-12)[:, None]

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
-from limber.estimation.forward.forward import Forward
-from limber.estimation.forward.quasi_static import QuasiStaticForward
-from limber.estimation.parameters import Values
+from limber.estimation.field_form import YoungField, open_field
+from limber.estimation.forward.forward import Forward, under_its_weight
+from limber.estimation.forward.quasi_static import QuasiStaticForward, uses_torque
+from limber.estimation.forward.watched import WatchedForward
+from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -19,6 +21,7 @@ from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames, frames_of
+from limber.recordings.calibration import calibration_of
 from limber.recordings.recording import Pull, PullEntry
 
 Warn = Callable[[str], None]
@@ -35,6 +38,7 @@ class Subject:
         weights: Young's modulus of the tetrahedra from the control points', [tet_count, K].
         model: With the values to start from.
         start: These values.
+        field: How the modulus runs between the control points; None: as the weights say.
     """
 
     mesh: TetMesh
@@ -43,6 +47,11 @@ class Subject:
     weights: np.ndarray
     model: BranchModel
     start: Values
+    field: YoungField | None = None
+
+    def young(self, values: Values) -> np.ndarray:
+        """Young's modulus of the tetrahedra [Pa], shape [tet_count]."""
+        return (self.field or YoungField(self.weights)).young(values)
 
 
 def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
@@ -70,7 +79,12 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     model = model.as_scanned() if settings.gravity else model
     start = Values(np.full(len(points), young), poisson, density,
                    (damping.mass, damping.stiffness))
-    return Subject(mesh, skeleton, points, young_weights(mesh, points), model, start)
+    weights = young_weights(mesh, points)
+    field = None
+    if settings.field == "open" and settings.forward == "full" and (
+            settings.method == "gauss-newton"):
+        field = open_field(mesh, skeleton, weights, settings.fractions)
+    return Subject(mesh, skeleton, points, weights, model, start, field)
 
 
 def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings, warn: Warn,
@@ -124,9 +138,52 @@ def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subj
     if entry.motion == "dynamic":
         from limber.estimation.forward.dynamic import DynamicForward
 
-        return DynamicForward(name, subject.model, subject.weights, entry, frames, rest)
-    return QuasiStaticForward(name, subject.model, subject.weights, entry, frames, rest,
-                              key_count=settings.key_frames)
+        return DynamicForward(name, subject.model, subject.weights, entry, frames, rest,
+                              field=subject.field)
+    kind = WatchedForward if is_watched(entry, frames, settings) else QuasiStaticForward
+    return kind(name, subject.model, subject.weights, entry, frames, rest,
+                key_count=settings.key_frames, field=subject.field)
+
+
+def is_watched(entry: PullEntry, frames: Frames, settings: EstimateSettings) -> bool:
+    """Whether a slow pull's force leads and the gripper's recorded path is an observation.
+
+    So it is wherever the force was measured, of a clamped grasp the torque too, and the gripper's
+    frame may be off. Without the force there is nothing else to lead but the path; it then counts
+    as exact.
+    """
+    measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
+    known = calibration_of(entry)
+    return (entry.drive == "pose" and settings.drive is None and settings.forward == "full"
+            and bool(measured.mean() > 0.8)
+            and (known.pose_sigma_m > 0 or known.pose_sigma_rad > 0)
+            and (entry.grasp.mode == "pinned" or uses_torque(entry, frames)))
+
+
+def parameter_space(subject: Subject, forwards: list[Forward], settings: EstimateSettings,
+                    ) -> ParameterSpace:
+    """What is free, and what is known beforehand of what is not asked for.
+
+    Poisson's ratio, the density where weight or inertia acts, and the form of the field are free
+    within their priors; asked for (``--fit-poisson``, ``--fit-density``), they are so without.
+    """
+    wanted = {"poisson": settings.fit_poisson, "density": settings.fit_density,
+              "alpha": settings.fit_damping, "beta": settings.fit_damping}
+    chosen = {name for name, is_wanted in wanted.items() if is_wanted}
+    form = subject.field.names if subject.field is not None else ()
+    priors = [(name, 0.0, 1.0) for name in form]
+    if settings.forward == "full" and settings.method == "gauss-newton":
+        weighs = any(forward.is_dynamic or under_its_weight(
+            subject.model, forward.entry).gravity.any() for forward in forwards)
+        if settings.poisson_sigma > 0 and "poisson" not in chosen:
+            priors.append(("poisson", subject.start.poisson, settings.poisson_sigma))
+        if settings.density_sigma > 0 and "density" not in chosen and weighs:
+            priors.append(("density", float(np.log(subject.start.density)),
+                           settings.density_sigma))
+    free = chosen | {name for name, _, _ in priors}
+    extra = (*form, *(name for name in wanted if name in free))
+    return ParameterSpace(subject.start, tuple(range(len(subject.start.young))), extra,
+                          priors=tuple(priors))
 
 
 def observed(folder: Path, pull: Pull, subject: Subject, settings: EstimateSettings,

@@ -18,7 +18,8 @@ class EstimateSettings(Settings):
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping"),
         "solver": ("method", "forward", "key_frames", "evaluations", "delta_m2", "robust"),
-        "uncertainty": ("hold_out", "mesh_check", "shapes"),
+        "uncertainty": ("field", "poisson_sigma", "density_sigma", "hold_out", "mesh_check",
+                        "shapes"),
     }
     experts = ("key_frames", "evaluations", "delta_m2", "robust", "mesh_check", "shapes")
 
@@ -42,6 +43,13 @@ class EstimateSettings(Settings):
     density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
     gravity: bool = Field(
         True, description="The branch bears its own weight, and was scanned so.")
+    field: Literal["open", "inverse_distance"] = Field(
+        "open", description="How Young's modulus runs between the control points. open: not "
+        "known; the pull and its interval decide. inverse_distance: exactly as the paper's.")
+    poisson_sigma: float = Field(
+        0.05, ge=0, description="Standard deviation of Poisson's ratio, where it is not fitted.")
+    density_sigma: float = Field(
+        0.1, ge=0, description="Relative standard deviation of the density, where it acts.")
     fit_poisson: bool = Field(False, description="Estimate Poisson's ratio too.")
     fit_density: bool = Field(False, description="Estimate the density too.")
     fit_damping: bool = Field(False, description="Estimate Rayleigh damping too (dynamic only).")

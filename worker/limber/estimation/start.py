@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from limber.errors import WorkError
 from limber.estimation.forward.forward import Forward
 from limber.estimation.objective import Objective
 from limber.estimation.optimise import gauss_newton
@@ -25,6 +26,32 @@ def scaled_start(objective: Objective, values: Values) -> Values:
     if any(forward.is_dynamic for forward in objective.forwards):
         return _step_by_step(objective, values)
     return _scaled(objective, values)
+
+
+def led_start(objective: Objective, values: Values) -> Values:
+    """Fit pulls whose path is watched by their force alone first, without the path.
+
+    Far from the solution no force explains both the path and the points; a force as it was read
+    merely moves a branch of wrong moduli too far. Near it, force and path are settled together.
+    """
+    watched = [forward for forward in objective.forwards if forward.watches_pose]
+    if not watched:
+        return values
+    space = objective.space
+    likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
+    for forward in watched:
+        forward.is_watching = False
+    try:
+        rough = objective.with_forwards(objective.forwards).with_space(likely)
+        fit = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
+                           force_rounds=1)
+    except WorkError:
+        return values
+    finally:
+        for forward in watched:
+            forward.is_watching = True
+    objective.forward_count = rough.forward_count
+    return likely.unpack(fit.evaluation.free)
 
 
 def _scaled(objective: Objective, values: Values) -> Values:
@@ -61,7 +88,7 @@ def _step_by_step(objective: Objective, values: Values) -> Values:
 
 
 def _force_ratio(forward: Forward, values: Values) -> float | None:
-    usable = forward.uses_force and forward.drive == "pose"
+    usable = forward.uses_force and (forward.drive == "pose" or forward.watches_pose)
     return forward.force_ratio(values) if usable else None
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.estimation.causes import largest
 from limber.estimation.fit import Estimate
 from limber.estimation.model_error import total_interval
 from limber.estimation.objective import Evaluation, Objective
@@ -17,11 +18,17 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
     """Return the stage's result: DESIGN's keys and more."""
     values, sure = found.values, found.uncertainty
     return {
-        "method": settings.method, "young_pa": values.young,
+        "method": settings.method, "young_pa": found.young, "young_mesh_pa": values.young,
         "young_interval_pa": total_interval(values.young, sure.young_interval,
                                             found.model_error),
-        "young_interval_sensor_pa": sure.young_interval,
+        "young_interval_sensor_pa": sure.young_interval * np.reshape(
+            found.model_error.mesh_factor, (-1, 1)),
         "young_deviation": found.deviations, "poisson": values.poisson,
+        "recording_spread": sure.recording_spread,
+        "field_form": values.form, "cell_errors": found.cell_errors,
+        "causes": [] if found.stopped else largest(found.causes),
+        "led_by": {forward.name: "force, the gripper's path watched" if forward.watches_pose
+                   else forward.drive for forward in found.objective.forwards},
         "density": values.density, "loss_m2": found.fit.evaluation.loss,
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
         "stopped": found.stopped, "held_out": found.held_out,

@@ -6,6 +6,7 @@ import numpy as np
 from scipy import stats
 
 from limber.estimation.objective import Evaluation, Objective
+from limber.recordings.calibration import calibration_of
 
 OUTLIER = 4.5
 """Standardised residual (RMS over axes) from which a measurement is named an outlier: chosen,
@@ -26,6 +27,7 @@ class Uncertainty:
         correlation: Of the free vector, shape [p, p].
         repetition: How many frames in a row say the same thing: 1 where their errors are
             independent.
+        recording_spread: Standard deviation of log E, all alike, from recording to recording.
     """
 
     covariance: np.ndarray
@@ -33,6 +35,7 @@ class Uncertainty:
     variance_factor: float
     correlation: np.ndarray
     repetition: float = 1.0
+    recording_spread: float = 0.0
 
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
@@ -44,8 +47,9 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     average out: the covariance grows by how many frames repeat each other. What the mesh gets
     wrong is not in it (:mod:`limber.estimation.model_error`).
     """
-    # Links are no measurements: neither do they tell the noise, nor does its scale act on them.
-    count = len(evaluation.residual) - len(objective.space.links)
+    # Priors and links are no measurements: neither do they tell the noise, nor does its scale act
+    # on them.
+    count = len(evaluation.residual) - objective.space.own_row_count
     jacobian, residual = evaluation.jacobian[:count], evaluation.residual[:count]
     freedom = max(len(residual) - jacobian.shape[1] - evaluation.unknown_count, 1)
     # Huber's proposal: residuals beyond 3 deviations count as 3. Where they are many they are no
@@ -64,6 +68,10 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
     spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
     covariance = spread @ spread.T
+    from_recording = recording_spread(evaluation, objective, factor * repetition)
+    together = np.zeros(len(covariance))
+    together[:objective.space.group_count] = 1.0
+    covariance += np.outer(together, together) * from_recording**2 / len(objective.forwards)
     deviation = np.sqrt(np.diag(covariance))
     width = stats.t.ppf(0.5 + level / 2, freedom) * deviation
     space = objective.space
@@ -74,7 +82,46 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     bounds = np.exp(space.bounds()[0][0]), np.exp(space.bounds()[1][0])
     interval = np.clip(np.column_stack([low.young, high.young]), *bounds)
     return Uncertainty(covariance, interval, factor,
-                       covariance / np.maximum(np.outer(deviation, deviation), 1e-300), repetition)
+                       covariance / np.maximum(np.outer(deviation, deviation), 1e-300), repetition,
+                       from_recording)
+
+
+def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:
+    """Standard deviation of log E, all alike, from recording to recording.
+
+    Each pull alone asks for a step of the common scale, known to within its own noise; by how much
+    more these steps differ is the spread (DerSimonian and Laird's random effect). Few pulls tell
+    it badly: what the calibration says of it counts as one further recording.
+
+    Args:
+        scale: Variance of what was measured over the stated.
+    """
+    stated = float(np.mean([calibration_of(forward.entry).repeat_sigma
+                            for forward in objective.forwards]))
+    count = len(objective.forwards)
+    if count < 2 or stated == 0.0:
+        return stated
+    steps, variances = [], []
+    group_count = objective.space.group_count
+    for piece in objective.raw_slopes(evaluation):
+        others = [piece.errors] + ([] if piece.response is None else [piece.response])
+        taken = np.vstack([np.hstack(others), np.eye(piece.errors.shape[1], sum(
+            each.shape[1] for each in others))])
+        basis = np.linalg.qr(taken)[0]
+        along, off = (np.concatenate([each, np.zeros(piece.errors.shape[1])]) for each in (
+            piece.free[:, :group_count].sum(axis=1), piece.residual))
+        along, off = (each - basis @ (basis.T @ each) for each in (along, off))
+        information = float(along @ along)
+        if information > 0:
+            steps.append(-float(along @ off) / information)
+            variances.append(scale / information)
+    if len(steps) < 2:
+        return stated
+    weights = 1 / np.array(variances)
+    mean = np.average(steps, weights=weights)
+    excess = float(weights @ (np.array(steps) - mean)**2) - (len(steps) - 1)
+    between = max(excess, 0.0) / (weights.sum() - (weights**2).sum() / weights.sum())
+    return float(np.sqrt((stated**2 + (len(steps) - 1) * between) / len(steps)))
 
 
 def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:

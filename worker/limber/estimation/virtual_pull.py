@@ -30,6 +30,7 @@ from limber.mechanics.young_field import young_weights
 from limber.perception.observe import write_depth
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.progress import SILENT, Progress
+from limber.recordings.calibration import EXACT
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import (
     GraspEntry,
@@ -172,7 +173,7 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool
     return PullEntry(
         observation="depth" if settings.camera else "markers",
         drive="force" if settings.weight is not None else settings.drive,
-        motion=settings.motion,
+        motion=settings.motion, calibration=EXACT,
         gravity_m_s2=truth.gravity if settings.own_weight and not is_weightless else None,
         weightless=is_weightless,
         grasp=GraspEntry(point_m=tuple(map(float, point)), radius_m=float(1.3 * radius),

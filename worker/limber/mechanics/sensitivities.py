@@ -36,15 +36,19 @@ class ParameterSet:
             shape [tet_count, K]; None: one factor on the whole field.
         control_young: Young's modulus at the control points [Pa], shape [K]; default: solved
             from the model's field by least squares.
+        shares: Instead of both: d log E of the tetrahedra to each parameter of the field, shape
+            [K, tet_count].
     """
 
     names: tuple[str, ...] = ("log_young",)
     weights: np.ndarray | None = None
     control_young: np.ndarray | None = None
+    shares: np.ndarray | None = None
 
     def labels(self) -> list[str]:
         """Return one name for each column of the derivatives."""
-        count = 1 if self.weights is None else self.weights.shape[1]
+        count = (len(self.shares) if self.shares is not None
+                 else 1 if self.weights is None else self.weights.shape[1])
         return [label for name in self.names
                 for label in ([f"log_young_{k}" for k in range(count)]
                               if name == "log_young" else [name])]
@@ -71,16 +75,17 @@ class StaticSensitivities:
 def static_sensitivities(model: BranchModel, result: StaticResult,
                          grasp: Grasp | Sequence[Grasp] | None, weights: np.ndarray | None,
                          parameters: Sequence[str] = ("log_young",), *, is_held: bool = True,
-                         control_young: np.ndarray | None = None) -> StaticSensitivities:
+                         control_young: np.ndarray | None = None,
+                         shares: np.ndarray | None = None) -> StaticSensitivities:
     """Differentiate a converged static state.
 
     Args:
         grasp: As it was solved with.
-        weights: See :class:`ParameterSet`.
+        weights, control_young, shares: See :class:`ParameterSet`.
         parameters: Out of PARAMETERS; the damping ones give 0.
         is_held: Whether the grasp was held at a pose; False for a force.
     """
-    wanted = ParameterSet(checked_names(parameters), weights, control_young)
+    wanted = ParameterSet(checked_names(parameters), weights, control_young, shares)
     grasps = [] if grasp is None else [grasp] if isinstance(grasp, Grasp) else list(grasp)
     equations = model.equations(grasps if is_held else ())
     u = result.displacement
@@ -106,15 +111,16 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
 
 
 def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
-                  right: np.ndarray) -> np.ndarray:
-    """Return x with force(x) = right on the free nodes, from a nearby tangent."""
+                  right: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
+    """Return x with force(x) = right on the free nodes, to ``tolerance``, from a nearby tangent.
+    """
     equations, solution = tangent.equations, tangent.solve(right)
     scale = np.linalg.norm(equations.free_part(right))
     last = np.inf
     for _ in range(_REFINEMENTS):
         left = equations.free_part(right - force(solution))
         norm = float(np.linalg.norm(left))
-        if norm <= 1e-10 * scale or norm >= 0.5 * last:
+        if norm <= tolerance * scale or norm >= 0.5 * last:
             # Round-off is reached, or the factor is too far away to get nearer.
             break
         last = norm
@@ -139,6 +145,8 @@ def lame_changes(model: BranchModel, wanted: ParameterSet,
 
 def young_shares(model: BranchModel, wanted: ParameterSet) -> np.ndarray:
     """Return d log E_tet / d log E_k, shape [K, tet_count]."""
+    if wanted.shares is not None:
+        return wanted.shares
     if wanted.weights is None:
         return np.ones((1, model.mesh.tet_count))
     control = wanted.control_young

@@ -13,6 +13,7 @@ from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
+from limber.recordings.calibration import WITHOUT_GRIPPER
 from limber.recordings.checks import clean
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
 from limber.recordings.frames import copy_clouds, copy_rgbd
@@ -212,6 +213,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     load = _load(settings, branch)
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
                    grasp=_place(settings.grasp_point, settings, branch), sigma=sigma)
+    entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER})
     poses = np.zeros((2, 6))
     poses[:, :3] = entry.grasp.point_m
     wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))

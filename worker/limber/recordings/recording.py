@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.errors import InputError
 from limber.plain import plain
+from limber.recordings.calibration import CalibrationEntry
 from limber.recordings.streams import Stream, read_stream, write_stream
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
@@ -64,6 +65,9 @@ class PullEntry(BaseModel):
         0.0, description="Added to the observations' time stamps to get the robot's.")
     grasp: GraspEntry
     sensor: SensorEntry = SensorEntry()
+    calibration: CalibrationEntry | None = Field(
+        None, description="How well gripper, force and camera are calibrated; absent: as a cell "
+        "that was set up with care and not measured since.")
     rest_points_m: tuple[Vector, ...] | None = Field(
         None, description="Where the observed points are at rest; absent: the control points.")
     source: str = ""

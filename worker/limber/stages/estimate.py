@@ -65,7 +65,8 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 
     Raises:
         InputError: no pulls, or pulls that cannot tell Young's modulus.
-        WorkError: the simulation finds no equilibrium.
+        WorkError: the simulation finds no equilibrium, or the fit ends at no result (it did not
+            converge, or at a bound, or the data leave the moduli open); nothing is written.
         Cancelled: after the best so far was kept.
     """
     branch = Branch.open(branch_folder)
@@ -76,7 +77,7 @@ def estimate(branch_folder: Path, settings: EstimateSettings, *, force: bool = F
 def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume: bool,
               progress: Progress) -> dict[str, Any]:
     from limber.estimation.evaluations import EvaluationLog
-    from limber.estimation.fit import fit_branch, judge_model
+    from limber.estimation.fit import fit_branch, judge_model, require_result
     from limber.estimation.summary import details, summary
     from limber.stages.loading import load_pulls, load_subject, pull_names, pulls_digest
 
@@ -101,6 +102,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
                        progress=heard.part(0.2, 0.9))
     found.warnings = warnings
     if not found.stopped:
+        require_result(found)
         judge_model(found, subject, pulls[0].entry.grasp, settings,
                     axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None,
                     cloud=_cloud(branch), progress=heard.part(0.9, 0.98))
@@ -118,7 +120,7 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
             json.dumps(plain(full), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         if not found.stopped:
             subject.mesh.with_data(cell_data={
-                "young": subject.weights @ found.values.young,
+                "young": subject.young(found.values),
                 "poisson": np.full(subject.mesh.tet_count, found.values.poisson),
                 "density": np.full(subject.mesh.tet_count, found.values.density),
             }).write(stage.path("mesh.vtu"))

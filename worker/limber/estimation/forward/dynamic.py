@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from limber.errors import InputError
+from limber.estimation.field_form import YoungField
 from limber.estimation.forward.force_motion import motion_response
 from limber.estimation.forward.forward import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import Response, nodal_loads
@@ -30,7 +31,7 @@ class DynamicForward(Forward):
     is_dynamic = True
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
-                 frames: Frames, rest_points: np.ndarray):
+                 frames: Frames, rest_points: np.ndarray, *, field: YoungField | None = None):
         super().__init__(name, entry, frames, rest_points)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if entry.drive == "force" and not measured.all():
@@ -46,6 +47,7 @@ class DynamicForward(Forward):
         self._forces = frames.wrenches[:, :3]
         self._arguments = (name, model, weights, entry)
         self.weights = weights
+        self.field = field or YoungField(weights)
         self._model = under_its_weight(model, entry)
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
@@ -61,13 +63,13 @@ class DynamicForward(Forward):
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
         model = self._model.with_parameters(
-            young=self.weights @ values.young, poisson=values.poisson, density=values.density,
+            young=self.field.young(values), poisson=values.poisson, density=values.density,
             damping=RayleighDamping(*values.damping))
         frames, by_pose = self.frames, self.drive == "pose"
         drive = ({"poses": np.array([pose_on(self.grasp, self.entry.grasp, pose)
                                      for pose in frames.poses])} if by_pose
                  else {"grasp_forces": self._forces})
-        wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
+        wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
         asked = {"sensitivities": wanted, "sensitivity_nodes": self._nodes} if sensitivities else {}
         result = simulate_dynamics(model, grasp=self.grasp, times=frames.times, **drive, **asked)
         if not result.converged:
@@ -100,7 +102,8 @@ class DynamicForward(Forward):
         measured = np.isfinite(self.frames.wrenches[:, :3]).all()
         if measured and entry.grasp.mode == "pinned":
             entry = entry.model_copy(update={"drive": "force"})
-        return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points)
+        return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points,
+                              field=self.field)
 
     def shift_force(self, change: np.ndarray) -> None:
         self._forces = self._forces + change.reshape(-1, 3)

@@ -9,6 +9,7 @@ from limber.estimation.forward.input_force import Response
 from limber.estimation.parameters import Values
 from limber.mechanics.model import BranchModel
 from limber.recordings.alignment import Frames
+from limber.recordings.calibration import calibration_of
 from limber.recordings.recording import PullEntry
 
 
@@ -24,6 +25,8 @@ class Simulated:
         d_forces: Shape [f, 3, P], or None.
         torques: About the grasp point [N m], shape [f, 3]; None: not known.
         d_torques: Shape [f, 3, P], or None.
+        grasps: The grasp point [m], shape [f, 3], where it is compared; else None.
+        d_grasps: Shape [f, 3, P], or None.
     """
 
     positions: np.ndarray
@@ -32,6 +35,8 @@ class Simulated:
     d_forces: np.ndarray | None = None
     torques: np.ndarray | None = None
     d_torques: np.ndarray | None = None
+    grasps: np.ndarray | None = None
+    d_grasps: np.ndarray | None = None
 
 
 def under_its_weight(model: BranchModel, entry: PullEntry) -> BranchModel:
@@ -56,6 +61,9 @@ class Forward(ABC):
         uses_force: Whether the force was measured in some frame, and is compared there.
         response: How the pull answers to errors of the measured force that drives it, once
             derivatives have been asked for; None: no such force, or not yet.
+        uses_torque: Whether the torque counts too.
+        grasp_tangent: Of the branch at the grasp, at all frames of the last simulation, shape
+            [f, 3]; where the gripper's path is an observation.
     """
 
     is_dynamic = False
@@ -66,6 +74,8 @@ class Forward(ABC):
         self.rest_points = np.asarray(rest_points, float)
         self.uses_force = bool(np.isfinite(frames.wrenches[:, :3]).all(axis=1).any())
         self.response: Response | None = None
+        self.uses_torque = False
+        self.grasp_tangent: np.ndarray | None = None
 
     @abstractmethod
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
@@ -82,6 +92,21 @@ class Forward(ABC):
     def drive(self) -> str:
         """What leads the simulation: ``pose`` or ``force``."""
         return self.entry.drive
+
+    @property
+    def watches_pose(self) -> bool:
+        """Whether the gripper's recorded path is an observation, and the force an unknown."""
+        return False
+
+    @property
+    def pose_sigma(self) -> float:
+        """Of a recorded place of the gripper, beside what all of them have in common [m]."""
+        return calibration_of(self.entry).pose_noise_m
+
+    @property
+    def force_is_stated(self) -> bool:
+        """Whether the force is a known load, not a sensor's reading."""
+        return False
 
     @property
     def full(self) -> "Forward":

@@ -37,10 +37,12 @@ class Response:
         points: Of the observed points [m per N], shape [f, m, 3, L].
         wrenches: Of force, and torque where it acts too, at the frames, shape [f, c, L]; c is 3
             or 6.
+        grasps: Of the gripper's place [m per N], shape [f, 3, L]; None where it is not watched.
     """
 
     points: np.ndarray
     wrenches: np.ndarray
+    grasps: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -132,5 +134,5 @@ def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) 
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(displacement, direction)
 
-    return np.array([refined_solve(tangent, force, load) for load in loads])
+    return np.array([refined_solve(tangent, force, load, tolerance=1e-5) for load in loads])
 

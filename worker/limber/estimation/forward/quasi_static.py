@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.errors import InputError, WorkError
+from limber.estimation.field_form import YoungField
 from limber.estimation.forward.forward import Forward, Simulated, under_its_weight
 from limber.estimation.forward.input_force import (
     Course,
@@ -59,10 +60,12 @@ class QuasiStaticForward(Forward):
         frames: Aligned frames.
         rest_points: Observed points at rest [m], shape [m, 3].
         key_count: Frames that are simulated at most.
+        field: How Young's modulus runs between the control points; as ``weights`` without it.
     """
 
     def __init__(self, name: str, model: BranchModel, weights: np.ndarray, entry: PullEntry,
-                 frames: Frames, rest_points: np.ndarray, *, key_count: int = 12):
+                 frames: Frames, rest_points: np.ndarray, *, key_count: int = 12,
+                 field: YoungField | None = None):
         super().__init__(name, entry, frames, rest_points)
         measured = np.isfinite(frames.wrenches[:, :3]).all(axis=1)
         if self.drive == "force" and measured.sum() < 2:
@@ -71,10 +74,12 @@ class QuasiStaticForward(Forward):
         if self.drive == "force" and entry.grasp.mode == "clamped":
             _require_torque(name, entry, frames)
         self.weights = weights
+        self.field = field or YoungField(weights)
         self._model = under_its_weight(model, entry)
         self.uses_torque = uses_torque(entry, frames)
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
+        self._zero = np.zeros(6)
         self.set_key_count(key_count)
 
     def set_key_count(self, count: int) -> None:
@@ -111,7 +116,7 @@ class QuasiStaticForward(Forward):
     def model_with(self, values: Values) -> BranchModel:
         """Return the branch with these parameters."""
         return self._model.with_parameters(
-            young=self.weights @ values.young, poisson=values.poisson, density=values.density,
+            young=self.field.young(values), poisson=values.poisson, density=values.density,
             damping=RayleighDamping(*values.damping))
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
@@ -131,7 +136,7 @@ class QuasiStaticForward(Forward):
         before: np.ndarray | None = None
         for key, drive in enumerate(self._drives):
             memory = self._memory[key]
-            same = memory is not None and _equal(self._values, values)
+            same = memory is not None and equal_values(self._values, values)
             hint = None if self._hints is None else self._hints[key]
             result = memory.result if same else self._solved(
                 model, self._load(key, drive), memory, jump, before, hint)
@@ -159,9 +164,19 @@ class QuasiStaticForward(Forward):
                                                          self.frames.poses[self.keys[key], :3])
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
-        if sensitivities and self.response is None and self.has_force_unknowns:
+        if (sensitivities or self.watches_pose) and self.response is None and (
+                self.has_force_unknowns):
             self.response = self._response(model)
-        return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques)
+        return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques,
+                                   *self._held(sensitivities))
+
+    def _held(self, _sensitivities: bool) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """The grasp point at the key frames and its derivatives, where they are compared."""
+        return None, None
+
+    @property
+    def force_is_stated(self) -> bool:
+        return self._course is not None and self._course.exact
 
     @property
     def has_force_unknowns(self) -> bool:
@@ -221,7 +236,7 @@ class QuasiStaticForward(Forward):
         known = np.flatnonzero(np.isfinite(frames.wrenches[:, :3]).all(axis=1))
         travel = np.linalg.norm(frames.poses[:, :3] - frames.poses[0, :3], axis=1)[known]
         row = known[int(np.argmin(np.abs(travel - 0.6 * travel.max())))]
-        force = frames.wrenches[row, :3]
+        force = frames.wrenches[row, :3] - self._zero[:3]
         size = float(np.linalg.norm(force))
         way = float(np.linalg.norm(frames.poses[row, :3] - frames.poses[0, :3]))
         if size <= 0 or way <= 0:
@@ -276,7 +291,8 @@ class QuasiStaticForward(Forward):
         starts = [] if hint is None else [hint]
         if memory is not None:
             start = memory.displacement
-            near = jump is not None and np.abs(jump).max() < YOUNG_STEP_LIMIT
+            near = (jump is not None and np.abs(jump).max() < YOUNG_STEP_LIMIT
+                    and not self.watches_pose)
             if memory.slope is not None and near:
                 start = start + memory.slope[..., :len(jump)] @ jump
             starts.append(start)
@@ -294,14 +310,14 @@ class QuasiStaticForward(Forward):
                 result: StaticResult) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of displacement [n, 3, p] and reaction [3, p]."""
         found = static_sensitivities(
-            model, result, self.grasp, self.weights, mechanics_names(extra),
-            is_held=self.drive == "pose", control_young=values.young)
+            model, result, self.grasp, None, mechanics_names(extra),
+            is_held=self.drive == "pose", shares=self.field.shares(values, extra))
         return found.displacement, found.reaction_force
 
     def _torque_slopes(self, model: BranchModel, values: Values, extra: tuple[str, ...],
                        result: StaticResult, slope: np.ndarray, about: np.ndarray) -> np.ndarray:
         """Derivative of the gripper's torque about a point that does not move, shape [3, p]."""
-        wanted = ParameterSet(mechanics_names(extra), self.weights, values.young)
+        wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
         held = self.grasp.nodes
         arm = model.mesh.nodes[held] + result.displacement[held] - about
         columns = []
@@ -340,15 +356,17 @@ def _require_torque(name: str, entry: PullEntry, frames: Frames) -> None:
             "pull.toml; or set mode = \"pinned\" under [grasp] if the branch could turn.")
 
 
-def _equal(one: Values | None, other: Values) -> bool:
+def equal_values(one: Values | None, other: Values) -> bool:
+    """Whether all parameters are the same."""
     return one is not None and np.array_equal(one.young, other.young) and (
-        (one.poisson, one.density, one.damping)
-        == (other.poisson, other.density, other.damping))
+        (one.poisson, one.density, one.damping, one.form)
+        == (other.poisson, other.density, other.damping, other.form))
 
 
 def mechanics_names(extra: tuple[str, ...]) -> tuple[str, ...]:
     """Return what :mod:`limber.mechanics.sensitivities` calls the parameters."""
     names = {"poisson": "poisson", "density": "log_density", "alpha": "damping_mass",
              "beta": "damping_stiffness"}
-    return ("log_young", *(names[name] for name in extra))
+    # What describes the form of the field comes with log E.
+    return ("log_young", *(names[name] for name in extra if name in names))
 

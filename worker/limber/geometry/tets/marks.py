@@ -7,9 +7,13 @@ from limber.errors import MeshingError
 from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 
-"""Where a branch is held unless told otherwise: two thirds along its main path."""
+FACE_COSINE, FLAT_SHARE = 0.8, 0.5
+"""A face whose normal is so near the axis belongs to the base; together they have to make up so
+much of the root's section, or there is no flat face."""
+CLAMP_BAND = 0.2
+"""Length that is held where there is no flat face, in radii of the root."""
 
 
 def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, density: float,
@@ -42,7 +46,12 @@ def mark(mesh: TetMesh, skeleton: Skeleton, *, young: float, poisson: float, den
 
 
 def base_nodes(mesh: TetMesh, skeleton: Skeleton) -> np.ndarray:
-    """1 for the nodes on the flat cut at the root, else 0, shape [node_count]."""
+    """1 for the nodes of the face at the root, else 0, shape [node_count].
+
+    Only the face is held: nodes in a band above it would be held too where the mesh is fine
+    enough to have some there, and the branch be the shorter the finer its mesh is. Where there is
+    no flat face (a scan that is rounded or ragged below), it is a band of ``CLAMP_BAND`` radii.
+    """
     path = skeleton.main_path()
     direction = skeleton.nodes[path[1]] - skeleton.nodes[path[0]]
     direction /= np.linalg.norm(direction)
@@ -51,10 +60,31 @@ def base_nodes(mesh: TetMesh, skeleton: Skeleton) -> np.ndarray:
     across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
     radius = max(float(skeleton.radius[path[0]]), 1e-9)
     beside = across < 2.0 * radius
-    # The lowest cross-section counts as the base even where the mesher has moved it a little.
-    lowest = along[beside].min() if beside.any() else 0.0
-    chosen = beside & (along < max(lowest, 0.0) + 0.2 * radius)
-    return _checked(chosen, "base")
+    lowest = min(along[beside].min() if beside.any() else 0.0, 0.0)
+    faces = mesh.surface_faces()
+    corners = mesh.nodes[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1) / 2
+    down = -(normals @ direction) / np.maximum(2 * area, 1e-300)
+    # A mesher moves a flat face a little, and a cut may be oblique; its edge is sharp all the same.
+    low = (along[faces].max(axis=1) < lowest + 0.5 * radius) & beside[faces].all(axis=1)
+    face = low & (down > FACE_COSINE)
+    if area[face].sum() < FLAT_SHARE * np.pi * radius**2:
+        return _checked(beside & (along < max(lowest, 0.0) + CLAMP_BAND * radius), "base")
+    return _checked(_nodes_of(mesh, faces[face]), "base")
+
+
+def _nodes_of(mesh: TetMesh, faces: np.ndarray) -> np.ndarray:
+    """Whether a node is on one of these faces, nodes halfway along their edges included."""
+    chosen = np.zeros(mesh.node_count, bool)
+    chosen[faces] = True
+    if mesh.is_quadratic:
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        keys = edges[:, 0] * mesh.node_count + edges[:, 1]
+        ends = np.sort(mesh.tets[:, EDGES], axis=2)
+        on_face = np.isin(ends[..., 0] * mesh.node_count + ends[..., 1], keys)
+        chosen[mesh.tets[:, 4:][on_face]] = True
+    return chosen
 
 
 def patch_nodes(mesh: TetMesh, skeleton: Skeleton, fraction: float) -> np.ndarray:

@@ -47,7 +47,8 @@ class MotionTangents:
         drive, wanted = self.drive, self.wanted
         found = static_sensitivities(
             self.model, equilibrium, drive.grasps or None, wanted.weights, wanted.names,
-            is_held=drive.path is not None, control_young=wanted.control_young)
+            is_held=drive.path is not None, control_young=wanted.control_young,
+            shares=wanted.shares)
         for column, tangent in enumerate(self._states):
             tangent.displacement = found.displacement[:, :, column].copy()
             if self.model.damping.stiffness:

@@ -1,0 +1,58 @@
+"""How Young's modulus runs between the control points, as unknowns of a fit."""
+
+import numpy as np
+import pytest
+
+from limber.estimation.field_form import YoungField, open_field
+from limber.estimation.parameters import ParameterSpace, Values
+
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+FRACTIONS = (0.2, 0.4, 0.6, 0.8)
+
+
+@pytest.fixture(scope="module")
+def field(small_bench):
+    return open_field(small_bench.mesh, small_bench.branch.skeleton, small_bench.weights,
+                      FRACTIONS)
+
+
+def test_shares_are_the_derivatives_of_the_field(field):
+    rng = np.random.default_rng(1)
+    extra = field.names
+    space = ParameterSpace(Values(TRUTH, 0.35, 900.0), (0, 1, 2, 3), extra)
+    free = np.r_[np.log(TRUTH), 0.5 * rng.standard_normal(len(extra))]
+    exact = field.shares(space.unpack(free), extra)
+    for column in range(len(free)):
+        step = np.zeros(len(free))
+        step[column] = 1e-5
+        ahead, behind = (np.log(field.young(space.unpack(free + sign * step))) for sign in (1, -1))
+        assert (ahead - behind) / 2e-5 == pytest.approx(exact[column], abs=1e-7)
+
+
+def test_any_form_keeps_the_moduli_at_the_control_points(field, small_bench):
+    """Mixture and bumps change the field between them, not there."""
+    values = Values(TRUTH, 0.35, 900.0, form=tuple(np.linspace(-1.5, 2, len(field.names))))
+    young = field.young(values)
+    for point, true in zip(small_bench.points, TRUTH, strict=True):
+        nearest = np.argmin(np.linalg.norm(small_bench.mesh.centroids - point, axis=1))
+        assert young[nearest] == pytest.approx(true, rel=0.25)
+    apart = np.log(young) - np.log(small_bench.weights @ TRUTH)
+    assert np.abs(apart).max() > 0.3
+
+
+def test_one_modulus_is_uniform_and_the_papers_field_is_its_weights(small_bench):
+    one = open_field(small_bench.mesh, small_bench.branch.skeleton, small_bench.weights[:, :1],
+                     (0.5,))
+    assert one.names == ()
+    plain = YoungField(small_bench.weights)
+    assert plain.young(Values(TRUTH, 0.35, 900.0)) == pytest.approx(small_bench.weights @ TRUTH)
+
+
+def test_a_prior_is_a_row_of_its_own():
+    """Standardised distance from its mean; links come after it."""
+    space = ParameterSpace(Values(TRUTH, 0.35, 900.0), (0, 1, 2, 3), ("poisson",),
+                           links=((0, 1),), priors=(("poisson", 0.3, 0.05),))
+    rows, offsets = space.own_rows()
+    assert rows.shape == (2, 5) and space.own_row_count == 2
+    free = space.pack(Values(TRUTH, 0.4, 900.0))
+    assert (rows @ free - offsets)[0] == pytest.approx(2.0)

@@ -1,0 +1,126 @@
+"""Errors of cell and sensors as unknowns: eliminated, found, named, and in the intervals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.subjects.paper_branches import measured
+
+from limber.estimation.causes import ADVICE, largest, variance_parts
+from limber.estimation.fit import fit_pulls
+from limber.estimation.forward.watched import WatchedForward
+from limber.estimation.nuisances import eliminated, in_words
+from limber.estimation.objective import Objective
+from limber.estimation.parameters import ParameterSpace, Values
+from limber.estimation.preparation import is_watched
+from limber.estimation.settings import EstimateSettings
+from limber.recordings.alignment import frames_of
+from limber.recordings.calibration import EXACT, CalibrationEntry
+from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
+
+TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=6)
+SHIFT = np.array([1.5e-3, -1e-3, 1e-3])
+TURN = np.array([0.01, -0.02, 0.015])
+
+
+@pytest.fixture(scope="module")
+def bad_cell(small_pull):
+    """A pull whose gripper is 2 mm and 1.5 degrees off, whose sensor has a zero, whose camera is
+    a millimetre off."""
+    pull = measured(small_pull, 3, points=5e-4, force=0.01)
+    peak = float(np.linalg.norm(small_pull.wrenches[:, :3], axis=1).max())
+    calibration = CalibrationEntry(force_bias_sigma_n=peak, force_drift_sigma_n=peak,
+                                   repeat_sigma=0.0)
+    point = np.array(pull.entry.grasp.point_m)
+    poses, wrenches = pull.poses.copy(), pull.wrenches.copy()
+    poses[:, :3] = point + SHIFT + Rotation.from_rotvec(TURN).apply(poses[:, :3] - point)
+    wrenches[:, :3] += peak * np.array([0.8, -0.5, 0.3])
+    seen = pull.observations
+    return replace(pull, poses=poses, wrenches=wrenches,
+                   entry=pull.entry.model_copy(update={"calibration": calibration}),
+                   observations=Observations(seen.times, seen.positions + [1e-3, 0.0, -1e-3]))
+
+
+def objective_of(bench, pull, poisson=0.36):
+    forward = WatchedForward(pull.name, bench.model, bench.weights, pull.entry, frames_of(pull),
+                             np.array(pull.entry.rest_points_m), key_count=6)
+    space = ParameterSpace.separate(Values(np.full(4, 1e7), poisson, 900.0))
+    return Objective([forward], space, force_sigma=[pull.entry.sensor.force_sigma_n])
+
+
+@pytest.fixture(scope="module")
+def found(small_bench, bad_cell):
+    objective = objective_of(small_bench, bad_cell)
+    return fit_pulls(objective, objective.space.base, SETTINGS, lambda _message: None)
+
+
+def test_elimination_is_the_joint_least_squares_problem():
+    """Steps and covariance of the free values, and the errors, as of all unknowns together."""
+    rng = np.random.default_rng(0)
+    jacobian, columns = rng.standard_normal((40, 3)), rng.standard_normal((40, 5))
+    residual = rng.standard_normal(40)
+    left, slopes, errors = eliminated(residual, jacobian, columns)
+    joint = np.vstack([np.hstack([jacobian, columns]), np.hstack([np.zeros((5, 3)), np.eye(5)])])
+    step = -np.linalg.lstsq(joint, np.r_[residual, np.zeros(5)], rcond=None)[0]
+    ours = -np.linalg.lstsq(slopes, left, rcond=None)[0]
+    assert ours == pytest.approx(step[:3])
+    assert errors.values + errors.gain @ ours == pytest.approx(step[3:])
+    covariance = np.linalg.inv(joint.T @ joint)
+    free = np.linalg.inv(slopes.T @ slopes)
+    assert free == pytest.approx(covariance[:3, :3])
+    assert errors.total_covariance(free) == pytest.approx(covariance[3:, 3:])
+
+
+def test_a_cell_that_is_off_does_not_move_the_moduli(found):
+    """2 mm of the gripper and a zero of nearly the whole force: every interval holds the truth,
+    and none says that nothing is known.
+    """
+    low, high = found.uncertainty.young_interval.T
+    assert np.all((low < TRUTH) & (TRUTH < high))
+    assert np.all(high / low < 4)
+    assert found.fit.converged and found.uncertainty.variance_factor < 1.3
+
+
+def test_what_is_off_is_found_and_named(found):
+    """Within its interval, and in a sentence that says how much."""
+    errors = {each["name"]: each for each in found.cell_errors}
+    true = {f"gripper turn about {axis}": turn for axis, turn in zip("xyz", TURN, strict=True)}
+    held = [each["interval"][0] - 2e-3 < value < each["interval"][1] + 2e-3
+            for name, value in true.items() if (each := errors[name])]
+    assert sum(held) >= 2
+    sentences = " ".join(in_words(found.cell_errors))
+    assert "force zero x" in sentences and "N off" in sentences
+
+
+def test_causes_add_up_to_the_variance(found):
+    """The parts of all causes are the covariance's diagonal; each can be acted on."""
+    sure = found.uncertainty
+    parts = variance_parts(found.fit.evaluation, found.objective)
+    total = np.sum(list(parts.values()), axis=0)
+    plain = np.linalg.inv(found.fit.evaluation.jacobian.T @ found.fit.evaluation.jacobian)
+    assert total == pytest.approx(np.diag(plain), rel=0.02)
+    assert sure.variance_factor == pytest.approx(0.5, abs=0.6)
+    named = largest(parts)
+    assert len(named) == 3 and all(each["advice"] in ADVICE.values() for each in named)
+    assert named[0]["share"] >= named[1]["share"] >= named[2]["share"]
+
+
+def test_a_path_is_watched_where_its_frame_may_be_off(small_pull):
+    """Not where it is known exactly, the force was not measured, or the user says what drives."""
+    frames = frames_of(small_pull)
+    entry = small_pull.entry
+    assert entry.calibration == EXACT and not is_watched(entry, frames, SETTINGS)
+    entry = entry.model_copy(update={"calibration": None})
+    assert is_watched(entry, frames, SETTINGS)
+    assert not is_watched(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
+    blind = replace(frames, wrenches=np.full_like(frames.wrenches, np.nan))
+    assert not is_watched(entry, blind, SETTINGS)
+
+
+def test_calibration_survives_a_pull_file(tmp_path, small_pull):
+    entry: PullEntry = small_pull.entry.model_copy(
+        update={"calibration": CalibrationEntry(pose_sigma_m=2e-4)})
+    write_entry(tmp_path / "pull.toml", entry)
+    assert read_entry(tmp_path / "pull.toml").calibration == entry.calibration

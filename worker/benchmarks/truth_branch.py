@@ -1,0 +1,173 @@
+"""Branches whose truth is drawn anew each time, and what a real cell would record of them.
+
+The truth lives on a finer mesh than the fit; its Young's modulus runs otherwise between the
+control points than the fit takes it to; its Poisson's ratio and density are not those given to the
+fit. The cell has a sensor with gain, zero and drift, and gripper and camera a little off.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.spatial.transform import Rotation
+from tests.subjects.paper_branches import PaperBranch
+
+from limber.estimation.gripper_path import MotionWanted, moved
+from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.grasping import grasp_on
+from limber.recordings.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+)
+
+FRACTIONS = (0.2, 0.4, 0.6, 0.8)
+GRAVITY = (0.0, 0.0, -9.80665)
+FORMS = ("straight", "monotone", "wavy")
+STATES, FRAMES = 16, 100
+"""Solutions along a pull of the truth, and frames recorded of it (a spline through the former)."""
+POSITION_NOISE_M, FORCE_NOISE = 1e-3, 0.02
+POISSON, DENSITY = 0.35, 900.0
+"""What the fit is told."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A drawn branch.
+
+    Attributes:
+        branch: Shape, and Young's modulus at the control points.
+        form: How the modulus runs between them; out of FORMS.
+        poisson, density: True ones.
+        model: On the fine mesh.
+    """
+
+    branch: PaperBranch
+    form: str
+    poisson: float
+    density: float
+    model: BranchModel
+
+    @property
+    def young(self) -> np.ndarray:
+        return np.array(self.branch.young)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Errors of one cell, which stay for all its pulls."""
+
+    calibration: CalibrationEntry
+    gripper_place: np.ndarray
+    gripper_turn: np.ndarray
+    gain: float
+    camera_place: np.ndarray
+    camera_turn: np.ndarray
+
+
+def drawn_truth(rng: np.random.Generator) -> Truth:
+    """Draw a branch of wood, as long and thick as the paper's, softer outwards as those are."""
+    length = rng.uniform(0.45, 0.75)
+    root = rng.uniform(6e-3, 10e-3)
+    ratios = np.clip(rng.normal(-0.9, 0.5, 3), -2.0, 0.0)
+    young = np.exp(np.log(rng.uniform(1e9, 5e9)) + np.r_[0.0, np.cumsum(ratios)])
+    poisson = float(np.clip(rng.normal(POISSON, 0.05), 0.2, 0.47))
+    density = DENSITY * (1 + 0.1 * rng.standard_normal())
+    branch = PaperBranch("drawn", tuple(young.tolist()), poisson, length,
+                         (root, root * rng.uniform(0.6, 0.85)), rng.uniform(0.1, 0.6))
+    form = str(rng.choice(FORMS))
+    mesh = branch.mesh(slice_length=1.45, sides=8)
+    field = np.exp(log_field(form, mesh, branch, rng))
+    return Truth(branch, form, poisson, density, BranchModel(
+        mesh, young=field, poisson=poisson, density=density, gravity=GRAVITY))
+
+
+def log_field(form: str, mesh: TetMesh, branch: PaperBranch, rng: np.random.Generator,
+              ) -> np.ndarray:
+    """Log E of the tetrahedra: through the moduli at the control points, otherwise than in a fit.
+    """
+    nodes = branch.skeleton.nodes
+    along = np.linalg.norm(mesh.centroids[:, None] - nodes[None], axis=2).argmin(axis=1) / (
+        len(nodes) - 1)
+    places, values = np.array(FRACTIONS), np.log(branch.young)
+    straight = np.interp(along, places, values)
+    if form == "straight":
+        return straight
+    if form == "wavy":
+        return straight + 0.12 * rng.standard_normal() * np.sin(np.pi * along / 0.2)
+    inside = PchipInterpolator(places, values)
+    slopes = inside.derivative()(places[[0, -1]])
+    beyond = (np.minimum(along - places[0], 0) * slopes[0]
+              + np.maximum(along - places[-1], 0) * slopes[1])
+    return inside(np.clip(along, places[0], places[-1])) + beyond
+
+
+def drawn_cell(rng: np.random.Generator, calibration: CalibrationEntry) -> Cell:
+    """Draw the errors that a calibration leaves."""
+    return Cell(calibration, calibration.pose_sigma_m * rng.standard_normal(3),
+                calibration.pose_sigma_rad * rng.standard_normal(3),
+                1 + calibration.force_gain_sigma * rng.standard_normal(),
+                calibration.camera_sigma_m * rng.standard_normal(3),
+                calibration.camera_sigma_rad * rng.standard_normal(3))
+
+
+def exact_pull(truth: Truth, number: int, phase: float) -> Pull:
+    """What happens in one pull, without any error of measurement."""
+    branch = truth.branch
+    skeleton, mesh = branch.skeleton, truth.model.mesh
+    point, radius = skeleton.point_at(0.92), float(skeleton.radius_at(0.92))
+    points = control_points(skeleton, FRACTIONS)
+    entry = PullEntry(
+        gravity_m_s2=GRAVITY, source="truth", rest_points_m=tuple(map(tuple, points.tolist())),
+        grasp=GraspEntry(point_m=tuple(point.tolist()), radius_m=1.3 * radius, mode="pinned"))
+    grasp = grasp_on(mesh, entry.grasp)
+    states = np.linspace(0.0, 6.0, STATES)
+    made = moved(truth.model, grasp, MotionWanted(
+        kind="pull", point=point, axis=point - skeleton.nodes[0], travel=0.37 * branch.length,
+        turn=2.0, phase=phase, times=states, weight=np.zeros(3)))
+    operator = point_operator(mesh, points)
+    seen = np.array([points + (operator @ each.ravel()).reshape(-1, 3)
+                     for each in made.displacements])
+    times = np.linspace(0.0, 6.0, FRAMES)
+    poses, wrenches, positions = (CubicSpline(states, values)(times)
+                                  for values in (made.poses, made.wrenches, seen))
+    return Pull(f"pull-{number + 1}", entry, times, poses, wrenches,
+                Observations(times, positions))
+
+
+def recorded(pull: Pull, cell: Cell, rng: np.random.Generator) -> Pull:
+    """What the cell records of a pull: its own errors, the sensor's drifting zero, and noise."""
+    known, times = cell.calibration, pull.times
+    share = times / times[-1]
+    peak = float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max())
+    zero = known.force_bias_sigma_n * rng.standard_normal(3)
+    # A sensor that warms up: the drift is not straight.
+    slowing = rng.uniform(0.3, 3.0)
+    course = (1 - np.exp(-share / slowing)) / (1 - np.exp(-1 / slowing))
+    drift = known.force_drift_sigma_n * rng.standard_normal(3) * course[:, None]
+    wrenches = pull.wrenches.copy()
+    wrenches[:, :3] = (cell.gain * wrenches[:, :3] + zero + drift
+                       + FORCE_NOISE * peak * rng.standard_normal((len(times), 3)))
+    point = np.array(pull.entry.grasp.point_m)
+    poses = pull.poses.copy()
+    turn = Rotation.from_rotvec(cell.gripper_turn)
+    poses[:, :3] = (point + cell.gripper_place + turn.apply(poses[:, :3] - point)
+                    + known.pose_noise_m * rng.standard_normal((len(times), 3)))
+    poses[:, 3:] = (turn * Rotation.from_rotvec(poses[:, 3:])).as_rotvec()
+    seen = pull.observations.positions
+    middle = seen.mean(axis=(0, 1))
+    turn = Rotation.from_rotvec(cell.camera_turn)
+    late = known.clock_sigma_s * rng.standard_normal()
+    positions = CubicSpline(times, seen)(np.clip(times + late, 0.0, times[-1]))
+    positions = (middle + turn.apply((positions - middle).reshape(-1, 3)).reshape(positions.shape)
+                 + cell.camera_place + POSITION_NOISE_M * rng.standard_normal(positions.shape))
+    sensor = SensorEntry(position_sigma_m=POSITION_NOISE_M, force_sigma_n=FORCE_NOISE * peak)
+    entry = pull.entry.model_copy(update={"sensor": sensor, "calibration": known})
+    return replace(pull, entry=entry, poses=poses, wrenches=wrenches,
+                   observations=Observations(times, positions))

@@ -1,0 +1,120 @@
+"""Trials of estimates against a truth: error, interval, and the bound that no interval undercuts.
+
+The Cramer-Rao bound is that of the trial's own problem: the Fisher information of all that was
+measured, taken at the truth, in all that is not known (moduli, form of their field, Poisson's
+ratio, density, every error of the cell, the course of the force), with what is known of each
+beforehand.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.truth_branch import (
+    DENSITY,
+    FRACTIONS,
+    POISSON,
+    Truth,
+    drawn_cell,
+    drawn_truth,
+    exact_pull,
+    recorded,
+)
+from limber.estimation.causes import variance_parts
+from limber.estimation.field_form import open_field
+from limber.estimation.fit import fit_pulls
+from limber.estimation.objective import Objective
+from limber.estimation.parameters import Values
+from limber.estimation.preparation import Subject, forwards_of, parameter_space
+from limber.estimation.settings import EstimateSettings
+from limber.geometry.skeleton.control_points import control_points
+from limber.mechanics.model import BranchModel
+from limber.mechanics.young_field import young_weights
+from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.recording import Pull
+
+SETTINGS = EstimateSettings(hold_out=False, key_frames=10)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One fit of a drawn branch in a drawn cell.
+
+    Attributes:
+        seed: Of all that was drawn.
+        form: Of the true field.
+        errors: Relative errors of the moduli, shape [4].
+        covered: Whether each 95 % interval holds the truth, shape [4].
+        widths: Half widths of the intervals in log E, shape [4].
+        bound: 1.96 deviations of log E by the Cramer-Rao bound, shape [4].
+        variance_factor: Mean squared residual over the stated.
+        converged: Of the optimiser.
+        seconds: Of the fit.
+        message: Why there is no result; empty: there is one.
+    """
+
+    seed: tuple[int, ...]
+    form: str
+    errors: tuple[float, ...] = ()
+    covered: tuple[bool, ...] = ()
+    widths: tuple[float, ...] = ()
+    bound: tuple[float, ...] = ()
+    variance_factor: float = float("nan")
+    converged: bool = False
+    seconds: float = 0.0
+    message: str = ""
+
+
+def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
+          settings: EstimateSettings = SETTINGS) -> Trial:
+    """Draw a branch and a cell, pull, fit, and compare with the truth."""
+    rng = np.random.default_rng(seed)
+    truth = drawn_truth(rng)
+    cell = drawn_cell(rng, calibration)
+    phase = rng.uniform(0, 2 * np.pi)
+    pulls = [recorded(exact_pull(truth, number, phase + 2.1 * number), cell, rng)
+             for number in range(pull_count)]
+    started = time.perf_counter()
+    subject = fitting_subject(truth)
+    objective = _objective(pulls, subject, settings)
+    found = fit_pulls(objective, subject.start, settings, lambda _message: None)
+    seconds = time.perf_counter() - started
+    log_truth = np.log(truth.young)
+    low, high = np.log(found.uncertainty.young_interval).T
+    return Trial(
+        seed, truth.form, tuple((found.values.young / truth.young - 1).tolist()),
+        tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
+        tuple(((high - low) / 2).tolist()),
+        tuple((1.96 * bound(truth, found.objective)).tolist()),
+        found.uncertainty.variance_factor, found.fit.converged, seconds)
+
+
+def fitting_subject(truth: Truth) -> Subject:
+    """The branch as a user has it: a coarser mesh, a book's density and Poisson's ratio."""
+    branch = truth.branch
+    return _subject(branch.mesh(slice_length=2.1, sides=8), truth, POISSON, DENSITY)
+
+
+def bound(truth: Truth, objective: Objective) -> np.ndarray:
+    """Standard deviation of log E by the Cramer-Rao bound, shape [4]; no link helps it."""
+    objective = objective.with_space(objective.space.linked(()))
+    space = objective.space
+    values = Values(truth.young, truth.poisson, truth.density)
+    evaluation = objective.evaluate(space.pack(values), jacobian=True)
+    return np.sqrt(np.sum(list(variance_parts(evaluation, objective).values()), axis=0))
+
+
+def _subject(mesh: object, truth: Truth, poisson: float, density: float) -> Subject:
+    skeleton = truth.branch.skeleton
+    points = control_points(skeleton, FRACTIONS)
+    weights = young_weights(mesh, points)
+    model = BranchModel(mesh, young=1e9, poisson=poisson, density=density, gravity=None)
+    return Subject(mesh, skeleton, points, weights, model, Values(np.full(4, 1e9), poisson,
+                   density), open_field(mesh, skeleton, weights, FRACTIONS))
+
+
+def _objective(pulls: list[Pull], subject: Subject, settings: EstimateSettings) -> Objective:
+    forwards = forwards_of(pulls, subject, settings, lambda _message: None)
+    return Objective(forwards, parameter_space(subject, forwards, settings),
+                     force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])

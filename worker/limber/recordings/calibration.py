@@ -1,0 +1,61 @@
+"""How well a cell is known: standard deviations of errors that stay through a recording.
+
+Noise averages out over frames; a gripper frame that lies a millimetre beside where it is thought
+to be does not. A fit takes these errors as unknowns, with the deviations given here as what is
+known of them beforehand.
+"""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class CalibrationEntry(BaseModel):
+    """Standard deviations, under ``[calibration]`` of ``pull.toml``; 0: known exactly.
+
+    The defaults are those of a cell set up with care and not measured since: a hand-eye
+    calibration good to a millimetre and a degree, a force sensor within 2 % whose zero drifts by
+    a newton (makers' sheets allow more; see the note on field errors), a camera good to a
+    millimetre.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    pose_sigma_m: float = Field(
+        1e-3, ge=0, description="Place of the gripper's frame in the branch's, each axis.")
+    pose_sigma_rad: float = Field(
+        0.0175, ge=0, description="Turn of the gripper's frame in the branch's, each axis.")
+    pose_noise_m: float = Field(
+        1e-4, gt=0, description="Error of a single pose: the robot's repeatability.")
+    force_gain_sigma: float = Field(0.02, ge=0, description="Of the force, relative.")
+    force_bias_sigma_n: float = Field(1.0, ge=0, description="Zero of the force, each axis.")
+    force_drift_sigma_n: float = Field(
+        1.0, ge=0, description="Change of that zero over the recording, each axis.")
+    torque_bias_sigma_nm: float = Field(0.05, ge=0, description="Zero of the torque, each axis.")
+    camera_sigma_m: float = Field(
+        1e-3, ge=0, description="Place of the observer's frame in the branch's, each axis.")
+    camera_sigma_rad: float = Field(
+        1e-3, ge=0, description="Turn of the observer's frame about the branch, each axis.")
+    clock_sigma_s: float = Field(
+        2e-3, ge=0, description="Observer's clock against the robot's, left after alignment.")
+    slip_sigma_m: float = Field(
+        5e-4, ge=0, description="Creep of the grasp along the branch, from begin to end.")
+    repeat_sigma: float = Field(
+        0.02, ge=0, description="Stiffness of one and the same branch from recording to recording, "
+        "relative: creep, warmth, how it is held.")
+
+
+EXACT = CalibrationEntry(
+    pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
+    force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=0.0,
+    clock_sigma_s=0.0, slip_sigma_m=0.0, repeat_sigma=0.0)
+"""Of a simulated cell without errors."""
+WITHOUT_GRIPPER = CalibrationEntry(
+    pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
+    force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=1e-3,
+    clock_sigma_s=0.0, slip_sigma_m=0.0)
+"""Of a stated load and of markers that were laid onto the branch at rest: what is left is how far
+that laying turned them."""
+
+
+def calibration_of(entry: "PullEntry") -> CalibrationEntry:  # noqa: F821
+    """What is known of a pull's cell; the defaults where its recording does not say."""
+    return entry.calibration or CalibrationEntry()
