@@ -25,6 +25,7 @@ class Bench:
 
     def __init__(self, rate: float = 500.0, **changes):
         self.guard = Guard(ARM, GuardSettings(LIMITS, ARM.joint_limits, BOX, **changes), rate)
+        self.guard.tared()
         self.rng = np.random.default_rng(1)
         self.step, self.clock = 1 / rate, 10.0
 
@@ -112,6 +113,19 @@ def test_after_a_stop_nothing_goes_on_by_itself(bench, name):
     assert bench.guard.state == State.MOVING
 
 
+def test_before_the_tare_the_bias_is_no_force_and_nothing_moves():
+    guard = Guard(ARM, GuardSettings(LIMITS, ARM.joint_limits, BOX), 500.0)
+    bench = Bench()
+    bias = np.array([30.0, 0, 0, 0, 0, 0])
+    assert guard.look(bench.sample(), wrench=bias, raw=np.stack([bias, bias])
+                      ).verdict == Verdict.GO
+    with pytest.raises(SafetyStop, match="not tared"):
+        guard.begin()
+    guard.tared()
+    assert guard.look(bench.sample(), wrench=bias, raw=np.stack([bias, bias])
+                      ).verdict == Verdict.STOP
+
+
 def test_silence_stops_after_50_ms(bench):
     assert bench.guard.silence(0.049).verdict == Verdict.GO
     assert bench.guard.silence(0.051).verdict == Verdict.STOP
@@ -178,6 +192,19 @@ def test_slip_is_told_without_a_prediction_by_a_sudden_fall(bench):
 def test_a_slow_return_is_no_slip(bench):
     for force in np.linspace(6, 0, 3000):
         assert bench.look(force=(force, 0, 0)).verdict == Verdict.GO
+
+
+def test_letting_the_branch_back_quickly_is_no_slip_but_losing_it_on_the_way_out_is(bench):
+    """Out 40 mm and back in half a second each, force as the way; then a loss while going out."""
+    out = np.linspace(0, 0.04, 250)
+    for way in np.r_[out, out[::-1]]:
+        verdict = bench.look(force=(150 * way, 0, 0), grasp=INSIDE + [way, 0, 0]).verdict
+        assert verdict == Verdict.GO
+    for way in out:
+        bench.look(force=(150 * way, 0, 0), grasp=INSIDE + [way, 0, 0])
+    lost = [bench.look(force=(0.5, 0, 0), grasp=INSIDE + [0.04 + way, 0, 0]).verdict
+            for way in out[1:50]]
+    assert Verdict.STOP in lost
 
 
 def test_idle_allows_rest_near_a_singularity_but_no_force():

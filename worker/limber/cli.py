@@ -32,9 +32,7 @@ if TYPE_CHECKING:
 
 # Designed, not built: named so that nobody looks for them in vain.
 NOT_YET = {
-    "record": "record a pull with a robot (bring one with `limber import-pull`)",
     "execute": "follow a path with a robot (paths are in plans/NAME.csv)",
-    "virtual-robot": "a UR controller in software",
     "batch": "many jobs, on this machine or a cluster (`limber reconstruct` takes a folder)",
 }
 

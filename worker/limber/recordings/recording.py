@@ -185,8 +185,13 @@ def read_entry(path: Path) -> PullEntry:
 
 
 def write_entry(path: Path, entry: PullEntry) -> None:
-    """Write ``pull.toml``; entries that are None are left out, TOML has no null."""
-    path.write_text(tomlkit.dumps(_without_none(plain(entry))), encoding="utf-8")
+    """Write ``pull.toml``."""
+    path.write_text(entry_text(entry), encoding="utf-8")
+
+
+def entry_text(entry: PullEntry) -> str:
+    """Return the text of ``pull.toml``; entries that are None are left out, TOML has no null."""
+    return tomlkit.dumps(_without_none(plain(entry)))
 
 
 def _without_none(value: Any) -> Any:

@@ -103,6 +103,7 @@ class Driver:
         while len(samples) < 3:
             samples += self._stream.read(1.0)
         guard, chain = self._new_guard(), WrenchChain(self.cell)
+        guard.tared()
         guard.begin()
         for sample in samples:
             reading = self._sensor.read(sample)
@@ -155,6 +156,12 @@ class Driver:
         from rtde_control import RTDEControlInterface
 
         control = RTDEControlInterface(address, self._stream.rate)
+        self._io = None
+        if self.cell.tool.gripper == "digital_output":
+            from rtde_io import RTDEIOInterface
+
+            # Made now: later the watchdog would not wait for it.
+            self._io = RTDEIOInterface(address)
         self._require(control.setTcp(list(self.cell.tool.grasp_pose)), "set its tool")
         self._require(control.setPayload(self.cell.tool.mass_kg,
                                          list(self.cell.tool.centre_of_mass_m)), "set its payload")
@@ -321,9 +328,6 @@ class Driver:
             raise SafetyStop(f"The path starts {1000 * away:.1f} mm from where the robot is.",
                              f"At most {1000 * _START_TOLERANCE:.0f} mm are bridged.",
                              "Move the robot to the start, or plan from its actual pose.")
-        if not self._chain.is_tared:
-            raise SafetyStop("The force sensor is not tared.", "Its bias would pass for a force "
-                             "on the branch.", "Tare it with the gripper hanging free.")
         if sample.slider <= 0.0:
             raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
                              "Raise it on the pendant.")
@@ -391,18 +395,12 @@ class Driver:
         self._begin(Trajectory(2.0 * gone.times, poses))
 
     def _grip(self, close: bool) -> None:
-        if self.cell.tool.gripper != "digital_output":
+        if self._io is None:
             raise InputError("The cell's gripper is not driven from here.",
                              f"tool.gripper is {self.cell.tool.gripper}.",
                              "Close and open it by hand.")
-        from rtde_io import RTDEIOInterface
-
-        io = RTDEIOInterface(self.cell.robot.address)
-        try:
-            self._require(io.setStandardDigitalOut(self.cell.tool.close_output, close),
-                          "drive its gripper")
-        finally:
-            io.disconnect()
+        self._require(self._io.setStandardDigitalOut(self.cell.tool.close_output, close),
+                      "drive its gripper")
         self.tell(event="gripper", closed=close)
 
     # Tare
@@ -421,6 +419,7 @@ class Driver:
         except WorkError as error:
             self.tell(event="refused", order="tare", reason=str(error))
             return
+        self.guard.tared()
         self.tell(event="tared", bias=self._chain.bias.tolist(), sigma=sigma.tolist(),
                   delay_s=self._chain.delay(self._stream.rate))
 
@@ -450,6 +449,8 @@ class Driver:
             self._following = None
             self._stop_arm()
         self._sensor.close()
+        if self._io is not None:
+            self._io.disconnect()
         self._control.disconnect()
         self._stream.close()
         self._dashboard.close()

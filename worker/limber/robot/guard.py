@@ -74,6 +74,7 @@ class GuardSettings:
             hard limits look at every reading as it comes.
         off_path: Distance from where the robot was sent [m].
         lost_share: Share of its force that a held branch loses when it slips or breaks.
+        loss_time: Time in which such a loss counts as sudden [s].
         least_force: Force below which a loss is not told from noise [N].
         largest_torque_error: Of the torque against the predicted one [N m].
     """
@@ -86,6 +87,7 @@ class GuardSettings:
     filter_time: float = 0.01
     off_path: float = 0.01
     lost_share: float = 0.4
+    loss_time: float = 0.5
     least_force: float = 1.0
     largest_torque_error: float = 1.0
 
@@ -99,6 +101,8 @@ class _Memory:
     frozen_since: float = 0.0
     filtered: np.ndarray | None = None
     peak: float = 0.0
+    grasp: np.ndarray | None = None
+    way: np.ndarray | None = None
 
 
 class Guard:
@@ -114,19 +118,28 @@ class Guard:
         self.state = State.IDLE
         self.reason = ""
         self._memory = _Memory()
+        self._is_tared = False
 
     # What a person does
+
+    def tared(self) -> None:
+        """The force sensor has been tared: from now on its limits hold."""
+        self._is_tared = True
 
     def begin(self) -> None:
         """Allow a motion.
 
         Raises:
-            SafetyStop: after a stop that was not acknowledged, or while one is paused.
+            SafetyStop: after a stop that was not acknowledged, while one is paused, or before the
+                force sensor was tared.
         """
         if self.state != State.IDLE:
             raise SafetyStop(f"The robot is {self.state.value}: {self.reason}.",
                              "No motion begins before a person has looked.",
                              "Choose: hold, retreat or release.")
+        if not self._is_tared:
+            raise SafetyStop("The force sensor is not tared.", "Its bias would pass for a force "
+                             "on the branch.", "Tare it with the gripper hanging free.")
         self.state = State.MOVING
         self._memory = _Memory()
 
@@ -178,6 +191,8 @@ class Guard:
             grasp: Where the grasp is, branch frame [m], shape [3].
             sent: Where the tool was sent to be by now, base frame [m], shape [3], or None.
         """
+        last, self._memory.grasp = self._memory.grasp, grasp
+        self._memory.way = None if last is None or grasp is None else grasp - last
         for check in (self._check_clock(sample), self._check_modes(sample),
                       self._check_wrench(sample, wrench, raw),
                       self._check_place(sample, grasp, sent),
@@ -249,6 +264,9 @@ class Guard:
         if sample.clock - memory.frozen_since > self._settings.frozen_time:
             return self._stop("the force sensor is frozen [s]",
                               sample.clock - memory.frozen_since, self._settings.frozen_time)
+        if not self._is_tared:
+            # Nothing moves yet, and what a sensor shows before its tare is its bias.
+            return _GO
         force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
         if force > limits.hard_force_n:
             return self._stop("hard force limit [N]", float(force), limits.hard_force_n)
@@ -289,8 +307,11 @@ class Guard:
         memory.filtered = filtered = kept * before + (1 - kept) * wrench
         force = float(np.linalg.norm(filtered[:3]))
         if expected is None:
-            # Nothing is predicted while E is being measured: a sudden loss still tells a slip.
-            memory.peak = max(memory.peak * np.exp(-self._step / 0.5), force)
+            # Nothing is predicted while E is being measured: a sudden loss still tells a slip, but
+            # not while the branch is let back and pulls the way that the gripper goes.
+            if memory.way is not None and float(memory.way @ filtered[:3]) < 0:
+                memory.peak = force
+            memory.peak = max(memory.peak * np.exp(-self._step / settings.loss_time), force)
             lost = memory.peak - force
             if lost > max(settings.lost_share * memory.peak, settings.least_force):
                 return self._stop("the force fell at once: slip or break [N]", lost,

@@ -178,7 +178,6 @@ class WrenchChain:
     Attributes:
         cell: Gripper's mass, ranges, frames.
         bias, bias_sigma: What the tare found, flange frame, and its standard error, shape [6].
-        is_tared: Whether there was a tare.
         count: Readings that the slower output averages; it is late by half of them.
     """
 
@@ -186,7 +185,6 @@ class WrenchChain:
     count: int = 5
     bias: np.ndarray = field(default_factory=lambda: np.zeros(6))
     bias_sigma: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    is_tared: bool = False
     _taring: list[np.ndarray] | None = None
     _recent: deque[np.ndarray] = field(default_factory=deque)
 
@@ -223,7 +221,6 @@ class WrenchChain:
                             "Let it hang free and still, and tare again.")
         self.bias = readings.mean(axis=0)
         self.bias_sigma = spread / np.sqrt(len(readings))
-        self.is_tared = True
         return self.bias_sigma
 
     def wrench(self, sample: Sample, reading: Reading) -> tuple[np.ndarray, np.ndarray]:

@@ -52,7 +52,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     if not force and branch.is_current(key, settings, reads=reads):
         return branch.manifest.stages[key].result
     progress(0.02, "meshing the true branch")
-    truth = _truth(branch, settings)
+    truth = load_truth(branch, settings)
     with branch.stage(key, settings, reads=reads) as stage:
         prefix = f"pulls/{name}/"
         for old in [file for file in branch.manifest.files if file.startswith(prefix)]:
@@ -71,7 +71,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     return stage.result
 
 
-def _truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
+def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     """The truth of a branch folder: its generator's, the body that was meshed, or its skeleton's.
     """
     from limber.estimation.virtual_pull import true_branch

@@ -74,6 +74,11 @@ class Load(Protocol):
         """Let what is held slide back by a part of its way."""
         ...
 
+    @property
+    def seen_points(self) -> list[list[float]]:
+        """Points that a tracker sees [m]."""
+        ...
+
     def report(self) -> dict[str, Any]:
         """Return the state of what is held, as plain data."""
         ...
@@ -90,8 +95,7 @@ class Nothing:
         return np.zeros(6)
 
     def grasp(self) -> None:
-        raise InputError("There is no branch.", "The gripper closes on nothing.",
-                         "Give the virtual robot a branch.")
+        """There is nothing between the jaws."""
 
     def release(self) -> None:
         """Nothing is held."""
@@ -101,6 +105,10 @@ class Nothing:
 
     def slide(self, part: float) -> None:
         """Nothing is held."""
+
+    @property
+    def seen_points(self) -> list[list[float]]:
+        return []
 
     def report(self) -> dict[str, Any]:
         return {"branch": "none"}
@@ -355,13 +363,10 @@ class Controller:
             self._drive_gripper(bool(self.digital_outputs >> self.gripper_output & 1))
 
     def _drive_gripper(self, close: bool) -> None:
-        if not close:
-            self.load.release()
-            return
-        try:
+        if close:
             self.load.grasp()
-        except InputError as error:
-            self.say(f"gripper: {error}")
+        else:
+            self.load.release()
 
     def _check_watchdog(self) -> None:
         """End a program whose client no longer writes: after the asked time, at least a step."""

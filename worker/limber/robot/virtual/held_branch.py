@@ -44,6 +44,25 @@ class BranchSetting:
     grip: float = 80.0
     break_strain: float = 0.2
 
+    @classmethod
+    def of_truth(cls, truth: Any, cell: Any, path: Path, *, poisson: float = 0.35,
+                 density: float = 900.0) -> "BranchSetting":
+        """Return the setting of a :class:`~limber.estimation.virtual_pull.TrueBranch` in a cell.
+
+        Its mesh is written to ``path``. The seen points are the control points and the tip.
+        """
+        from limber.mechanics.young_field import young_weights
+
+        mesh, count = truth.mesh, truth.mesh.tet_count
+        mesh.with_data(cell_data={
+            "young": young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float),
+            "poisson": np.full(count, poisson), "density": np.full(count, density)}).write(path)
+        tip = truth.skeleton.nodes[truth.skeleton.main_path()[-1]]
+        points = [*truth.control_points, tip]
+        return cls(path, tuple(cell.base.pose), tuple(cell.tool.grasp_pose),
+                   tuple(tuple(map(float, point)) for point in points),
+                   tuple(map(float, truth.gravity)))
+
 
 @dataclass
 class Solution:
@@ -85,8 +104,8 @@ class HeldBranch:
         self.state = "free"
         self._offset = np.eye(4)
         self._solution: Solution | None = None
-        self._busy, self._age = False, 0.0
-        self._gripper = np.eye(4)
+        self._busy, self._asked, self._age = False, False, 0.0
+        self._gripper = self._closed_at = np.eye(4)
 
     @property
     def points(self) -> np.ndarray:
@@ -96,6 +115,8 @@ class HeldBranch:
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         """Return what the branch exerts on the flange, flange frame, shape [6]."""
         self._gripper = self._base @ flange @ self._tool
+        if self.state == "closing":
+            self._close_jaws()
         if self.state != "held":
             return np.zeros(6)
         self._age += seconds
@@ -116,23 +137,29 @@ class HeldBranch:
         return self._at_flange(-on_branch, patch, flange)
 
     def grasp(self) -> None:
-        """Close the gripper where it is.
+        """Close the gripper where it is; the arm's loop goes on while the branch is looked for.
 
-        Raises:
-            InputError: the branch is not between its jaws.
+        The state is ``closing``, then ``held``, or ``empty`` where no branch is between the jaws.
         """
-        position = self._gripper[:3, 3]
-        self._flush()
-        self._pipe.send(("grasp", tuple(position)))
-        answer = self._receive("grasped")
-        if "error" in answer:
-            raise InputError(answer["error"], "The gripper closes on nothing.",
-                             "Move it onto the branch.")
-        rest = np.eye(4)
-        rest[:3, 3] = answer["centre"]
-        self._offset = inverse_of(self._gripper) @ rest
-        self._solution, self._busy, self._age = answer["solution"], False, 0.0
-        self.state = "held"
+        self.state, self._solution = "closing", None
+        self._closed_at = self._gripper
+        self._asked = False
+
+    def _close_jaws(self) -> None:
+        if self._busy and self._pipe.poll():
+            kind, answer = self._pipe.recv()
+            self._busy = False
+            if kind == "grasped":
+                if "error" in answer:
+                    self.state = "empty"
+                    return
+                rest = np.eye(4)
+                rest[:3, 3] = answer["centre"]
+                self._offset = inverse_of(self._closed_at) @ rest
+                self._solution, self._age, self.state = answer["solution"], 0.0, "held"
+        if not self._busy and not self._asked:
+            self._pipe.send(("grasp", tuple(self._closed_at[:3, 3])))
+            self._busy = self._asked = True
 
     def release(self) -> None:
         """Open the gripper: the branch goes back to rest."""
@@ -157,6 +184,11 @@ class HeldBranch:
         self._process.join()
         self._pipe.close()
 
+    @property
+    def seen_points(self) -> list[list[float]]:
+        """Where the seen points are now [m]."""
+        return self.points.tolist()
+
     def report(self) -> dict[str, Any]:
         """Return its state as plain data."""
         solution = self._solution
@@ -174,11 +206,6 @@ class HeldBranch:
         if not self._busy:
             self._pipe.send(("solve", patch))
             self._busy = True
-
-    def _flush(self) -> None:
-        if self._busy:
-            self._pipe.recv()
-            self._busy = False
 
     def _receive(self, kind: str) -> dict[str, Any]:
         try:
@@ -232,6 +259,15 @@ class _Solver:
         self._grasp = None
         self._state = np.zeros_like(mesh.nodes)
         self._last: Solution | None = None
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Compile and factorise once before the robot's clock runs."""
+        nodes = self._model.mesh.nodes
+        root = nodes[self._model.fixed].mean(axis=0)
+        far = np.linalg.norm(nodes - root, axis=1).argmax()
+        self.grasp(nodes[far])
+        self._grasp, self._last, self._state = None, None, np.zeros_like(nodes)
 
     def seen(self) -> np.ndarray:
         """Where the seen points are now [m], shape [n, 3]."""

@@ -1,15 +1,18 @@
-"""The virtual controller's ports: RTDE 30004, scripts 30003, dashboard 29999, FT300 63351.
+"""The virtual controller's ports: RTDE, scripts, dashboard, FT300, simulated markers.
 
 One asyncio loop steps the controller by the wall clock and serves all connections. It waits by
 ``select``, whose time-out has microseconds; ``epoll`` would round every 2 ms step up by one.
 """
 
 import asyncio
+import json
 import selectors
 import struct
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
+
+import numpy as np
 
 from limber.errors import InputError, WorkError
 from limber.robot import rtde
@@ -17,9 +20,15 @@ from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import GREETING, answer
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, FT300_PORT = 30004, 30003, 29999, 63351
+MARKER_PORT = 63400
+"""Simulated tracking of points on the branch: JSON lines, 30 a second."""
 
-# A process that was held up catches up at most this much; beyond it the controller lost time.
-_MOST_CATCH_UP = 0.25
+_MARKER_SECONDS = 1 / 30
+_MARKER_SIGMA_M = 0.5e-3
+
+# A process that was held up catches up at most this much; beyond it the controller's clock stood
+# still. A real controller is never held up: its watchdog must not count what only this one lost.
+_MOST_CATCH_UP = 0.01
 _SENDS_BEHIND = 1 << 20  # bytes a client may leave unread before it is cut off
 
 
@@ -56,6 +65,8 @@ class Server:
             DASHBOARD_PORT: self._serve_dashboard}
         if self.controller.ft300 is not None:
             ports[FT300_PORT] = self._serve_ft300
+        if self.controller.load.seen_points:
+            ports[MARKER_PORT] = self._serve_markers
         try:
             for port, serve in ports.items():
                 self._servers.append(await asyncio.start_server(
@@ -174,6 +185,17 @@ class Server:
             fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
             self.send(writer, f"( {fields} )".encode())
             await asyncio.sleep(0.01)
+
+
+    async def _serve_markers(self, _reader: asyncio.StreamReader,
+                             writer: asyncio.StreamWriter) -> None:
+        rng = np.random.default_rng(self.controller.step_count)
+        while not writer.is_closing():
+            points = np.array(self.controller.load.seen_points)
+            points = points + _MARKER_SIGMA_M * rng.standard_normal(points.shape)
+            line = json.dumps({"t_s": self.controller.clock, "points_m": points.tolist()})
+            self.send(writer, f"{line}\n".encode())
+            await asyncio.sleep(_MARKER_SECONDS)
 
 
 class _RtdeConnection:

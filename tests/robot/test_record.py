@@ -1,0 +1,147 @@
+"""`limber record` on the virtual robot that holds a branch, and what it refuses."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from limber.errors import InputError, SafetyStop
+from limber.recordings.recording import read_pull
+from limber.robot.recorder import PullRecorder
+from limber.stages.record import RecordOptions, RecordSettings, record
+from limber.store import Branch
+
+pytest.importorskip("rtde_control")
+
+MARKERS = 63400
+
+
+def sideways_pull(branch_folder, **changes) -> RecordSettings:
+    direction = tuple(map(float, sideways(Branch.open(branch_folder))))
+    return RecordSettings(**{"direction": direction, "distance": 0.012, "speed": 0.02,
+                             "pause": 0.2, **changes})
+
+
+def recorded(branch_folder, tmp_path, address, name="robot-1", **options):
+    branch = Branch.open(branch_folder)
+    cell = standing_at(branch, address)
+    path = cell_file(cell, tmp_path)
+    with robot_holding(branch, cell, tmp_path) as robot:
+        result = record(branch_folder, path, name, sideways_pull(branch_folder),
+                        RecordOptions(confirm=name, markers=MARKERS, **options))
+    return result, robot
+
+
+def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, worker_address):
+    """No sample lost; the piece goes out and back; force rises and falls; markers beside it."""
+    result, _ = recorded(branch_folder, tmp_path, worker_address)
+    assert result["ended"] == "reached" and result["marker_frames"] > 20
+    pull = read_pull(branch_folder / "pulls" / "robot-1")
+    assert np.diff(pull.times) == pytest.approx(np.full(len(pull.times) - 1, 0.002), abs=1e-5)
+    start = np.array(pull.entry.grasp.point_m)
+    assert pull.poses[0, :3] == pytest.approx(start, abs=1e-4)
+    away = np.linalg.norm(pull.poses[:, :3] - start, axis=1)
+    assert away.max() == pytest.approx(0.012, abs=3e-4) and away[-1] < 5e-4
+    farthest = int(away.argmax())
+    direction = sideways(Branch.open(branch_folder))
+    assert pull.poses[farthest, :3] - start == pytest.approx(0.012 * direction, abs=3e-4)
+    # The gripper pulls the branch the way it goes; the noise is 0.15 N.
+    force = pull.wrenches[:, :3]
+    assert force[farthest - 50:farthest + 50].mean(axis=0) @ direction > 0.3
+    seen = pull.observations
+    assert seen.positions[-1] == pytest.approx(seen.positions[0], abs=3e-3)
+
+
+def test_nothing_moves_without_a_typed_name(branch_folder, tmp_path, worker_address):
+    path = cell_file(standing_at(Branch.open(branch_folder), worker_address), tmp_path)
+    for confirm in (None, "something"):
+        with pytest.raises(InputError, match="Nobody confirmed"):
+            record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm=confirm))
+
+
+def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path, worker_address):
+    cell = standing_at(Branch.open(branch_folder), worker_address)
+    path = cell_file(cell.model_copy(update={"branch": "another"}), tmp_path)
+    with pytest.raises(InputError, match="calibrated for branch another"):
+        record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm="r"))
+
+
+def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, worker_address):
+    """A force limit that the pull breaks: exit 4, a recording that says where it ended."""
+    branch = Branch.open(branch_folder)
+    cell = standing_at(branch, worker_address, soft_force_n=1.0, hard_force_n=1.2)
+    path = cell_file(cell, tmp_path)
+    with robot_holding(branch, cell, tmp_path) as robot:
+        with pytest.raises(SafetyStop, match=r"force limit.*samples are in"):
+            record(branch_folder, path, "stopped", sideways_pull(branch_folder),
+                   RecordOptions(confirm="stopped"))
+        assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    found = Branch.open(branch_folder).manifest.stages["record:stopped"].result
+    assert "force limit" in found["ended"] and found["sample_count"] > 100
+    assert read_pull(branch_folder / "pulls" / "stopped").entry.observation == "none"
+
+
+def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, worker_address):
+    """kill -9 in the middle: the arm stops, all but the last second is there afterwards."""
+    branch = Branch.open(branch_folder)
+    cell = standing_at(branch, worker_address)
+    path = cell_file(cell, tmp_path)
+    with robot_holding(branch, cell, tmp_path) as robot:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "limber", "record", str(branch_folder), "--cell", str(path),
+             "--name", "cut", "--confirm", "cut", "--direction",
+             *(str(x) for x in sideways(branch)),
+             "--distance", "0.03", "--speed", "0.006", "--json"],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        end = time.monotonic() + 60
+        while np.linalg.norm(robot.state["tool_speed"][:3]) < 2e-3:
+            assert time.monotonic() < end and process.poll() is None, process.stdout.read()
+            time.sleep(0.02)
+        begin = robot.state["clock"]
+        time.sleep(2.5)
+        killed = robot.state["clock"]
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        time.sleep(1.0)
+        assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    branch = Branch.open(branch_folder)
+    assert "pulls/cut/robot.csv" in branch.streams()
+    result = record(branch_folder, path, "cut", RecordSettings(), RecordOptions(recover=True))
+    assert result["seconds"] > killed - begin - 1.0
+    pull = read_pull(branch_folder / "pulls" / "cut")
+    assert np.all(np.diff(pull.times) > 0) and np.isfinite(pull.poses).all()
+
+
+def test_the_piece_moves_with_the_gripper_as_one_body():
+    """A gripper turned about its own middle carries the piece round; its torque moves along."""
+    lines = []
+
+    class Lines:
+        def append(self, line: str) -> None:
+            lines.append(line)
+
+    recorder = PullRecorder(Lines(), np.array([0.0, 0.01, 0.5]))
+    sample = np.full((1, 31), np.nan)
+    sample[0, :13] = [5.0, 0, 0, 0.5, 0, 0, 0, 1.0, 0, 0, 0, 0, 0]
+    recorder.take(sample)
+    assert len(lines) == 1
+    recorder.close_gripper()
+    turned = sample.copy()
+    turned[0, 0], turned[0, 6] = 5.002, np.pi / 2
+    recorder.take(np.vstack([sample, turned]))
+    rows = np.array([[float(x) for x in line.split(",")] for line in lines[1:]])
+    assert rows[0, 1:7] == pytest.approx([0, 0.01, 0.5, 0, 0, 0])
+    assert rows[1, 1:7] == pytest.approx([-0.01, 0, 0.5, 0, 0, np.pi / 2], abs=1e-6)
+    # Force 1 N along x at the gripper: about the piece, 10 mm beside it, 0.01 N m about z.
+    assert rows[0, 7:] == pytest.approx([1, 0, 0, 0, 0, 0.01], abs=1e-9)
+
+
+def test_its_schema_is_plain(capsys):
+    from limber.stages.registry import stage_schema
+
+    assert json.dumps(stage_schema("record"))

@@ -1,0 +1,68 @@
+"""A cell whose virtual robot stands with its gripper on a branch, and that robot."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.robot.arms import arm_named
+from limber.robot.cell import Cell, write_cell
+from limber.robot.execution import across
+from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
+from limber.robot.virtual.controller import HOME
+from limber.robot.virtual.held_branch import BranchSetting
+from limber.robot.virtual.launch import VirtualRobot
+from limber.stages.loading import load_skeleton
+from limber.stages.virtual_pull import load_truth
+from limber.store import Branch
+
+GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
+
+
+def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: float = 0.92,
+                back: float = 0.0, **limits: float) -> Cell:
+    """Return a cell in which the home pose has the gripper at a place of the branch.
+
+    It stands ``back`` [m] before it, against its way of approach.
+    """
+    skeleton = load_skeleton(branch)
+    point = skeleton.point_at(fraction)
+    axis = point - skeleton.point_at(fraction - 0.05)
+    gripper = matrices(np.r_[point, across(axis)[0]])
+    gripper[:3, 3] -= back * gripper[:3, 2]
+    tool = forward(arm_named(model), np.array(HOME)) @ matrices(np.array(GRASP_POSE))
+    base = pose_vectors(gripper @ inverted(tool))
+    return Cell(
+        branch=branch.uuid, base={"pose": tuple(map(float, base)), "position_sigma_m": 1e-3},
+        robot={"model": model, "address": address},
+        tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output"},
+        sensor={"kind": "controller" if model.endswith("e") else "ft300"},
+        limits={"soft_force_n": 30.0, "hard_force_n": 40.0, "hard_torque_nm": 8.0, **limits})
+
+
+def sideways(branch: Branch, fraction: float = 0.92) -> np.ndarray:
+    """Return a direction across all of the branch up to the grasp, shape [3]."""
+    skeleton = load_skeleton(branch)
+    line = np.array([skeleton.point_at(part) for part in np.linspace(0.05, fraction, 12)])
+    return np.linalg.svd(line - line.mean(axis=0))[2][2]
+
+
+def robot_holding(branch: Branch, cell: Cell, folder: Path, *, seed: int = 0,
+                  young: tuple[float, ...] = ()) -> VirtualRobot:
+    """Return a virtual robot in whose gripper the true branch of a folder comes."""
+    truth = load_truth(branch, VirtualPullSettings(young=young))
+    setting = BranchSetting.of_truth(truth, cell, folder / "truth.vtu")
+    path = folder / "setting.json"
+    path.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}), encoding="utf-8")
+    options = ["--branch", path, "--seed", seed]
+    if cell.sensor.kind == "ft300":
+        options.append("--ft300")
+    return VirtualRobot(cell.robot.model, cell.robot.address, options)
+
+
+def cell_file(cell: Cell, folder: Path) -> Path:
+    """Write a cell and return its path."""
+    path = folder / "cell.toml"
+    write_cell(path, cell)
+    return path

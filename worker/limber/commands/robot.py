@@ -1,0 +1,156 @@
+"""Check a robot and calibrate where it stands: `limber robot check`, `limber robot calibrate`."""
+
+import csv
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from limber.cli import Run, stage_command
+
+
+@click.group("robot")
+def command() -> None:
+    """Check a robot and calibrate where it stands."""
+
+
+@stage_command("check")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+def check(run: Run, cell_file: Path) -> dict[str, Any]:
+    """Connect, tell model, version, mode and force, and move nothing."""
+    import time
+
+    from limber.robot.cell import read_cell
+    from limber.robot.link import RobotLink
+
+    cell = read_cell(cell_file)
+    batches: list[np.ndarray] = []
+    with RobotLink(cell, batches.append) as link:
+        facts = dict(link.facts)
+        time.sleep(1.0)
+    facts.pop("event", None)
+    samples = np.concatenate(batches) if batches else np.zeros((0, 31))
+    if cell.robot.version and cell.robot.version != facts["version"]:
+        run.progress.warn(f"The cell was calibrated with version {cell.robot.version}, the "
+                          f"controller is {facts['version']}.")
+    if not facts["real_time"]:
+        run.progress.warn("No real-time priority: other programs can hold the loop up, which ends "
+                          "in a stop.")
+    pose = np.array(facts["pose"])
+    from limber.robot.kinematics import forward, matrices
+
+    nominal = forward(cell.arm, np.array(facts["joints"])) @ matrices(np.array(
+        cell.tool.grasp_pose))
+    return facts | {
+        "arm": cell.arm.name, "payload_kg": cell.tool.mass_kg, "sensor": cell.sensor.kind,
+        "samples_per_second": len(samples),
+        "force_without_tare_n": samples[:, 7:10].mean(axis=0) if len(samples) else None,
+        "force_sigma_n": samples[:, 7:10].std(axis=0) if len(samples) else None,
+        "nominal_kinematics_off_m": float(np.linalg.norm(nominal[:3, 3] - pose[:3]))
+        if len(samples) else None}
+
+
+@stage_command("calibrate")
+@click.argument("cell_file", type=click.Path(path_type=Path))
+@click.argument("branch_folder", type=click.Path(path_type=Path))
+@click.option("--points", "points_file", type=click.Path(path_type=Path), required=True,
+              help="CSV of points on the branch to touch: name,x_m,y_m,z_m (branch frame). With "
+              "six more columns, robot_x_m .. robot_rz_rad, the robot is not asked.")
+@click.option("--largest-residual", default=0.01, show_default=True,
+              help="A point that is farther off is refused [m].")
+def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path,
+              largest_residual: float) -> dict[str, Any]:
+    """Write the robot's base in the branch's frame into the cell file, from touched points.
+
+    Each point is touched with the middle of the gripper, the robot guided by hand; its pose is
+    read when Enter is pressed.
+    """
+    from limber.errors import InputError
+    from limber.robot.calibration import fit_base
+    from limber.robot.cell import BaseEntry, read_cell, write_cell
+    from limber.store import Branch
+
+    cell, branch = read_cell(cell_file), Branch.open(branch_folder)
+    names, on_branch, touched = _points(points_file)
+    version = cell.robot.version
+    if touched is None:
+        if not sys.stdin.isatty():
+            raise InputError("Nobody can say when a point is touched: standard input is no "
+                             "terminal.", "", "Run it in a terminal, or give the robot's poses "
+                             "in the points file.")
+        touched, version = _touch(run, cell, names)
+    fit = fit_base(touched, on_branch, largest_residual=largest_residual)
+    base = BaseEntry(pose=tuple(map(float, fit.pose)),
+                     position_sigma_m=max(fit.position_sigma, 1e-4),
+                     rotation_sigma_rad=max(fit.rotation_sigma, 1e-4),
+                     residual_m=fit.residual)
+    entry = cell.model_copy(update={
+        "base": base, "branch": branch.uuid,
+        "calibrated": datetime.now(UTC).isoformat(timespec="seconds"),
+        "robot": cell.robot.model_copy(update={"version": version})})
+    write_cell(cell_file, entry)
+    run.show("Touched points", [["point", "off [mm]"], *(
+        [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))])
+    return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": fit.pose,
+            "residual_m": fit.residual, "position_sigma_m": fit.position_sigma,
+            "rotation_sigma_rad": fit.rotation_sigma}
+
+
+def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
+    from limber.errors import InputError
+
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            rows = [row for row in csv.reader(stream) if row]
+        if rows and not _is_number(rows[0][1]):
+            rows = rows[1:]
+        names = [row[0] for row in rows]
+        numbers = np.array([[float(part) for part in row[1:]] for row in rows])
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{path} cannot be read as points ({error}).",
+                         "A line has name,x_m,y_m,z_m.", "Correct the file.") from error
+    if numbers.ndim != 2 or numbers.shape[1] not in (3, 9):
+        raise InputError(f"{path} has {numbers.shape[-1]} numbers a line.",
+                         "Three, or nine with the robot's pose, were expected.",
+                         "Correct the file.")
+    return names, numbers[:, :3], numbers[:, 3:6] if numbers.shape[1] == 9 else None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
+    """Read the tool's position at each point; the arm is guided by hand, nothing is sent to it."""
+    from limber.robot.kinematics import matrices
+    from limber.robot.samples import SampleStream
+
+    touched = []
+    stream = SampleStream(cell.robot.address)
+    try:
+        version = ".".join(map(str, stream.version[:3]))
+        for name in names:
+            input(f"Touch {name} with the middle of the gripper, then press Enter ")
+            stream.skip()
+            sample = stream.read(1.0)[-1]
+            # The flange by nominal kinematics would be millimetres off: the controller's own pose
+            # counts, for the tool that is set there.
+            from limber.robot.kinematics import forward, inverted
+
+            set_tool = inverted(forward(cell.arm, sample.joints)) @ matrices(sample.pose)
+            flange = matrices(sample.pose) @ inverted(set_tool)
+            touched.append((flange @ matrices(np.array(cell.tool.grasp_pose)))[:3, 3])
+    finally:
+        stream.close()
+    return np.array(touched), version
+
+
+command.add_command(check)
+command.add_command(calibrate)

@@ -1,0 +1,171 @@
+"""A planned path as motion of a robot: joints, times, expected wrenches, approach and return."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError, NoPathError
+from limber.robot.cell import Cell
+from limber.robot.joint_path import JointPath, joint_path
+from limber.robot.kinematics import inverted, matrices, pose_vectors
+from limber.robot.trajectory import Trajectory, along, densely
+
+_TURNS = 12  # directions about the branch from which the gripper may come
+
+
+@dataclass(frozen=True)
+class RobotMotion:
+    """What a robot will do to take a branch along a path.
+
+    Poses are of the gripper's middle in the robot's base frame.
+
+    Attributes:
+        approach: From before the branch to the grasp.
+        path: With the branch held.
+        joints: Of approach and path together, one continuous branch.
+        rotation: Of the gripper at the grasp, branch frame, as a rotation vector [rad].
+    """
+
+    approach: Trajectory
+    path: Trajectory
+    joints: JointPath
+    rotation: np.ndarray
+
+    @property
+    def way_back(self) -> Trajectory:
+        """The path reversed, with what is expected on it."""
+        path = self.path
+        expected = None if path.expected is None else path.expected[::-1]
+        return Trajectory(path.duration - path.times[::-1], path.poses[::-1], expected)
+
+    @property
+    def leaving(self) -> Trajectory:
+        """The approach reversed."""
+        approach = self.approach
+        return Trajectory(approach.duration - approach.times[::-1], approach.poses[::-1])
+
+
+def robot_motion(cell: Cell, poses: np.ndarray, forces: np.ndarray, axis: np.ndarray, *,
+                 speed: float, rotation: np.ndarray | None = None,
+                 start_joints: np.ndarray | None = None) -> RobotMotion:
+    """Turn a path of the grasped piece of branch into motion of the robot.
+
+    Args:
+        poses: Of the grasped piece from its rest pose on, branch frame [m, rad], shape [n, 6].
+        forces: What the gripper exerts on the branch at each, branch frame [N], shape [n, 3].
+        axis: Direction of the branch at the grasp, branch frame, shape [3].
+        speed: Of the gripper [m/s].
+        rotation: Of the gripper at the grasp, branch frame [rad], shape [3]. Without it the
+            direction of approach across the branch that keeps farthest from singularities.
+        start_joints: Where the robot is [rad], shape [6].
+
+    Raises:
+        InputError: the speed is over the cell's.
+        NoPathError: no branch of the inverse kinematics carries the motion; says where and why.
+    """
+    if speed > cell.limits.speed_m_s:
+        raise InputError(f"{speed:g} m/s is over the cell's {cell.limits.speed_m_s:g} m/s.",
+                         "The guard would slow it down and the force would not fit the time.",
+                         "Ask for less, or raise limits.speed_m_s in the cell file.")
+    wanted = across(axis) if rotation is None else [np.asarray(rotation, float)]
+    best: RobotMotion | None = None
+    refusal: NoPathError | None = None
+    for turn in wanted:
+        try:
+            motion = _motion(cell, poses, forces, turn, speed, start_joints)
+        except NoPathError as error:
+            refusal = refusal or error
+            continue
+        if best is None or motion.joints.singularity > best.joints.singularity:
+            best = motion
+    if best is None:
+        assert refusal is not None
+        raise refusal
+    return best
+
+
+def across(axis: np.ndarray) -> list[np.ndarray]:
+    """Return rotations [rad] of a gripper that comes across a branch along ``axis`` [3].
+
+    The gripper's z is the way it comes, its y lies along the branch.
+    """
+    y = np.asarray(axis, float) / np.linalg.norm(axis)
+    side = np.cross(y, [0.0, 0.0, 1.0])
+    if np.linalg.norm(side) < 0.1:
+        side = np.cross(y, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    found = []
+    for angle in np.arange(_TURNS) * 2 * np.pi / _TURNS:
+        z = Rotation.from_rotvec(angle * y).apply(side)
+        for sign in (1.0, -1.0):
+            frame = np.column_stack([np.cross(sign * y, z), sign * y, z])
+            found.append(Rotation.from_matrix(frame).as_rotvec())
+    return found
+
+
+def _motion(cell: Cell, poses: np.ndarray, forces: np.ndarray, rotation: np.ndarray, speed: float,
+            start_joints: np.ndarray | None) -> RobotMotion:
+    grip = inverted(matrices(poses[0])) @ matrices(np.r_[poses[0, :3], rotation])
+    held = matrices(poses) @ grip
+    back = held[0].copy()
+    way = held[0, :3, :3] @ np.array(cell.approach.direction)
+    back[:3, 3] -= cell.approach.distance_m * way
+    base = inverted(matrices(np.array(cell.base.pose)))
+    approach = densely(pose_vectors(base @ np.array([back, held[0]])))
+    steps = pose_vectors(base @ held)
+    path = densely(steps)
+    tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
+    limits = cell.limits
+    joints = joint_path(cell.arm, matrices(np.vstack([approach, path[1:]])) @ tool,
+                        start=start_joints, joint_limits=cell.joint_limits,
+                        singularity_margin=limits.singularity,
+                        joint_margin=limits.joint_margin_rad)
+    times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
+    # Expected wrenches stand at the plan's poses: carried to the dense ones by the way between.
+    ways = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
+    dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
+    expected = np.zeros((len(path), 6))
+    for k in range(3):
+        expected[:, k] = np.interp(dense, ways, forces[:, k])
+    coming = along(approach, speed, limits.acceleration_m_s2)
+    return RobotMotion(Trajectory(coming, approach, np.zeros_like(approach)),
+                       Trajectory(times, path, expected), joints, rotation)
+
+
+@dataclass(frozen=True)
+class Followed:
+    """How well a robot followed a path, from its samples.
+
+    Attributes:
+        peak_force: Greatest force on the branch [N].
+        path_error: Greatest distance of the grasp from the path [m].
+        force_error: Share of the peak force by which the smoothed force differs from the
+            expected one, 95 % of the samples below it; NaN without expected forces.
+    """
+
+    peak_force: float
+    path_error: float
+    force_error: float
+
+
+def followed(samples: np.ndarray, path: np.ndarray) -> Followed:
+    """Compare samples (:data:`limber.robot.link.COLUMNS`) with the path [n, 3], branch frame."""
+    force = samples[:, 13:16]
+    # Distance from segments, not from points.
+    start, way = path[:-1], np.diff(path, axis=0)
+    length = np.maximum((way**2).sum(axis=1), 1e-18)
+    nearest = np.full(len(samples), np.inf)
+    for a, step, square in zip(start, way, length, strict=True):
+        part = np.clip((samples[:, 1:4] - a) @ step / square, 0, 1)
+        nearest = np.minimum(nearest, np.linalg.norm(
+            samples[:, 1:4] - a - part[:, None] * step, axis=1))
+    expected = samples[:, 25:28]
+    known = np.isfinite(expected).all(axis=1)
+    peak = float(np.linalg.norm(force, axis=1).max())
+    error = float("nan")
+    if known.any():
+        largest = np.linalg.norm(expected[known], axis=1).max()
+        off = np.linalg.norm(force[known] - expected[known], axis=1)
+        error = float(np.quantile(off, 0.95) / max(largest, 1e-9))
+    return Followed(peak, float(nearest.max()), error)

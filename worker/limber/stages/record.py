@@ -1,0 +1,341 @@
+"""Record a pull with a robot, under the guard, into a recording that survives a kill."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from limber.errors import InputError, SafetyStop, WorkError
+from limber.progress import SILENT, Progress
+from limber.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.robot.cell import Cell
+    from limber.robot.link import RobotLink
+    from limber.robot.recorder import MarkerStream, PullRecorder
+    from limber.robot.trajectory import Trajectory
+    from limber.store import Stream
+
+
+class RecordInputs(BranchInputs):
+    """A branch folder, the robot's cell and the recording's name."""
+
+    groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
+
+    cell: Path = Field(description="The robot's cell file.")
+    name: str = Field("pull-1", description="Name of the recording.")
+
+
+class RecordSettings(Settings):
+    """A predefined pull: straight out along a direction, the gripper not turned, and back.
+
+    A branch that is pulled far sideways without following its arc is stretched: its force then
+    rises steeply, and the guard pauses.
+    """
+
+    groups: ClassVar[Groups] = {"pull": ("direction", "distance", "speed", "cycles", "pause")}
+
+    direction: tuple[float, float, float] = Field(
+        (1.0, 0.0, 0.0), description="Where to pull, branch frame; its length does not count.")
+    distance: float = Field(0.05, gt=0, le=0.5, description="How far [m].")
+    speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
+    cycles: int = Field(1, ge=1, le=20, description="Times out and back.")
+    pause: float = Field(0.5, ge=0, le=10, description="Standing still at each end [s].")
+
+
+class RecordOptions(Settings):
+    """How a recording is run."""
+
+    groups: ClassVar[Groups] = {"running": ("confirm", "markers", "after_stop", "recover")}
+
+    confirm: str | None = Field(
+        None, description="The recording's name, typed: the robot moves. Without it the name is "
+        "asked for at the terminal.")
+    markers: int | None = Field(
+        None, ge=1, le=65535, description="Port on the robot's address at which a tracker sends "
+        "the points that it sees as JSON lines (the virtual robot's is 63400).")
+    after_stop: Literal["ask", "hold", "retreat"] = Field(
+        "ask", description="What to do after a stop; ask: at the terminal, else hold.")
+    recover: bool = Field(False, description="Move nothing: take over what a killed recording "
+                          "of this name has left.", json_schema_extra={"switch": True})
+
+
+def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
+           options: RecordOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Record a pull.
+
+    The sensor is tared with the gripper empty, the gripper closes, pulls and returns. Every
+    sample of the controller goes into ``robot.csv`` as it comes; a kill or a stop keeps all but
+    the last second.
+
+    Returns:
+        ``ended`` (``reached`` or the reason of a stop), ``sample_count``, ``seconds``,
+        ``peak_force_n``, ``marker_frames``.
+
+    Raises:
+        InputError: cell and branch do not belong together, or nobody confirmed.
+        SafetyStop: the guard stopped it; what was recorded is in the folder all the same.
+    """
+    from limber.robot.belonging import check_branch
+    from limber.robot.cell import read_cell
+
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise InputError(f"--name {name!r} cannot name a recording.",
+                         "It becomes a folder's name.", "Use letters, digits, dash and dot.")
+    branch, cell = Branch.open(folder), read_cell(cell_file)
+    if warning := check_branch(cell, branch.uuid, folder):
+        progress.warn(warning)
+    if options.recover:
+        return _finish(branch, name, settings, {"ended": "recovered after a kill"})
+    if branch.has(f"pulls/{name}/pull.toml"):
+        raise InputError(f"{folder} has a recording {name} already.",
+                         "A recording is never written over.", "Give another --name.")
+    if f"pulls/{name}/robot.csv" in branch.streams():
+        raise InputError(f"A recording {name} was cut off.", "It would be lost.",
+                         "Take it over with --recover, or give another --name.")
+    _confirmed(name, options)
+    with branch.writing(f"the recording {name}"):
+        ended = _recorded(branch, cell, name, settings, options, progress)
+        result = _finish(branch, name, settings, ended)
+    if ended["ended"] != "reached":
+        raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
+                         f"{result['sample_count']} samples are in pulls/{name}.",
+                         "Look at the branch and the robot before anything moves.")
+    return result
+
+
+def _confirmed(name: str, options: RecordOptions) -> None:
+    """The robot moves only when somebody has typed the recording's name."""
+    typed = options.confirm
+    if typed is None and sys.stdin.isatty():
+        typed = input(f"The robot will move. Type {name} to go on: ").strip()
+    if typed != name:
+        raise InputError("Nobody confirmed that the robot may move.", "",
+                         f"Give --confirm {name}, with the workspace free and a hand at the "
+                         "emergency stop.")
+
+
+def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
+              options: RecordOptions, progress: Progress) -> dict[str, Any]:
+    from limber.robot.link import RobotLink
+    from limber.robot.recorder import MarkerStream, PullRecorder
+
+    stream = branch.stream(f"pulls/{name}/robot.csv")
+    entry_lines = branch.stream(f"pulls/{name}/pull.toml")
+    marker_lines = branch.stream(f"pulls/{name}/markers.csv") if options.markers else None
+    tracker = MarkerStream(cell.robot.address, options.markers) if options.markers else None
+    try:
+        progress(0.02, "connecting")
+        recorders: list[PullRecorder] = []
+        with RobotLink(cell, lambda rows: recorders[0].take(rows) if recorders else None) as link:
+            point = _grasp_point(branch, cell, link)
+            recorder = PullRecorder(stream, point)
+            recorders.append(recorder)
+            progress(0.05, "taring: keep the gripper free")
+            tared = link.tare(1.0)
+            _close_gripper(cell, link)
+            time.sleep(0.5)
+            _write_entry(entry_lines, cell, point, tared, tracker, recorder, marker_lines)
+            recorder.close_gripper()
+            trajectory = _pull(cell, recorder.last[1:7], settings)
+            link.start(trajectory)
+            event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
+            ended = {"ended": "reached" if event["event"] == "reached" else event["reason"],
+                     "warnings": list(link.warnings)}
+            if event["event"] == "reached":
+                time.sleep(0.2)
+                if cell.tool.gripper == "digital_output":
+                    link.gripper(False)
+            elif _choice(options) == "retreat":
+                link.acknowledge()
+                link.retreat()
+            ended |= {"peak_force_n": recorder.peak_force, "sample_count": recorder.count}
+            return ended
+    finally:
+        for lines in (stream, entry_lines, marker_lines):
+            if lines is not None:
+                lines.close()
+        if tracker is not None:
+            tracker.close()
+
+
+def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None,
+             recorder: PullRecorder, trajectory: Trajectory, progress: Progress,
+             ) -> dict[str, Any]:
+    """Wait for the end of the motion; markers are written as they come."""
+    begin = time.monotonic()
+    while True:
+        try:
+            return link.wait("reached", "stopped", "paused", seconds=0.05)
+        except WorkError:
+            if link.process.poll() is not None or \
+                    time.monotonic() - begin > 3 * trajectory.duration + 30:
+                raise
+        except BaseException:
+            # Ctrl-C stops the arm before anything else.
+            link.stop()
+            raise
+        _write_markers(tracker, lines, recorder)
+        progress(0.1 + 0.85 * min((time.monotonic() - begin) / trajectory.duration, 1.0),
+                 "pulling", force_n=recorder.peak_force)
+
+
+def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
+                   recorder: PullRecorder) -> None:
+    if tracker is None or lines is None:
+        return
+    for clock, points in tracker.read():
+        if recorder.first is not None and clock >= recorder.first:
+            lines.append(",".join([f"{clock - recorder.first:.6f}",
+                                   *(f"{value:.6g}" for value in points.ravel())]))
+
+
+def _pull(cell: Cell, pose: np.ndarray, settings: RecordSettings) -> Trajectory:
+    from limber.robot.joint_path import joint_path
+    from limber.robot.kinematics import inverted, matrices, pose_vectors
+    from limber.robot.trajectory import Trajectory, along, densely
+
+    direction = np.array(settings.direction, float)
+    length = np.linalg.norm(direction)
+    if length < 1e-9:
+        raise InputError("--direction 0 0 0.", "It points nowhere.", "Give a direction.")
+    if settings.speed > cell.limits.speed_m_s:
+        raise InputError(f"--speed {settings.speed:g} is over the cell's "
+                         f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
+                         "Ask for less, or raise limits.speed_m_s in the cell file.")
+    frames = matrices(np.array([pose, pose]))
+    frames[1, :3, 3] += settings.distance * direction / length
+    out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
+    joint_path(cell.arm, matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose))),
+               joint_limits=cell.joint_limits, singularity_margin=cell.limits.singularity,
+               joint_margin=cell.limits.joint_margin_rad)
+    times, poses, begin = [], [], 0.0
+    for _ in range(settings.cycles):
+        for leg in (out, out[::-1]):
+            passed = begin + along(leg, settings.speed, cell.limits.acceleration_m_s2)
+            # The last pose of a leg is the first of the next, after the pause.
+            times.append(passed)
+            poses.append(leg)
+            begin = float(passed[-1]) + max(settings.pause, 0.02)
+    return Trajectory(np.concatenate(times), np.concatenate(poses))
+
+
+def _grasp_point(branch: Branch, cell: Cell, link: RobotLink) -> np.ndarray:
+    """The branch's axis nearest to the gripper [m], shape [3]."""
+    from limber.robot.kinematics import matrices
+    from limber.stages.loading import load_skeleton
+
+    gripper = (matrices(np.array(cell.base.pose)) @ matrices(_tool_pose(cell, link)))[:3, 3]
+    skeleton = load_skeleton(branch)
+    nearest, distance = skeleton.nodes[0], np.inf
+    for child, parent in enumerate(skeleton.parent):
+        if parent < 0:
+            continue
+        start, way = skeleton.nodes[parent], skeleton.nodes[child] - skeleton.nodes[parent]
+        part = np.clip((gripper - start) @ way / max(way @ way, 1e-18), 0, 1)
+        off = float(np.linalg.norm(gripper - start - part * way))
+        if off < distance:
+            nearest, distance = start + part * way, off
+    if distance > 0.03:
+        raise InputError(f"The gripper is {1000 * distance:.0f} mm from the branch's axis.",
+                         "It would close on nothing, or the calibration is off.",
+                         "Move it onto the branch, or calibrate again.")
+    return nearest
+
+
+def _tool_pose(cell: Cell, link: RobotLink) -> np.ndarray:
+    """Where the gripper's middle is by the robot's joints, base frame [m, rad], shape [6]."""
+    from limber.robot.kinematics import forward, matrices, pose_vectors
+
+    flange = forward(cell.arm, np.array(link.facts["joints"]))
+    return pose_vectors(flange @ matrices(np.array(cell.tool.grasp_pose)))
+
+
+def _close_gripper(cell: Cell, link: RobotLink) -> None:
+    if cell.tool.gripper == "digital_output":
+        link.gripper(True)
+    elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
+        input("Close the gripper on the branch by hand, then press Enter ")
+
+
+def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
+                 tracker: MarkerStream | None, recorder: PullRecorder,
+                 marker_lines: Stream | None) -> None:
+    """Write ``pull.toml`` first of all: what a kill leaves can be read with it."""
+    from limber.recordings.recording import GraspEntry, PullEntry, SensorEntry, entry_text
+
+    rest = None
+    if tracker is not None and marker_lines is not None:
+        frames = tracker.read(1.0)
+        if not frames:
+            raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
+        rest = tuple(tuple(map(float, point)) for point in np.mean([f[1] for f in frames], axis=0))
+        names = (f"m{k}_{axis}_m" for k in range(len(rest)) for axis in "xyz")
+        marker_lines.append(",".join(("t_s", *names)))
+    entry = PullEntry(
+        observation="markers" if rest else "none", grasp=GraspEntry(
+            point_m=tuple(map(float, point)), radius_m=0.012),
+        sensor=SensorEntry(
+            force_sigma_n=cell.sensor.force_sigma_n, torque_sigma_nm=cell.sensor.torque_sigma_nm,
+            force_range_n=cell.sensor.force_range_n),
+        rest_points_m=rest,
+        source=f"limber record, {cell.arm.name}, {cell.sensor.kind}; tare within "
+        f"{max(tared['sigma'][:3]):.2g} N")
+    for line in entry_text(entry).splitlines():
+        lines.append(line)
+
+
+def _choice(options: RecordOptions) -> str:
+    if options.after_stop != "ask":
+        return options.after_stop
+    if not sys.stdin.isatty():
+        return "hold"
+    typed = input("The robot has stopped. Type retreat to go back the way it came; anything else "
+                  "holds: ")
+    return "retreat" if typed.strip() == "retreat" else "hold"
+
+
+def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str, Any],
+            ) -> dict[str, Any]:
+    """Take the streams over into the branch folder."""
+    from limber.recordings.streams import read_stream
+
+    prefix = f"pulls/{name}/"
+    left = [file for file in branch.streams() if file.startswith(prefix)]
+    if f"{prefix}robot.csv" not in left or f"{prefix}pull.toml" not in left:
+        raise InputError(f"There is no cut-off recording {name}.",
+                         f"Left over are: {', '.join(branch.streams()) or 'none'}.",
+                         "Give the name of one of those.")
+    with branch.stage(f"record:{name}", settings) as stage:
+        for file in left:
+            stage.adopt(file)
+        samples = read_stream(stage.path(f"{prefix}robot.csv"))
+        force = np.linalg.norm(samples.values[:, 6:9], axis=1)
+        markers = 0
+        if f"{prefix}markers.csv" in left:
+            markers = len(read_stream(stage.path(f"{prefix}markers.csv")))
+        stage.result.update(
+            {"pull": name, "sample_count": len(samples), "marker_frames": markers,
+             "seconds": float(samples.times[-1]), "peak_force_n": float(force.max())} | ended)
+    return stage.result
+
+
+def run(inputs: RecordInputs, settings: RecordSettings, options: RecordOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return record(inputs.branch_folder, inputs.cell, inputs.name, settings, options,
+                  progress=progress)
+
+
+STAGE = StageDescription(
+    "record", 55, run, RecordInputs, RecordSettings, RecordOptions, key="record:{name}",
+    reads=("skeleton.swc",), writes=("pulls/{name}/",))
