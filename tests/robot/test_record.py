@@ -40,7 +40,7 @@ def recorded(branch_folder, tmp_path, address, name="robot-1", **options):
 def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, worker_address):
     """No sample lost; the piece goes out and back; force rises and falls; markers beside it."""
     result, _ = recorded(branch_folder, tmp_path, worker_address)
-    assert result["ended"] == "reached" and result["marker_frames"] > 20
+    assert result["ended"] == "reached" and result["marker_frames"] > 5
     pull = read_pull(branch_folder / "pulls" / "robot-1")
     assert np.diff(pull.times) == pytest.approx(np.full(len(pull.times) - 1, 0.002), abs=1e-5)
     start = np.array(pull.entry.grasp.point_m)

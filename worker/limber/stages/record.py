@@ -152,7 +152,9 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             ended = {"ended": "reached" if event["event"] == "reached" else event["reason"],
                      "warnings": list(link.warnings)}
             if event["event"] == "reached":
-                time.sleep(0.2)
+                # What was seen last comes a little later.
+                time.sleep(0.5)
+                _write_markers(tracker, marker_lines, recorder)
                 if cell.tool.gripper == "digital_output":
                     link.gripper(False)
             elif _choice(options) == "retreat":

@@ -74,9 +74,8 @@ class Load(Protocol):
         """Let what is held slide back by a part of its way."""
         ...
 
-    @property
-    def seen_points(self) -> list[list[float]]:
-        """Points that a tracker sees [m]."""
+    def seen(self) -> tuple[float, list[list[float]]]:
+        """Return points that a tracker sees [m], and how old they are [s]."""
         ...
 
     def report(self) -> dict[str, Any]:
@@ -106,9 +105,8 @@ class Nothing:
     def slide(self, part: float) -> None:
         """Nothing is held."""
 
-    @property
-    def seen_points(self) -> list[list[float]]:
-        return []
+    def seen(self) -> tuple[float, list[list[float]]]:
+        return 0.0, []
 
     def report(self) -> dict[str, Any]:
         return {"branch": "none"}

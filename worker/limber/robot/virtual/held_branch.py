@@ -105,6 +105,7 @@ class HeldBranch:
         self._offset = np.eye(4)
         self._solution: Solution | None = None
         self._busy, self._asked, self._age = False, False, 0.0
+        self._points_age = self._asked_age = 0.0
         self._gripper = self._closed_at = np.eye(4)
 
     @property
@@ -120,6 +121,8 @@ class HeldBranch:
         if self.state != "held":
             return np.zeros(6)
         self._age += seconds
+        self._points_age += seconds
+        self._asked_age += seconds
         patch = self._gripper @ self._offset
         self._exchange(patch)
         solution = self._solution
@@ -157,6 +160,7 @@ class HeldBranch:
                 rest[:3, 3] = answer["centre"]
                 self._offset = inverse_of(self._closed_at) @ rest
                 self._solution, self._age, self.state = answer["solution"], 0.0, "held"
+                self._points_age = 0.0
         if not self._busy and not self._asked:
             self._pipe.send(("grasp", tuple(self._closed_at[:3, 3])))
             self._busy = self._asked = True
@@ -184,10 +188,10 @@ class HeldBranch:
         self._process.join()
         self._pipe.close()
 
-    @property
-    def seen_points(self) -> list[list[float]]:
-        """Where the seen points are now [m]."""
-        return self.points.tolist()
+    def seen(self) -> tuple[float, list[list[float]]]:
+        """Return the seen points [m], and how long ago the gripper was where they belong to [s]."""
+        held = self._solution is not None
+        return self._points_age if held else 0.0, self.points.tolist()
 
     def report(self) -> dict[str, Any]:
         """Return its state as plain data."""
@@ -203,9 +207,10 @@ class HeldBranch:
         if self._busy and self._pipe.poll():
             self._solution = self._pipe.recv()[1]
             self._busy, self._age = False, 0.0
+            self._points_age = self._asked_age
         if not self._busy:
             self._pipe.send(("solve", patch))
-            self._busy = True
+            self._busy, self._asked_age = True, 0.0
 
     def _receive(self, kind: str) -> dict[str, Any]:
         try:

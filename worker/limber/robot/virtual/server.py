@@ -65,7 +65,7 @@ class Server:
             DASHBOARD_PORT: self._serve_dashboard}
         if self.controller.ft300 is not None:
             ports[FT300_PORT] = self._serve_ft300
-        if self.controller.load.seen_points:
+        if self.controller.load.seen()[1]:
             ports[MARKER_PORT] = self._serve_markers
         try:
             for port, serve in ports.items():
@@ -190,11 +190,17 @@ class Server:
     async def _serve_markers(self, _reader: asyncio.StreamReader,
                              writer: asyncio.StreamWriter) -> None:
         rng = np.random.default_rng(self.controller.step_count)
+        last = -1.0
         while not writer.is_closing():
-            points = np.array(self.controller.load.seen_points)
+            age, seen = self.controller.load.seen()
+            points = np.array(seen)
             points = points + _MARKER_SIGMA_M * rng.standard_normal(points.shape)
-            line = json.dumps({"t_s": self.controller.clock, "points_m": points.tolist()})
-            self.send(writer, f"{line}\n".encode())
+            # Stamped with the time at which the gripper was where the branch was solved.
+            seen_at = self.controller.clock - age
+            if seen_at > last + 1e-9:
+                line = json.dumps({"t_s": seen_at, "points_m": points.tolist()})
+                self.send(writer, f"{line}\n".encode())
+                last = seen_at
             await asyncio.sleep(_MARKER_SECONDS)
 
 
