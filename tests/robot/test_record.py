@@ -23,7 +23,7 @@ MARKERS = 63400
 
 def sideways_pull(branch_folder, **changes) -> RecordSettings:
     direction = tuple(map(float, sideways(Branch.open(branch_folder))))
-    return RecordSettings(**{"direction": direction, "distance": 0.012, "speed": 0.02,
+    return RecordSettings(**{"direction": direction, "distance": 0.012, "speed": 0.01,
                              "pause": 0.2, **changes})
 
 

@@ -18,6 +18,8 @@ import numpy as np
 from limber.errors import InputError
 from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
 
+_BLEND_SECONDS = 0.05
+
 
 @dataclass(frozen=True)
 class BranchSetting:
@@ -106,6 +108,7 @@ class HeldBranch:
         self._solution: Solution | None = None
         self._busy, self._asked, self._age = False, False, 0.0
         self._points_age = self._asked_age = 0.0
+        self._jump = np.zeros(6)
         self._gripper = self._closed_at = np.eye(4)
 
     @property
@@ -131,9 +134,8 @@ class HeldBranch:
         if solution.peak_strain > self.setting.break_strain:
             self.lose("broken")
             return np.zeros(6)
-        change = np.concatenate((patch[:3, 3] - solution.frame[:3, 3], rotation_vector(
-            patch @ inverse_of(solution.frame))))
-        on_branch = solution.wrench + solution.stiffness @ change
+        self._jump *= np.exp(-seconds / _BLEND_SECONDS)
+        on_branch = extrapolated(solution, patch) + self._jump
         if np.linalg.norm(on_branch[:3]) > self.setting.grip:
             self.lose("slipped")
             return np.zeros(6)
@@ -160,7 +162,7 @@ class HeldBranch:
                 rest[:3, 3] = answer["centre"]
                 self._offset = inverse_of(self._closed_at) @ rest
                 self._solution, self._age, self.state = answer["solution"], 0.0, "held"
-                self._points_age = 0.0
+                self._points_age, self._jump = 0.0, np.zeros(6)
         if not self._busy and not self._asked:
             self._pipe.send(("grasp", tuple(self._closed_at[:3, 3])))
             self._busy = self._asked = True
@@ -205,8 +207,11 @@ class HeldBranch:
 
     def _exchange(self, patch: np.ndarray) -> None:
         if self._busy and self._pipe.poll():
-            self._solution = self._pipe.recv()[1]
+            before, self._solution = self._solution, self._pipe.recv()[1]
             self._busy, self._age = False, 0.0
+            if before is not None:
+                # The wrench goes over to the new solution, a branch's force does not jump.
+                self._jump += extrapolated(before, patch) - extrapolated(self._solution, patch)
             self._points_age = self._asked_age
         if not self._busy:
             self._pipe.send(("solve", patch))
@@ -228,6 +233,13 @@ class HeldBranch:
         origin = self._base[:3, :3] @ flange[:3, 3] + self._base[:3, 3]
         lever = rotation @ (patch[:3, 3] - origin)
         return np.concatenate((force, torque + crossed(lever, force)))
+
+
+def extrapolated(solution: Solution, patch: np.ndarray) -> np.ndarray:
+    """Return the wrench at a frame of the patch [4, 4] near that of a solution, shape [6]."""
+    change = np.concatenate((patch[:3, 3] - solution.frame[:3, 3],
+                             rotation_vector(patch @ inverse_of(solution.frame))))
+    return solution.wrench + solution.stiffness @ change
 
 
 def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:

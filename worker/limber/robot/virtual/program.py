@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _READY, _DONE = 1, 2
 _STOP_SCRIPT = 255
+_STOPS = {15, 16, 33, 34}
 # Commands that the script does at once, without the handshake's second half.
 _REAL_TIME = {6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71}
 _MOVE = re.compile(r"\b(movej|movel)\((p?)\[([^\]]*)\]\s*,\s*a=([-\d.eE+]+)\s*,\s*v=([-\d.eE+]+)"
@@ -102,6 +103,8 @@ class ControlProgram:
         if command == _STOP_SCRIPT:
             controller.stop_program("client asked")
             return
+        if command in _STOPS:
+            controller.say(f"stop command {command}")
         action = _ACTIONS.get(command)
         if action is None:
             # The real controller would do it; this one must not pretend that it did.

@@ -1,0 +1,178 @@
+"""The robot's table: kinematics, stop times, faults, the stream, paths; all on the virtual robot.
+
+No real robot was measured. Times are those of this computer under its load at the moment; the
+virtual controller and the driver share it.
+"""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from benchmarks.robot_faults import (
+    ENDS_ROBOT,
+    FAULTS,
+    cell_for,
+    new_robot,
+    provoke,
+    restored,
+    straight,
+)
+from benchmarks.table import Row
+from limber.errors import LimberError
+from limber.progress import Progress
+from limber.robot.arms import ARMS
+from limber.robot.kinematics import forward, inverse
+from limber.robot.link import RobotLink
+from limber.robot.trajectory import Trajectory, along, densely
+
+_ADDRESS = "127.0.0.71"
+
+
+def rows(quick: bool, progress: Progress, _out: Path | None) -> list[Row]:
+    """Measure; ``quick`` does each fault once and streams for 20 s instead of 10 minutes."""
+    seed = int(np.random.SeedSequence().entropy % 2**31)
+    print(f"seed {seed}")
+    table = [*_kinematics(seed)]
+    progress(0.05, "stop times")
+    for model in ("ur5", "ur5e"):
+        table += _stop_time(model, seed, 5 if quick else 20)
+    progress(0.15, "path")
+    table.append(_path(seed))
+    progress(0.2, "faults")
+    table.append(_faults(seed, 1 if quick else 20, progress.part(0.2, 0.9)))
+    progress(0.9, "stream")
+    table.append(_stream(seed, 20.0 if quick else 600.0))
+    return table
+
+
+def _kinematics(seed: int) -> list[Row]:
+    rng = np.random.default_rng(seed)
+    worst, missing, count = 0.0, 0, 10_000 // len(ARMS) + 1
+    for arm in ARMS.values():
+        joints = rng.uniform(-np.pi, np.pi, (count, 6))
+        frames = forward(arm, joints)
+        solutions = inverse(arm, frames)
+        exist = np.isfinite(solutions).all(axis=-1)
+        again = forward(arm, np.nan_to_num(solutions))
+        worst = max(worst, float(np.linalg.norm(
+            (again - frames[:, None])[..., :3, 3], axis=-1)[exist].max()))
+        apart = np.abs((solutions - joints[:, None] + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
+        missing += int(np.sum(~(np.nanmin(apart, axis=1) < 1e-6)))
+    found = [Row("kinematics: position of every inverse solution, 10,000 poses, 7 arms",
+                 "1e-9 m", f"{worst:.1e} m", worst < 1e-9),
+             Row("kinematics: poses whose own joints are not among the solutions", "0",
+                 str(missing), missing == 0)]
+    try:
+        import ur_analytic_ik
+    except ImportError:
+        return [*found, Row("kinematics against an independent library", "1e-9 m",
+                            "library not installed", None)]
+    off, lacking = 0.0, 0
+    for name, arm in ARMS.items():
+        library = getattr(ur_analytic_ik, name)
+        joints = rng.uniform(-np.pi, np.pi, (count, 6))
+        frames = forward(arm, joints)
+        theirs = np.array([library.forward_kinematics(*row) for row in joints])
+        off = max(off, float(np.abs(frames - theirs)[:, :3, 3].max()))
+        ours = np.isfinite(inverse(arm, frames)).all(axis=-1).sum(axis=1)
+        lacking += sum(len(library.inverse_kinematics(frame)) != number
+                       for frame, number in zip(frames, ours, strict=True))
+    return [*found, Row("kinematics against an independent library: position", "1e-9 m",
+                        f"{off:.1e} m", off < 1e-9),
+            Row("poses with another number of inverse solutions than the library's", "0",
+                str(lacking), lacking == 0)]
+
+
+def _stop_time(model: str, seed: int, runs: int) -> list[Row]:
+    """From the step at which the force goes over the limit to the controller's stop command."""
+    latencies, ways = [], []
+    with new_robot(_ADDRESS, model, seed) as robot:
+        for _ in range(runs):
+            restored(robot)
+            with RobotLink(cell_for(_ADDRESS, model)) as link:
+                time.sleep(0.2)
+                link.tare()
+                link.start(straight(robot, (0.0, 0.2, 0.0)))
+                time.sleep(1.0)
+                before = robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
+                link.wait("stopped", seconds=5)
+                time.sleep(0.3)
+                after = robot.state
+            stopped = [line for line in after["log"] if "stop command" in line
+                       and float(line.split()[0]) > before["clock"]]
+            latencies.append(float(stopped[0].split()[0]) - before["clock"])
+            ways.append(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))
+    rate, asked = (125, 12) if model == "ur5" else (500, 6)
+    worst = 1000 * max(latencies)
+    return [Row(f"force over the hard limit until the stop command, {rate} Hz, worst of {runs}",
+                f"{asked} ms", f"{worst:.0f} ms (median {1000 * np.median(latencies):.0f})",
+                worst <= asked + 1e-6),
+            Row(f"way after the limit at 50 mm/s, {rate} Hz, worst", "reported",
+                f"{1000 * max(ways):.1f} mm", None)]
+
+
+def _path(seed: int) -> Row:
+    collected: list[np.ndarray] = []
+    with new_robot(_ADDRESS, "ur5e", seed) as robot:
+        start = np.array(robot.state["pose"])
+        corners = start + np.array([[0, 0, 0, 0, 0, 0], [0, 0.08, 0, 0, 0, 0],
+                                    [0, 0.08, 0.05, 0, 0.1, 0], [0.03, 0.02, 0.05, 0, 0, 0]])
+        poses = densely(corners, spacing=0.0005)
+        path = Trajectory(along(poses, 0.03, 0.2), poses, np.zeros_like(poses))
+        with RobotLink(cell_for(_ADDRESS), collected.append) as link:
+            time.sleep(0.2)
+            link.tare()
+            link.follow(path)
+    samples = np.concatenate(collected)
+    distance = max(float(np.linalg.norm(poses[:, :3] - row, axis=1).min())
+                   for row in samples[:, 1:4])
+    return Row("following a path at 30 mm/s: distance from it, worst", "1 mm",
+               f"{1000 * distance:.2f} mm", distance < 1e-3)
+
+
+def _faults(seed: int, runs: int, progress: Progress) -> Row:
+    failed, total, slowest = [], 0, 0.0
+    for number, name in enumerate(FAULTS):
+        progress(number / len(FAULTS), name)
+        robot = new_robot(_ADDRESS, "ur5e", seed + number)
+        try:
+            for _ in range(runs):
+                if robot.process.poll() is not None:
+                    robot.close()
+                    robot = new_robot(_ADDRESS, "ur5e", seed + number)
+                restored(robot)
+                total += 1
+                try:
+                    outcome = provoke(name, robot, cell_for(_ADDRESS))
+                except (AssertionError, LimberError) as error:
+                    failed.append(f"{name}: {error}")
+                    continue
+                if name not in ENDS_ROBOT:
+                    slowest = max(slowest, outcome.standstill_s)
+        finally:
+            robot.close()
+    for line in failed:
+        print(line)
+    return Row(f"{len(FAULTS)} faults while moving, {runs} runs each: standstill and a report",
+               "every one", f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s",
+               not failed)
+
+
+def _stream(seed: int, seconds: float) -> Row:
+    clocks: list[np.ndarray] = []
+    with new_robot(_ADDRESS, "ur5e", seed) as robot, \
+            RobotLink(cell_for(_ADDRESS), lambda part: clocks.append(part[:, 0].copy())) as link:
+        process = psutil.Process(link.process.pid)
+        time.sleep(5.0)
+        begin = process.memory_info().rss
+        time.sleep(seconds)
+        grown = process.memory_info().rss - begin
+        lost_by_robot = robot.state["lost_seconds"]
+    steps = np.diff(np.concatenate(clocks))
+    lost = int(np.round(steps / 0.002).sum() - len(steps))
+    return Row(f"500 Hz for {seconds:.0f} s: samples lost, not ascending; driver's memory",
+               "0; flat", f"{lost} of {len(steps) + 1}, {int(np.sum(steps <= 0))}; "
+               f"{grown / 1e6:+.1f} MB (virtual clock stood still for {lost_by_robot:.2f} s)",
+               lost == 0 and bool(np.all(steps > 0)) and abs(grown) < 5e6)
