@@ -213,7 +213,8 @@ def test_the_recorded_beam_settles_alike_in_both_files(branch_folder, tmp_path):
     for number, source in enumerate(("beam_load52_V2_a.csv", "beam_load52_V2_a.c3d")):
         name = f"beam{number}"
         assert call(["import-pull", str(branch_folder), str(SHARED / source), "--name", name,
-                     "--weight", "0.51012", "--grasp-point", "0", "0", "0.3", "--progress",
+                     "--weight", "0.51012", "--grasp-point", "0", "0", "0.3",
+                     "--grasp-radius", "0.02", "--progress",
                      "none"]) == 0
         pull = read_pull(branch_folder / "pulls" / name)
         moved.append(pull.observations.positions[-1] - np.array(pull.entry.rest_points_m))

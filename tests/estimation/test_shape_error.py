@@ -62,17 +62,16 @@ def test_too_few_shapes_say_nothing(fitted):
 def test_the_largest_part_of_a_wide_interval_is_named():
     """20 % by the scan at the last point: scan better. 10 % in all: no word. Sensors: pull more."""
     def told(sensor: float, geometry: float | None) -> list[str]:
-        parts = [value for value in (sensor, geometry) if value is not None]
+        parts = {"noise of the points": np.array([0.01, sensor])**2}
+        if geometry is not None:
+            parts["shape of the scan"] = np.array([0.01, geometry])**2
         messages: list[str] = []
-        _tell_largest_part({
-            "sensor": np.array([0.01, sensor]), "mesh": None,
-            "geometry": None if geometry is None else np.array([0.01, geometry]),
-            "total": np.array([0.014, np.linalg.norm(parts)])}, messages.append)
+        _tell_largest_part(parts, messages.append)
         return messages
 
     assert told(0.05, 0.08) == []
     assert "point 2" in told(0.05, 0.2)[0] and "scan from more sides" in told(0.05, 0.2)[0]
-    assert "More pulls" in told(0.3, 0.2)[0] and "More pulls" in told(0.3, None)[0]
+    assert "more pulls" in told(0.3, 0.2)[0] and "more pulls" in told(0.3, None)[0]
 
 
 def test_a_pull_that_its_force_drives_is_no_exception(monkeypatch, small, small_bench, small_pull):

@@ -169,3 +169,16 @@ def test_every_recorded_push_through_the_command(tmp_path, capsys):
                          delimiter=",", skiprows=1)[:, 0]
         assert way.min() <= line["contact_m"] < way.mean()
         assert "fourth power" in line["why_no_modulus"]
+
+
+def test_the_first_contact_counts_not_an_obstacle_behind_it():
+    """A cane, then a trellis wire twenty times as stiff: the slope is the cane's, and what was
+    left out is told."""
+    rng = np.random.default_rng(3)
+    way = np.arange(0.0, 0.08, 0.0005)
+    force = (60 * np.maximum(way - 0.02, 0) + 1200 * np.maximum(way - 0.06, 0)
+             + 0.02 * rng.standard_normal(len(way)))
+    found = force_slope(way, force)
+    assert found.slope == pytest.approx(60, rel=0.05)
+    assert found.contact == pytest.approx(0.02, abs=3e-3)
+    assert any("left out" in message and "first contact" in message for message in found.warnings)

@@ -37,13 +37,13 @@ def source(tmp_path, plain_pull):
     return tmp_path
 
 
-def test_markers_in_millimetres_and_gram_force(branch_folder, source, plain_pull):
+def test_markers_in_millimetres_and_gram_force(bare_folder, source, plain_pull):
     """Units are converted at the door; the pull in the folder is in metres and newtons."""
-    result = import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(
+    result = import_pull(bare_folder, source / "markers.csv", "m", ImportSettings(
         robot=str(source / "robot.csv"), unit="mm", force_unit="gf", time_offset=0.05,
         torque_sigma=0.002))
     assert result["frame_count"] == 60 and result["point_count"] == 2
-    pull = read_pull(branch_folder / "pulls" / "m")
+    pull = read_pull(bare_folder / "pulls" / "m")
     assert np.allclose(pull.observations.positions, plain_pull.observations.positions, atol=1e-6)
     assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-6)
     assert pull.entry.time_offset_s == 0.05
@@ -51,16 +51,16 @@ def test_markers_in_millimetres_and_gram_force(branch_folder, source, plain_pull
     assert pull.entry.grasp.point_m == (0.0, 0.0, 0.5)
 
 
-def test_a_robot_table_is_needed_and_its_columns_are_named(branch_folder, source):
+def test_a_robot_table_is_needed_and_its_columns_are_named(bare_folder, source):
     """What is missing is said, with the columns that are expected."""
     with pytest.raises(InputError, match="--robot"):
-        import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(unit="mm"))
+        import_pull(bare_folder, source / "markers.csv", "m", ImportSettings(unit="mm"))
     with pytest.raises(InputError, match="x_m"):
-        import_pull(branch_folder, source / "markers.csv", "m", ImportSettings(
+        import_pull(bare_folder, source / "markers.csv", "m", ImportSettings(
             unit="mm", robot=str(source / "markers.csv")))
     with pytest.raises(InputError, match="no "):
-        import_pull(branch_folder, source / "nothing.csv", "m", ImportSettings())
-    assert "m" not in json.loads((branch_folder / "branch.json").read_text())["files"]
+        import_pull(bare_folder, source / "nothing.csv", "m", ImportSettings())
+    assert "m" not in json.loads((bare_folder / "branch.json").read_text())["files"]
 
 
 def test_rigid_fit_of_a_turned_copy():
@@ -75,7 +75,7 @@ def test_rigid_fit_of_a_turned_copy():
     assert np.linalg.det(mirrored) == pytest.approx(1)
 
 
-def test_rgbd_folder_in_the_layout_of_tum(branch_folder, source):
+def test_rgbd_folder_in_the_layout_of_tum(bare_folder, source):
     """depth.txt gives stamps, groundtruth.txt the camera's pose, masks go along."""
     folder = source / "rgbd"
     (folder / "depth").mkdir(parents=True)
@@ -90,8 +90,8 @@ def test_rgbd_folder_in_the_layout_of_tum(branch_folder, source):
         lines.append(f"{10.0 + 0.5 * k:.6f} depth/f{k}.png")
     (folder / "depth.txt").write_text("\n".join(lines) + "\n")
     (folder / "groundtruth.txt").write_text("10.0 1 2 3 0 0 0.70710678 0.70710678\n")
-    import_pull(branch_folder, folder, "rgbd", ImportSettings(robot=str(source / "robot.csv")))
-    target = branch_folder / "pulls" / "rgbd"
+    import_pull(bare_folder, folder, "rgbd", ImportSettings(robot=str(source / "robot.csv")))
+    target = bare_folder / "pulls" / "rgbd"
     frames = list_frames(target, "depth")
     assert [time for time, _ in frames] == [10.0, 10.5, 11.0]
     moved = read_camera(target / "camera.toml")
@@ -100,7 +100,7 @@ def test_rgbd_folder_in_the_layout_of_tum(branch_folder, source):
     assert len(list((target / "mask").iterdir())) == 3
 
 
-def test_folder_of_clouds(branch_folder, source):
+def test_folder_of_clouds(bare_folder, source):
     """PLY files with numbers for names need a rate, and become metres with time stamps."""
     from limber.geometry.cloud.cloud import Cloud
 
@@ -110,9 +110,9 @@ def test_folder_of_clouds(branch_folder, source):
         Cloud(np.full((20, 3), 100.0 * k)).write_ply(folder / f"cloud_{k}.ply")
     robot = str(source / "robot.csv")
     with pytest.raises(InputError, match="--rate-hz"):
-        import_pull(branch_folder, folder, "c", ImportSettings(robot=robot, unit="mm"))
-    import_pull(branch_folder, folder, "c", ImportSettings(robot=robot, unit="mm", rate_hz=10))
-    assert [t for t, _ in list_frames(branch_folder / "pulls" / "c", "clouds")] == [0.0, 0.1, 0.2]
+        import_pull(bare_folder, folder, "c", ImportSettings(robot=robot, unit="mm"))
+    import_pull(bare_folder, folder, "c", ImportSettings(robot=robot, unit="mm", rate_hz=10))
+    assert [t for t, _ in list_frames(bare_folder / "pulls" / "c", "clouds")] == [0.0, 0.1, 0.2]
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
@@ -138,7 +138,7 @@ def test_c3d_holds_what_its_table_holds():
     assert np.allclose(stream.times, table.times, atol=1e-6)
 
 
-def test_masks_of_a_yolo_model_of_ones_own(branch_folder, source, monkeypatch, capsys):
+def test_masks_of_a_yolo_model_of_ones_own(bare_folder, source, monkeypatch, capsys):
     """Colour images of an RGB-D folder go through ultralytics' interface (a stand-in here, with
     its call and its shapes); each depth image gets the mask of the colour image nearest in time.
     """
@@ -175,12 +175,12 @@ def test_masks_of_a_yolo_model_of_ones_own(branch_folder, source, monkeypatch, c
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
     weights = source / "mine.pt"
     weights.write_bytes(b"weights")
-    arguments = ["import-pull", str(branch_folder), str(folder), "--name", "seen", "--robot",
+    arguments = ["import-pull", str(bare_folder), str(folder), "--name", "seen", "--robot",
                  str(source / "robot.csv"), "--yolo-weights", str(weights), "--yolo-prompt",
                  "branch", "--json", "--progress", "none"]
     assert call(arguments) == 0
     masks = [read_mask(path) for path in sorted(
-        (branch_folder / "pulls" / "seen" / "mask").iterdir())]
+        (bare_folder / "pulls" / "seen" / "mask").iterdir())]
     assert [np.flatnonzero(mask.any(axis=0)).tolist() for mask in masks] == [[0], [1], [2]]
     monkeypatch.setitem(sys.modules, "ultralytics", None)
     capsys.readouterr()

@@ -414,7 +414,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         if stiff is not None:
             error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
     found.model_error = error
-    _tell_largest_part(found, progress.warn)
+    _tell_largest_part(found.causes, progress.warn)
 
 
 def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
@@ -430,9 +430,12 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
     return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
 
 
-def _tell_largest_part(found: Estimate, tell: Callable[[str], None]) -> None:
-    """Say what would narrow a wide interval: what makes up most of its variance."""
-    parts = found.causes
+def _tell_largest_part(parts: dict[str, np.ndarray], tell: Callable[[str], None]) -> None:
+    """Say what would narrow a wide interval: what makes up most of its variance.
+
+    Args:
+        parts: Variance of log E at the control points by cause, each of shape [K].
+    """
     total = np.sqrt(np.sum(list(parts.values()), axis=0))
     worst = int(np.argmax(total))
     if total[worst] < WIDE:

@@ -21,6 +21,8 @@ from limber.recordings.tables import (
 
 NOISE_FLOOR_N = 20 * FORCE_UNITS_N["gf"]
 """Force over the unloaded reading that counts as contact [N]; a drop of twice as much is a slip."""
+OBSTACLE = 2.0
+"""A slope that grows so many times at a bend is that of something else behind the branch."""
 STIFFENING = 0.3
 """A slope that changes by more along the push is told."""
 
@@ -116,8 +118,13 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
     moved, force = _oriented(moved, force, messages)
     out, back = _ways(moved)
     x, y = _sorted(moved[out], force[out])
-    contact, baseline = _contact(x, y)
-    loaded = (x > contact) & (y > baseline + NOISE_FLOOR_N)
+    contact, baseline, obstacle = _first_contact(x, y)
+    loaded = (x > contact) & (y > baseline + NOISE_FLOOR_N) & (x <= obstacle)
+    if obstacle < x[-1]:
+        messages.append(
+            f"From {1e3 * obstacle:.1f} mm on the force rises {OBSTACLE:.0f} times as steeply or "
+            f"more: something else is touched there. {int(np.sum(x > obstacle))} samples beyond "
+            "were left out; the slope is that of the first contact.")
     if loaded.sum() < 4:
         raise InputError(
             f"The force rises by {np.ptp(y):.3g} N over {np.ptp(x) * 1e3:.3g} mm.",
@@ -178,7 +185,8 @@ def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
     limited = saturated(force[:, None])
     if limited.any() and limited.sum() < 0.8 * len(force):
         messages.append(f"{int(limited.sum())} readings at {np.abs(force[limited]).max():.3g} N "
-                        "are alike: the load cell is saturated there; left out.")
+                        "are alike: the load cell is saturated there; left out, at "
+                        f"{_shown_places(moved[limited])}.")
         moved, force = moved[~limited], force[~limited]
     # One sample far from both neighbours, on the same side; a slip stays where it falls to.
     before, after = force[1:-1] - force[:-2], force[1:-1] - force[2:]
@@ -187,9 +195,17 @@ def _in_range(moved: np.ndarray, force: np.ndarray, messages: list[str],
     stray = np.r_[False, jump > max(10 * usual, 2 * NOISE_FLOOR_N), False] if len(force) > 2 else (
         np.zeros(len(force), bool))
     if stray.any():
-        messages.append(f"{int(stray.sum())} spike(s) in the force, the first at "
-                        f"{moved[stray][0] * 1e3:.1f} mm; left out.")
+        messages.append(f"{int(stray.sum())} spike(s) in the force, left out: at "
+                        f"{_shown_places(moved[stray])}.")
     return moved[~stray], force[~stray]
+
+
+def _shown_places(moved: np.ndarray) -> str:
+    """Displacements [m] of samples in words."""
+    places = [f"{value * 1e3:.1f}" for value in np.sort(moved)]
+    if len(places) > 8:
+        return f"{places[0]} to {places[-1]} mm"
+    return f"{', '.join(places)} mm"
 
 
 def _oriented(moved: np.ndarray, force: np.ndarray, messages: list[str],
@@ -268,6 +284,31 @@ def _contact(moved: np.ndarray, force: np.ndarray) -> tuple[float, float]:
         if cost < best[0]:
             best = (cost, place, solved[0])
     return best[1], best[2]
+
+
+def _first_contact(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Displacement and reading at the first contact, and where a later one begins (or the end).
+
+    The bend that fits best may be that of an obstacle behind the branch: then the force has risen
+    before it already.
+    """
+    contact, baseline = _contact(x, y)
+    end = float(x[-1])
+    for _ in range(3):
+        before = x < contact
+        if before.sum() < 8:
+            break
+        earlier, reading = _contact(x[before], y[before])
+        rising = (x >= earlier) & before
+        if rising.sum() < 4 or np.mean(y[before][-3:]) - reading < 2 * NOISE_FLOOR_N:
+            break
+        slope, _ = _line(x[rising], y[rising])
+        beyond = (x >= contact) & (x <= end)
+        steeper = _line(x[beyond], y[beyond])[0] if beyond.sum() >= 3 else 0.0
+        if slope <= 0 or steeper < OBSTACLE * slope:
+            break
+        end, contact, baseline = float(contact), earlier, reading
+    return contact, baseline, end
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

@@ -50,7 +50,8 @@ class BranchFrame:
     Attributes:
         alignment: From the scan's coordinates to the branch's.
         gravity: [m/s^2] in the branch's frame.
-        nodes: Of its mesh [m], shape [n, 3]; only a steady load asks for them.
+        nodes: Of its mesh [m], shape [n, 3]; a steady load asks for them. None: there is no mesh
+            yet, and nothing can be held against it.
     """
 
     alignment: Alignment = field(default_factory=Alignment)
@@ -214,6 +215,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
                    grasp=_place(settings.grasp_point, settings, branch), sigma=sigma)
     entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER})
+    _require_on_branch(entry.grasp, name, branch.nodes)
     poses = np.zeros((2, 6))
     poses[:, :3] = entry.grasp.point_m
     wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
@@ -226,6 +228,25 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
             "labels": [labels[k] for k in used], "load_n": load.tolist(),
             "displacement_m": moved.tolist(), "settled_s": still.duration,
             "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
+
+
+def _require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) -> None:
+    """Refuse a grasp in the air beside the branch.
+
+    Raises:
+        InputError: no node lies within two grasp radii (and 5 mm) of it.
+    """
+    if nodes is None:
+        return
+    off = float(np.linalg.norm(nodes - np.array(grasp.point_m), axis=1).min())
+    if off > 2 * grasp.radius_m + 5e-3:
+        place = ", ".join(f"{value:.4g}" for value in grasp.point_m)
+        raise InputError(
+            f"{name}: the grasp point ({place}) m lies {off * 1e3:.0f} mm from the branch.",
+            "The gripper would hold nothing: the point, or the whole recording, is in another "
+            "frame of reference or unit.",
+            "Give --grasp-point on the branch (in the frame that --coordinates says), and check "
+            "--unit.")
 
 
 def _require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
@@ -321,6 +342,7 @@ def _assembled(kind: str, source: Path, folder: Path, name: str, settings: Impor
     observation = {"rgbd": "depth", "clouds": "clouds"}.get(kind, "markers")
     entry = _entry(observation, source, settings, branch, rest, drive=settings.drive,
                    mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
+    _require_on_branch(entry.grasp, name, branch.nodes)
     return Pull(name, entry, robot.times, poses, wrenches, observations, tuple(messages))
 
 

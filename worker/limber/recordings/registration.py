@@ -1,7 +1,7 @@
 """Markers of a capture system onto their nominal places on the branch at rest."""
 
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations, permutations
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,8 @@ from limber.recordings.tables import LENGTH_UNITS_M, same_label, scale_of, split
 
 POOR_FIT_M = 5e-3
 """A rigid fit that leaves more than this at a marker is reported."""
+COLLINEAR = 0.03
+"""Extent across a line, over that along it, from which markers span a triangle."""
 _MOST_FOR_PERMUTATION = 7
 
 
@@ -88,7 +90,8 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
         name: Of the pull, for messages.
 
     Raises:
-        InputError: fewer than three markers in common.
+        InputError: fewer than three markers in common, one that has a nominal place is missing,
+            or they lie on a line, are mirrored, or are mistaken for each other.
     """
     pairs = [(k, j) for k, label in enumerate(labels) for j, known in enumerate(nominal_labels)
              if same_label(label, known) and np.isfinite(points[k]).all()]
@@ -104,6 +107,9 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
             "Use the recording's labels.")
     used = np.array([k for k, _ in pairs])
     target = nominal[[j for _, j in pairs]]
+    messages += _unpaired(labels, nominal_labels, pairs, name)
+    _require_body(target, name)
+    _require_same_body(points[used], target, [labels[k] for k in used], name)
     inlier = _consistent(points[used], target)
     rotation, shift = rigid_fit(points[used][inlier], target[inlier])
     residual = np.linalg.norm(points[used] @ rotation.T + shift - target, axis=1)
@@ -112,6 +118,60 @@ def register(points: np.ndarray, labels: list[str], nominal_labels: list[str],
             messages.append(f"{name}: marker {labels[k]} lies {off * 1e3:.1f} mm from its nominal "
                             f"place{'' if good else ' and was left out of the rigid fit'}.")
     return Registration(rotation, shift, used, residual, tuple(messages))
+
+
+def _unpaired(labels: list[str], nominal_labels: list[str], pairs: list[tuple[int, int]],
+              name: str) -> list[str]:
+    """Say which markers have no nominal place.
+
+    Raises:
+        InputError: one that has a place is not in the recording, or not in view at its start.
+    """
+    missing = [label for j, label in enumerate(nominal_labels) if j not in {j for _, j in pairs}]
+    if missing:
+        raise InputError(
+            f"{name}: {', '.join(missing)} has a nominal place, but is not in the recording's "
+            f"first frame; that has {', '.join(labels)}.",
+            "A marker that is missing, or has another name there, would be left out silently.",
+            "Correct its name in the table of nominal places, or take it out of the table.")
+    unknown = [label for k, label in enumerate(labels) if k not in {k for k, _ in pairs}]
+    if not unknown:
+        return []
+    return [f"{name}: no nominal place is known of {', '.join(unknown)}; left out."]
+
+
+def _require_body(target: np.ndarray, name: str) -> None:
+    """Raises InputError where markers lie on a line: a turn about it would not show."""
+    extent = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)
+    if extent[1] < max(COLLINEAR * extent[0], 1e-4):
+        raise InputError(f"{name}: the markers' nominal places lie on a line.",
+                         "How the recording is turned about that line cannot be told.",
+                         "Use a marker beside the line; three must span a triangle.")
+
+
+def _require_same_body(points: np.ndarray, target: np.ndarray, labels: list[str],
+                       name: str) -> None:
+    """Raises InputError where markers fit once they are mirrored, or two of them exchanged."""
+    rms = float(np.sqrt(np.mean(_residuals(points, target)**2)))
+    if rms <= POOR_FIT_M:
+        return
+    mirrored = float(np.sqrt(np.mean(_residuals(points * [1.0, 1.0, -1.0], target)**2)))
+    if mirrored < min(rms / 3, POOR_FIT_M):
+        raise InputError(
+            f"{name}: the markers fit their nominal places to {1e3 * mirrored:.1f} mm mirrored, "
+            f"and to {1e3 * rms:.0f} mm as they are.",
+            "An axis counts the other way in the recording or in the table.",
+            "Check the signs and the order of the axes (x, y, z right-handed).")
+    for first, second in combinations(range(len(points)), 2):
+        order = np.arange(len(points))
+        order[[first, second]] = second, first
+        swapped = float(np.sqrt(np.mean(_residuals(points, target[order])**2)))
+        if swapped < min(rms / 3, POOR_FIT_M):
+            raise InputError(
+                f"{name}: {labels[first]} and {labels[second]} fit to {1e3 * swapped:.1f} mm if "
+                f"they are exchanged, and to {1e3 * rms:.0f} mm as they are named.",
+                "They are mistaken for each other in the recording or in the table.",
+                "Exchange their names in the table of nominal places.")
 
 
 def rigid_fit(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -73,7 +73,7 @@ def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:
         return BranchFrame()
     loaded = settings.weight is not None or settings.load is not None
     return BranchFrame(branch.manifest.alignment, branch.gravity,
-                       load_mesh(branch).nodes if loaded else None)
+                       load_mesh(branch).nodes if loaded or branch.has("mesh.vtu") else None)
 
 
 def _digest(path: Path) -> str:

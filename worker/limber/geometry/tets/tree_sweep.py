@@ -22,6 +22,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 _FLAT = 0.02  # a tetrahedron's shape under that (1 is regular) is avoided
 _SHIFTS = (1, -1, 2, -2, 3, -3)  # where else a twig's slice may go, in its own lengths
 _CLAMP_SLICES = (1.0, 3.0)  # where the first slices end, in radii of the root
+_TAPERED, _THINNEST = 2.5, 0.06  # radius ratio from which rings are graded; down to which
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
 
@@ -249,6 +250,24 @@ class _TreeSweep:
         half = 1.25 * float(own.radius_at(where[out[0]]))
         return _Window(twig, place - half, place + half, outward)
 
+    def _is_tapered(self, axis: _Axis, low: float, high: float) -> bool:
+        radii = axis.radius_at(np.linspace(low, high, 20))
+        return bool(radii.max() > _TAPERED * radii.min())
+
+    def _graded(self, axis: _Axis, low: float, high: float) -> np.ndarray:
+        """Places of rings where the radius changes much: closer where it is thin.
+
+        Slices as long as suits the middle would be needles at a thin end, which look as if they
+        were folded over.
+        """
+        along = np.linspace(low, high, 400)
+        radii = axis.radius_at(along)
+        pitch = self._spacing * np.maximum(radii, _THINNEST * radii.max())
+        rings = np.concatenate([[0.0], np.cumsum((1 / pitch[1:] + 1 / pitch[:-1]) / 2
+                                                 * np.diff(along))])
+        count = max(round(float(rings[-1])), 1)
+        return np.interp(np.linspace(0, rings[-1], count + 1), rings, along)
+
     def _ring_places(self, axis: _Axis, start: float, windows: list[_Window]) -> np.ndarray:
         fixed = sorted({round(v, 12) for w in windows for v in (w.low, w.high)})
         marks = [start, *[v for v in fixed if start < v < axis.length], axis.length]
@@ -264,7 +283,10 @@ class _TreeSweep:
             size = self._spacing * float(axis.radius_at((low + high) / 2))
             within = any(a <= low + 1e-9 and high <= b + 1e-9 for a, b in inside)
             count = 1 if within else max(round((high - low) / size), 1)
-            places += list(np.linspace(low, high, count + 1)[1:])
+            between = np.linspace(low, high, count + 1)
+            if not within and self._is_tapered(axis, low, high):
+                between = self._graded(axis, low, high)
+            places += list(between[1:])
         if len(places) < 3:
             places = list(np.linspace(start, axis.length, 3))
         return np.array(places)
