@@ -122,7 +122,8 @@ def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
     """Their weight hangs on the base, and on the gripper that holds the branch where it is."""
     folder, _, full = generated
     place = tmp_path / "w.branch"
-    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_radius=0.1))
+    result = reconstruct(folder / "cloud.ply", place,
+                         ReconstructSettings(twig_radius=0.1, upright=True))
     assert result["left_out_twigs"] == 2 and result["branch_count"] == full["branch_count"]
     model = load_model(Branch.open(place))
     weight = np.linalg.norm(solve_static(model).require().base_force)

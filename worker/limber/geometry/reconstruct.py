@@ -10,9 +10,17 @@ from limber.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import Prepared, prepare
+from limber.geometry.left_out import (
+    leave_out_twigs,
+    tell_left_out,
+    touching_runs,
+    touching_texts,
+    twig_mass,
+)
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.plausibility import check_explained
 from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
@@ -84,6 +92,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     for text in prepared.warnings:
         progress.warn(text)
     found = _skeleton(prepared, settings, own, progress.part(0.02, 0.55))
+    if own is None:
+        check_explained(found, settings.unexplained)
     if prepared.view is not None and own is None:
         found, text = seen_skeleton(found, prepared, settings.silhouette_reach)
         if text:
@@ -117,12 +127,17 @@ def mesh_skeleton(skeleton: Skeleton, settings: ReconstructSettings,
     for text in meshed.warnings:
         progress.warn(text)
     masses += [twig_mass(kept, run, settings.density) for run in meshed.left_out]
+    tell_left_out(masses, float(meshed.mesh.volumes.sum()) * settings.density, settings, progress)
+    touching = touching_runs(kept)
+    for text in touching_texts(surface.handle_count, touching):
+        progress.warn(text)
     mesh = mark(meshed.mesh, kept, young=settings.young, poisson=settings.poisson,
                 density=settings.density, fractions=FRACTIONS,
                 grasp_fraction=settings.grasp_fraction)
     progress(1.0, "mesh", tets=mesh.tet_count)
     numbers = _numbers(skeleton, surface, check.as_dict(), meshed, kept) | {
-        "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses)}
+        "left_out_mass_kg": sum(m["mass_kg"] for m in masses), "left_out_twigs": len(masses),
+        "surface_handles": surface.handle_count, "touching": touching}
     return MeshedBranch(skeleton, surface, mesh, masses, numbers)
 
 
@@ -141,43 +156,6 @@ def _numbers(skeleton: Skeleton, surface: Surface, check: dict[str, Any], meshed
         "tet_count": meshed.mesh.tet_count, "mesh_node_count": meshed.mesh.node_count,
         "mesher": meshed.mesher, "watertight": check["watertight"], "surface_check": check,
         "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb()}
-
-
-def leave_out_twigs(skeleton: Skeleton, settings: ReconstructSettings,
-                    ) -> tuple[Skeleton, list[dict[str, Any]]]:
-    """Cut off thin or high-order side twigs; their mass stays, at their place.
-
-    Returns:
-        The skeleton to mesh, and for each twig cut off ``mass_kg``, its ``centre_m`` and
-        ``attached_m``, the point on the kept axis that carries it.
-    """
-    keep = np.ones(skeleton.node_count, bool)
-    masses: list[dict[str, Any]] = []
-    for run, members in enumerate(skeleton.runs()[1:], start=1):
-        own = members[1:]
-        carried = not keep[members[0]]
-        thin = float(np.median(skeleton.radius[own])) < settings.twig_radius
-        if not (carried or thin or skeleton.order[own[0]] > settings.twig_order):
-            continue
-        keep[own] = False
-        masses.append(twig_mass(skeleton, run, settings.density, keep))
-    return (skeleton, []) if keep.all() else (skeleton.subset(keep), masses)
-
-
-def twig_mass(skeleton: Skeleton, run: int, density: float, keep: np.ndarray | None = None,
-              ) -> dict[str, Any]:
-    """Return mass [kg], centre and place of attachment [m] of a run that is not meshed."""
-    members = skeleton.runs()[run]
-    own, base = members[1:], members[0]
-    while keep is not None and not keep[base]:
-        base = skeleton.parent[base]
-    up = skeleton.parent[own]
-    length = np.linalg.norm(skeleton.nodes[own] - skeleton.nodes[up], axis=1)
-    volume = np.pi * skeleton.radius[own]**2 * length
-    centre = np.average((skeleton.nodes[own] + skeleton.nodes[up]) / 2, axis=0,
-                        weights=np.maximum(volume, 1e-300))
-    return {"mass_kg": float(density * volume.sum()), "centre_m": centre.tolist(),
-            "attached_m": skeleton.nodes[base].tolist(), "branch": run}
 
 
 def peak_memory_mb() -> float:

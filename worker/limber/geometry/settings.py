@@ -55,7 +55,7 @@ class SkeletonSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "shape": ("contraction_points", "gap_factor", "bridge_limit", "prune", "plants",
-            "radius_low", "radius_high"),
+            "radii", "radius_low", "radius_high"),
     }
     experts = ("contraction_points", "gap_factor", "bridge_limit", "radius_low", "radius_high")
 
@@ -70,6 +70,9 @@ class SkeletonSettings(Settings):
         "the carrier's axis.")
     plants: Literal["refuse", "largest", "joined"] = Field(
         "refuse", description="Two plants in one cloud: refuse, take the largest, or join them.")
+    radii: Literal["fit", "paper"] = Field(
+        "fit", description="Radii fitted together with the axes, or the paper's median distance "
+        "of the nearest points.")
     radius_low: float = Field(
         5e-4, ge=0, description="Radii are limited from below at this share of the diagonal.")
     radius_high: float = Field(
@@ -100,7 +103,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
-        "shape": ("twig_radius", "twig_order"),
+        "shape": ("twig_radius", "twig_order", "unexplained", "leave_out"),
         "material": ("young", "poisson", "density"),
         "mesh": ("grasp_fraction",),
     }
@@ -111,7 +114,14 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     root: tuple[float, float, float] | None = Field(
         None, description="A point near the root, in the file's coordinates; else the thick end.")
     upright: bool = Field(
-        True, description="Turn the branch so that it grows along z; gravity is turned with it.")
+        False, description="As in the paper, turn the branch so that it grows along z, and gravity "
+        "with it; else the scan's own up stays up.")
+    unexplained: float = Field(
+        0.3, ge=0, le=1, description="Refuse a scan of whose points a larger share lies on no "
+        "round axis (leaves); 1 takes all.")
+    leave_out: bool = Field(
+        False, description="Accept a mesh without twigs that hold over 3 % of the mass; their "
+        "mass is kept.")
     twig_radius: float = Field(
         0.0, ge=0, description="Leave out twigs thinner than that [m], keep their mass.")
     twig_order: int = Field(

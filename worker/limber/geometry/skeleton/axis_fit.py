@@ -48,13 +48,15 @@ class AxisFit:
 
 
 def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
-             uncertainty: bool = True, progress: Progress = SILENT) -> AxisFit:
+             settled: bool = False, uncertainty: bool = True, progress: Progress = SILENT,
+             ) -> AxisFit:
     """Fit axes and radii of a skeleton's runs to points.
 
     Args:
         skeleton: Where the axes about are, with first radii; its topology is kept.
         points: Scanned points [m], shape [m, 3].
         rounds: Gauss-Newton rounds; points choose their cylinder anew in each.
+        settled: The axes are where they belong: what is left to find is fine.
         uncertainty: Find each radius's standard deviation too; without, it and the states stay
             as they were.
         progress: Called each round.
@@ -66,10 +68,10 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
         # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
         noise = max(_robust_sigma(match.residual, radius[match.segment]), 1e-4 * floor)
-        spread = max(noise, 0.6 * spread)
+        spread = noise if settled else max(noise, 0.6 * spread)
         weight = _tukey(match.residual, _limit(spread, noise, radius[match.segment]))
         # While axes are still far off, the misfit is no noise that smoothing could help against.
-        trusted = noise if number > rounds // 2 else 0.0
+        trusted = noise if settled or number > rounds // 2 else 0.0
         place = match.normal
         if trusted:
             place = _places(skeleton.parent, nodes, match, weight, noise)
@@ -215,17 +217,19 @@ def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
     """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
 
     A run is no thicker than its carrier where it starts, nor ``growth`` times its own median so
-    far: a bunch of twigs that the scan did not resolve would otherwise become a fat cylinder.
+    far, nor at its tip than that median: a bunch of twigs that the scan did not resolve would
+    otherwise become a fat cylinder.
     """
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
     for run, members in enumerate(skeleton.runs()):
         own = members if run == 0 else members[1:]
         carrier = members[0]
-        cap = np.inf if run == 0 else 1.1 * max(radius[carrier], radius[skeleton.parent[carrier]])
+        cap = np.inf if run == 0 else max(radius[carrier], radius[skeleton.parent[carrier]])
         for place, node in enumerate(own):
             # The first few are too few to speak for the run: a cut stem starts with a ragged end.
             if place >= max(6, len(own) // 8):
-                cap = min(cap, growth * float(np.median(radius[own[:place]])))
+                allowed = growth + (1 - growth) * place / len(own)
+                cap = min(cap, allowed * float(np.median(radius[own[:place]])))
             if radius[node] > cap:
                 radius[node], state[node] = cap, LIMITED
     return replace(skeleton, radius=radius, radius_state=state)

@@ -86,7 +86,8 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
     """Write one cylinder for each node but the root, as CSV in metres.
 
     Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
-    standard deviation, and its state (0 measured, 1 limited, 2 interpolated).
+    standard deviation, its state (0 measured, 1 limited, 2 interpolated, 3 unresolved,
+    4 bridged), and the probability that the node is there.
     """
     start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
     length = np.linalg.norm(end - start, axis=1)
@@ -94,14 +95,33 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
     with open(path, "w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow("id parent sx sy sz ex ey ez radius length ax ay az branch order "
-                        "radius_sigma radius_state".split())
+                        "radius_sigma radius_state probability".split())
         for i in range(len(end)):
             node = i + 1
             numbers = [*start[i], *end[i], skeleton.radius[node], length[i], *axis[i]]
             up = skeleton.parent[node] - 1
             writer.writerow([i, up, *(f"{v:.9g}" for v in numbers), skeleton.branch[node],
                              skeleton.order[node], f"{skeleton.radius_sigma[node]:.3g}",
-                             skeleton.radius_state[node]])
+                             skeleton.radius_state[node],
+                             f"{skeleton.probability[node]:.3f}"])
+
+
+def read_fitted(path: Path) -> Skeleton:
+    """Read what :func:`write_cylinders` wrote, with deviations, states and probabilities."""
+    skeleton = read_cylinders(path)
+    rows = list(csv.DictReader(_lines(path)))
+    if not rows or "probability" not in rows[0]:
+        raise InputError(f"{path} has no radius_sigma, radius_state and probability.",
+                         "It was written by another program or an older Limber.",
+                         "Reconstruct the scan again.")
+    if len(rows) != skeleton.node_count - 1:
+        return skeleton  # nodes at one place were merged: what belongs to which is not known
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in (
+        "radius_sigma", "radius_state", "probability")}
+    first = {name: np.concatenate([values[:1], values]) for name, values in columns.items()}
+    return Skeleton.from_edges(
+        skeleton.nodes, skeleton.parent, skeleton.radius, radius_sigma=first["radius_sigma"],
+        radius_state=first["radius_state"].astype(np.int8), probability=first["probability"])
 
 
 def _lines(path: Path) -> list[str]:

@@ -20,7 +20,7 @@ _BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not see
 _FEW = 0.12  # share of points there that noise can put
 _FRONT, _EDGE = np.deg2rad(40.0), np.deg2rad(65.0)
 _ALONG = 0.65  # scatter at the edges over that in front, under which it is along the sight alone
-_GRAZING = np.deg2rad(84.0)  # beyond that no sensor sees a surface
+_GRAZING = np.deg2rad(81.0)  # beyond about that no sensor sees a surface
 _LEAST_SEEN = 0.01
 _ANGLE = 2 * np.pi * (np.arange(_PLACES) + 0.5) / _PLACES
 

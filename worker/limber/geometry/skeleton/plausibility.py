@@ -117,14 +117,40 @@ def warnings(result: Any) -> list[str]:
     if result.second_base is not None:
         texts.append(f"The plant stands on a second base, at {_place(result.second_base)}: two "
                      "plants that touch? Cut out one of them (--crop-low, --crop-high).")
-    # Leaves make noise look large: what lies a whole radius off is on no axis, whatever noise is.
-    radius = result.skeleton.radius[result.node_of_point]
-    misfit = float(np.mean(np.abs(result.residual) > np.clip(
-        3 * result.noise, 0.4 * radius, radius)))
+    if result.other_root is not None:
+        texts.append(f"The end at {_place(result.other_root)} is about as likely the root as that "
+                     "at the origin: name it (--root) if it is.")
+    misfit = unexplained_share(result)
     if misfit > 0.15:
         texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
                      "pixels or a second plant? Radii there mean little.")
     return texts
+
+
+def unexplained_share(result: Any) -> float:
+    """Share of points that lie on no round axis: leaves, flying pixels, a second plant."""
+    # Leaves make noise look large: what lies a whole radius off is on no axis, whatever noise is.
+    radius = result.skeleton.radius[result.node_of_point]
+    return float(np.mean(np.abs(result.residual) > np.clip(3 * result.noise, 0.4 * radius, radius)))
+
+
+def check_explained(result: Any, limit: float) -> None:
+    """Refuse a scan much of which lies on no round axis.
+
+    Args:
+        result: The skeleton with the residuals of its points.
+        limit: Share of points that may lie on none.
+
+    Raises:
+        InputError: more do.
+    """
+    share = unexplained_share(result)
+    if share > limit:
+        raise InputError(
+            f"{100 * share:.0f} % of the points lie on no round axis (allowed: "
+            f"{100 * limit:.0f} %).", "Leaves, foliage or a second plant would become rods, and "
+            "radii mean little there.", "Cut the leaves out of the scan (--crop-low, --crop-high, "
+            "or in another program), or accept the axes as they come (--unexplained 1).")
 
 
 def _place(point: np.ndarray) -> str:

@@ -7,8 +7,9 @@ import numpy as np
 
 from limber.errors import InputError
 
-MEASURED, LIMITED, INTERPOLATED = 0, 1, 2
-"""Values of ``radius_state``: fitted to points, limited to the cloud's scale, or filled in."""
+MEASURED, LIMITED, INTERPOLATED, UNRESOLVED, BRIDGED = 0, 1, 2, 3, 4
+"""Values of ``radius_state``: fitted to points, limited to the cloud's scale, filled in, too
+thin for the scan's points and noise, or in a gap."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class Skeleton:
         radius_sigma: Standard deviation of each radius [m], shape [n]; 0 where unknown.
         branch: Index of the unforked run that each node belongs to, shape [n]; 0 is the main one.
         order: Branching order, 0 for the main run, shape [n].
-        radius_state: ``MEASURED``, ``LIMITED`` or ``INTERPOLATED``, shape [n].
+        radius_state: ``MEASURED``, ``LIMITED``, ``INTERPOLATED``, ``UNRESOLVED`` or ``BRIDGED``,
+            shape [n].
+        probability: That the node is there at all, shape [n]; 1 where nobody doubted.
     """
 
     nodes: np.ndarray
@@ -32,6 +35,7 @@ class Skeleton:
     branch: np.ndarray = field(default=None)
     order: np.ndarray = field(default=None)
     radius_state: np.ndarray = field(default=None)
+    probability: np.ndarray = field(default=None)
 
     def __post_init__(self) -> None:
         count = len(self.nodes)
@@ -39,6 +43,8 @@ class Skeleton:
             object.__setattr__(self, "radius_sigma", np.zeros(count))
         if self.radius_state is None:
             object.__setattr__(self, "radius_state", np.zeros(count, np.int8))
+        if self.probability is None:
+            object.__setattr__(self, "probability", np.ones(count))
         if self.branch is None or self.order is None:
             branch, order = _runs(self.parent, self._edge_lengths())
             object.__setattr__(self, "branch", branch)
@@ -145,8 +151,8 @@ class Skeleton:
         parent = self.parent[keep]
         parent = np.where(parent < 0, -1, new_index[parent])
         return Skeleton.from_edges(
-            self.nodes[keep], parent, self.radius[keep],
-            radius_sigma=self.radius_sigma[keep], radius_state=self.radius_state[keep])
+            self.nodes[keep], parent, self.radius[keep], radius_sigma=self.radius_sigma[keep],
+            radius_state=self.radius_state[keep], probability=self.probability[keep])
 
     def write_swc(self, path: Path) -> None:
         """Write an SWC file, in metres as its header says; type 5 is a fork, 6 a tip, 0 else."""

@@ -13,10 +13,12 @@ from limber.geometry.skeleton.axis_fit import (
     attached,
     fit_axes,
     limited,
+    median_radii,
     nearest_cylinders,
     resampled,
     tapered,
 )
+from limber.geometry.skeleton.confidence import assessed, shares
 from limber.geometry.skeleton.contraction import Contraction, ContractionStatus, contract
 from limber.geometry.skeleton.curve_graph import (
     CurveGraph,
@@ -39,6 +41,11 @@ from limber.progress import SILENT, Progress
 FIT_POINT_LIMIT = 60_000
 """More points than that do not make the fit better, only slower."""
 
+_ROOT_SHARE = 0.45  # of the thickest end, from which an end may be the root
+_ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and share of height, that tell
+_ROOT_EVEN = 1.0  # by which two ends may differ, in these, and be as likely
+_NOISY = 0.2  # of the median radius
+
 LEAF_SHARE = 0.5
 """Share of points over two radii off their axis from which a scan shows leaves, not branches."""
 
@@ -58,6 +65,7 @@ class SkeletonResult:
         loops: Lengths [m] of closed loops that were opened.
         pruned: Number of spurs pruned.
         second_base: Where the plant seems to stand on the ground a second time [m], shape [3].
+        other_root: An end that is about as likely the root [m], shape [3].
     """
 
     skeleton: Skeleton
@@ -70,6 +78,7 @@ class SkeletonResult:
     loops: list[float] = field(default_factory=list)
     pruned: int = 0
     second_base: np.ndarray | None = None
+    other_root: np.ndarray | None = None
 
     @property
     def warnings(self) -> list[str]:
@@ -81,15 +90,18 @@ class SkeletonResult:
         bridges = [bridge | {"from": move(bridge["from"][None])[0],
                              "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
         split_off = [piece | {"at": move(piece["at"][None])[0]} for piece in self.split_off]
-        base = None if self.second_base is None else move(self.second_base[None])[0]
+        base, other = (None if place is None else move(place[None])[0]
+                       for place in (self.second_base, self.other_root))
         return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
-                       bridges=bridges, split_off=split_off, second_base=base)
+                       bridges=bridges, split_off=split_off, second_base=base, other_root=other)
 
     def report(self) -> dict[str, Any]:
         """Numbers for the stage's result."""
         return {"contraction_iterations": self.contraction.iterations,
                 "contraction_status": self.contraction.status, "noise_m": self.noise,
-                "bridges": self.bridges, "split_off": self.split_off,
+                "bridges": self.bridges, "length_shares": shares(self.skeleton),
+                "doubtful_run_count": len({int(run) for run in self.skeleton.branch[
+                    self.skeleton.probability < 0.5]}), "split_off": self.split_off,
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 
 
@@ -121,14 +133,14 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                         bridge_limit=settings.bridge_limit * diagonal, up=up,
                         join_plants=settings.plants == "joined")
     check_one_plant(graph, len(thin), diagonal, settings.plants)
-    start = _root_node(graph, points[thin], root, up, settings.prune)
+    start, other_root = _root_node(graph, points[thin], root, up, settings.prune)
     if is_sparse(points[thin], contraction.drawn):
         thin, loops, base = thinned(points, POINT_LIMIT), graph.loops, graph.nodes[start]
         graph = level_graph(
             points[thin], base, gap_factor=settings.gap_factor, up=up,
             bridge_limit=settings.bridge_limit * diagonal, join_plants=settings.plants == "joined")
         graph.loops = loops
-        start = _root_node(graph, points[thin], base, up, settings.prune)
+        start, _ = _root_node(graph, points[thin], base, up, settings.prune)
     first, pruned = _first_skeleton(graph, settings, start)
     some = points if len(points) <= FIT_POINT_LIMIT else points[thinned(points, FIT_POINT_LIMIT)]
     if (graph.owner < 0).any():
@@ -143,14 +155,20 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
             points[thin], base, gap_factor=settings.gap_factor, up=up,
             width=float(np.median(graph.thickness)), join_plants=settings.plants == "joined",
             bridge_limit=settings.bridge_limit * diagonal)
-        start = _root_node(graph, points[thin], base, up, settings.prune)
+        start, _ = _root_node(graph, points[thin], base, up, settings.prune)
         first, pruned = _first_skeleton(graph, settings, start)
         fitted, more = _through_leaves(first, some, fitted, settings, diagonal), 0
+        segment, residual = nearest_cylinders(fitted.skeleton, points)
+    if settings.radii == "paper":
+        radius = median_radii(fitted.skeleton, points)
+        low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
+        fitted = replace(fitted, skeleton=limited(
+            replace(fitted.skeleton, radius=radius), low, high))
         segment, residual = nearest_cylinders(fitted.skeleton, points)
     result = SkeletonResult(
         fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
         graph.split_off, graph.loops, pruned + more,
-        second_base(fitted.skeleton, up))
+        second_base(fitted.skeleton, up), other_root)
     progress(1.0, "skeleton", nodes=fitted.skeleton.node_count)
     return result
 
@@ -194,24 +212,41 @@ def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, start: int,
 
 
 def _root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, up: np.ndarray,
-               prune: float) -> int:
-    """The tip nearest to ``root``, or the tip of the thickest end; of several the lowest.
+               prune: float) -> tuple[int, np.ndarray | None]:
+    """The end nearest to ``root``, or the lowest of the thick ends; and one that is as likely.
 
     How thick an end is, its smallest extent tells together with how far its points were drawn: a
     leaf is wide, but flat. An end that is shorter than it is thick is a spur, not an end.
     """
     degree = np.bincount(graph.edges.ravel(), minlength=len(graph.nodes))
     tips = np.flatnonzero(degree == 1)
-    if root is not None:
-        return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))])
     # Spurs would end the walk from a tip early: pruned as from the lowest tip, for now.
-    parent = rooted(graph.nodes, graph.edges, int(tips[np.argmin(graph.nodes[tips] @ up)]))
+    first = int(tips[np.argmin(graph.nodes[tips] @ up)])
+    parent = rooted(graph.nodes, graph.edges, first)
     keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
     neighbours: list[list[int]] = [[] for _ in graph.nodes]
     for node in np.flatnonzero(keep & (parent >= 0)):
         neighbours[node].append(int(parent[node]))
         neighbours[parent[node]].append(int(node))
     tips = np.array([node for node, near in enumerate(neighbours) if len(near) == 1])
+    if root is not None:
+        return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))]), None
+    thick = _end_thickness(graph, points, neighbours, tips)
+    able = thick >= _ROOT_SHARE * thick.max()
+    height = graph.nodes[tips] @ up / np.linalg.norm(up)
+    chosen = int(np.argmin(np.where(able, height, np.inf)))
+    # As likely: about as low and as thick, or thicker by more than it is higher.
+    odds = np.log(np.maximum(thick, 1e-12) / max(thick[chosen], 1e-12)) / _ROOT_THICK - (
+        height - height[chosen]) / (_ROOT_HEIGHT * max(float(np.ptp(height)), 1e-12))
+    odds[chosen] = -np.inf
+    rival = int(np.argmax(odds)) if len(tips) > 1 else chosen
+    other = graph.nodes[tips[rival]] if odds[rival] > -_ROOT_EVEN else None
+    return int(tips[chosen]), other
+
+
+def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[int]],
+                   tips: np.ndarray) -> np.ndarray:
+    """How thick each end is [m], shape [tips]; 0 for spurs."""
     reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
     thick = np.zeros(len(tips))
     for place, tip in enumerate(tips):
@@ -221,8 +256,7 @@ def _root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, u
         if len(mine) >= 4 and length > 2 * float(np.median(graph.thickness[chain])):
             least = np.sqrt(max(np.linalg.eigvalsh(np.cov(mine.T))[0], 0.0))
             thick[place] = np.sqrt(least * float(np.median(graph.thickness[chain])))
-    candidates = tips[thick >= 0.45 * thick.max()]
-    return int(candidates[np.argmin(graph.nodes[candidates] @ up)])
+    return thick
 
 
 def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
@@ -238,9 +272,14 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     skeleton = resampled(limited(skeleton, low, high), 1.0)
     fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.5, 0.8))
     skeleton, late = _without_strands(fit.skeleton)
-    fit = fit_axes(skeleton, points, rounds=6 if late else 0, progress=progress.part(0.8, 1.0))
+    # Noise leaves little information a round.
+    noisy = fit.noise > _NOISY * float(np.median(skeleton.radius))
+    rounds = 18 if noisy else 6 if late else 0
+    fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late,
+                   progress=progress.part(0.8, 1.0))
     pruned += strands + late
-    return replace(fit, skeleton=tapered(limited(fit.skeleton, low, high))), pruned
+    return replace(fit, skeleton=assessed(tapered(limited(fit.skeleton, low, high)), points,
+                                          fit.noise)), pruned
 
 
 def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+_SAME = 1e-13  # of the coordinates: nodes that close are at one place
+
 
 def tangents(points: np.ndarray) -> np.ndarray:
     """Unit tangents of a polyline by central differences, shape [n, 3]."""
@@ -40,6 +42,8 @@ def frames(points: np.ndarray, tangent: np.ndarray, normal: np.ndarray | None = 
     for i in range(len(points) - 1):
         across = points[i + 1] - points[i]
         square = across @ across
+        if square < _SAME**2 * max(float(points[i] @ points[i]), 1e-300):
+            across, square = tangent[i], 1.0  # two nodes at one place: on along the tangent
         reflected = normals[i] - (2 / square) * (across @ normals[i]) * across
         turned = tangent[i] - (2 / square) * (across @ tangent[i]) * across
         second = tangent[i + 1] - turned

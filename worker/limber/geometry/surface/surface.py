@@ -32,6 +32,12 @@ class Surface:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0)
 
+    @property
+    def handle_count(self) -> int:
+        """Handles of a closed surface in one piece (its genus): 0 for a tree, 1 for a ring."""
+        used = len(np.unique(self.faces))
+        return max(round((2 - used + len(self.faces) / 2) / 2), 0)
+
     def write_ply(self, path: Path) -> None:
         """Write a binary PLY file, in double precision: rounding could make faces cross."""
         from plyfile import PlyData, PlyElement

@@ -1,0 +1,61 @@
+"""What a scan leaves open is said: gaps, unresolved twigs, doubtful ones."""
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.confidence import assessed, shares
+from limber.geometry.skeleton.files import read_fitted, write_cylinders
+from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, UNRESOLVED, Skeleton
+
+
+def _tube(low, high, radius, count, seed=0):
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle),
+                     rng.uniform(low, high, count)], axis=1)
+
+
+def _stem(radius: float, twig: float) -> Skeleton:
+    """A stem of 0.4 m along z, and a twig along x from its middle."""
+    z = np.linspace(0, 0.4, 41)
+    x = np.linspace(0, 0.1, 21)[1:]
+    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
+                       np.stack([x, 0 * x, 0 * x + 0.2], axis=1)])
+    parent = np.concatenate([np.arange(41) - 1, [20], 41 + np.arange(19)])
+    return Skeleton.from_edges(nodes, parent, np.repeat([radius, twig], [41, 20]))
+
+
+def _twig_points(radius: float, count: int) -> np.ndarray:
+    return _tube(0.008, 0.1, radius, count, seed=1)[:, [2, 1, 0]] + [0, 0, 0.2]
+
+
+def test_gaps_and_thin_twigs_are_said(tmp_path) -> None:
+    """A stretch without points is bridged; a twig under three spacings is unresolved, and its
+    interval is wide; the file keeps it all."""
+    points = np.vstack([_tube(0, 0.08, 0.008, 1500), _tube(0.14, 0.4, 0.008, 4500, seed=2),
+                        _twig_points(0.002, 40)])
+    told = assessed(_stem(0.008, 0.004), points, 0.0003)
+    z, stem = told.nodes[:, 2], told.branch == 0
+    assert set(told.radius_state[stem & (z > 0.09) & (z < 0.13)]) == {BRIDGED}
+    assert set(told.radius_state[stem & (z > 0.16)]) == {MEASURED}
+    twig = told.branch == 1
+    assert set(told.radius_state[twig][10:]) <= {UNRESOLVED, BRIDGED}
+    assert (told.radius_sigma[twig] > 0.2 * told.radius[twig])[10:].all()
+    share = shares(told)
+    assert sum(share.values()) == pytest.approx(1) and 0.08 < share["bridged"] < 0.2
+    write_cylinders(told, tmp_path / "s.csv")
+    back = read_fitted(tmp_path / "s.csv")
+    np.testing.assert_array_equal(back.radius_state[1:], told.radius_state[1:])
+    np.testing.assert_allclose(back.probability[1:], told.probability[1:], atol=6e-4)
+
+
+def test_a_twig_with_more_points_is_surer() -> None:
+    """Probability grows with the points; a stem is sure; a carrier is no less sure than its twig.
+    """
+    sure = []
+    for count in (4, 60, 900):
+        points = np.vstack([_tube(0, 0.4, 0.008, 6000), _twig_points(0.004, count)])
+        told = assessed(_stem(0.008, 0.004), points, 0.0003)
+        assert (told.probability[told.branch == 0] == 1).all()
+        sure.append(float(told.probability[told.branch == 1][0]))
+    assert sure[0] < sure[1] < sure[2] < 1 and sure[2] > 0.95
