@@ -12,6 +12,7 @@ from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
 from limber.mechanics.settings import SimulateSettings
 from limber.mechanics.simulate import load_case_of, motion_of
+from limber.progress import Progress
 from limber.recordings.alignment import frames_of
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import GraspEntry, PullEntry
@@ -22,6 +23,9 @@ MOVE = np.array([0.05, -0.03, -0.02])
 GRAVITY = (0.0, -6.0, -7.76)
 """Of a branch that was turned upright."""
 YOUNG = 6e7
+
+REFUSING = Progress(on_warning=pytest.fail)
+"""No door has anything to warn of."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +49,7 @@ def folder(tmp_path_factory, small):
 def expected(folder):
     """The loaded branch itself: pose, energy, force and where the flower is."""
     branch = Branch.open(folder)
-    loaded = load_branch(branch, gravity=True, warn=pytest.fail)
+    loaded = load_branch(branch, gravity=True, progress=REFUSING)
     grasp = loaded.marked_grasp("pinned")
     pose = grasp.rest_pose + np.r_[MOVE, np.zeros(3)]
     state = loaded.equilibrium(grasp, pose).require()
@@ -61,7 +65,7 @@ def agree(energy, force, state):
 def test_weight_matters_here(folder, expected):
     """Without weight force and energy are others: doors that left it out would be found out."""
     grasp, pose, state, _ = expected
-    bare = load_branch(Branch.open(folder), gravity=False, warn=pytest.fail)
+    bare = load_branch(Branch.open(folder), gravity=False, progress=REFUSING)
     light = bare.equilibrium(grasp, pose).require()
     assert abs(light.energy / state.energy - 1) > 0.01
     assert np.abs(light.reaction_force - state.reaction_force).max() > 0.01 * np.abs(
@@ -73,7 +77,7 @@ def test_simulate(folder, expected):
     grasp, _, state, _ = expected
     settings = SimulateSettings(kind="static", move=tuple(MOVE), frame_rate=3,
                                 grasp_mode="pinned")
-    loaded = load_branch(Branch.open(folder), gravity=True, warn=pytest.fail)
+    loaded = load_branch(Branch.open(folder), gravity=True, progress=REFUSING)
     motion = motion_of(load_case_of(loaded.model, settings, None, grasp.centre), settings)
     assert motion.energy[0] == 0.0
     agree(motion.energy[-1], motion.grasp_force[-1], state)
@@ -82,7 +86,7 @@ def test_simulate(folder, expected):
 def test_energy_and_plan(folder, expected):
     """The model of the energy field and of planned paths."""
     _, pose, state, _ = expected
-    model = load_grasp_model(Branch.open(folder), gravity=True, warn=pytest.fail)
+    model = load_grasp_model(Branch.open(folder), gravity=True, progress=REFUSING)
     np.testing.assert_allclose(model.rest_position, pose[:3] - MOVE, atol=1e-12)
     found = model.follow(pose[None, :3], model.rest.displacement)[0]
     agree(model.energy(found), found.reaction_force, state)
@@ -126,7 +130,7 @@ def test_virtual_pull(folder, expected):
                                    poisson=0.35, density=900.0, phase=0.3)
     pull, moved = simulate_pull(truth, "virtual", settings)
     assert not pull.entry.weightless and pull.entry.gravity_m_s2 is None
-    loaded = load_branch(branch, gravity=True, warn=pytest.fail)
+    loaded = load_branch(branch, gravity=True, progress=REFUSING)
     bare = loaded.model.without_point_masses()  # the flower is not in the truth
     grasp = grasp_on(loaded.mesh, pull.entry.grasp)
     state = replace(loaded, model=bare).equilibrium(grasp, pull.poses[-1], start=moved[-1])

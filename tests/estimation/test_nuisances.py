@@ -53,7 +53,7 @@ def objective_of(bench, pull, poisson=0.36):
 @pytest.fixture(scope="module")
 def found(small_bench, bad_cell):
     objective = objective_of(small_bench, bad_cell)
-    return fit_pulls(objective, objective.space.base, SETTINGS, lambda _message: None)
+    return fit_pulls(objective, objective.space.base, SETTINGS)
 
 
 def test_elimination_is_the_joint_least_squares_problem():

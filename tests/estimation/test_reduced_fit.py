@@ -12,6 +12,7 @@ from limber.estimation.fit import fit_pulls
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.reduced_fit import CorrectedForward, Reduction
 from limber.estimation.settings import EstimateSettings
+from limber.progress import Progress
 from limber.stages.estimate import estimate
 
 SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=16)
@@ -32,7 +33,8 @@ def noisy(small_pull):
 
 def fit(bench, pulls, settings, **kept):
     objective, messages = bench.objective(pulls, settings), []
-    found = fit_pulls(objective, objective.space.base, settings, messages.append, **kept)
+    found = fit_pulls(objective, objective.space.base, settings,
+                      Progress(on_warning=messages.append), **kept)
     found.warnings = messages
     return found
 
@@ -67,7 +69,7 @@ def test_a_basis_around_wrong_moduli_is_made_again(thick, small_pull):
     reduction.build(values)
     before = reduction.bases[0]
     found, _ = reduced_fit.fit_reduced(objective, np.log(values.young), gauss_newton,
-                                       gauss_newton, reduction, lambda _message: None)
+                                       gauss_newton, reduction)
     assert reduction.bases[0] is not before
     assert np.abs(np.exp(found.evaluation.free) / full.values.young - 1).max() < 2e-3
 

@@ -56,9 +56,9 @@ def fitted(scanned, pull, **settings):
     if settings.get("gravity", True):
         # The truth has no fruit.
         start = replace(start, model=start.model.without_point_masses())
-    forwards = forwards_of([pull], start, about, lambda _message: None)
+    forwards = forwards_of([pull], start, about)
     objective = Objective(forwards, ParameterSpace.separate(start.start), force_sigma=[0.01])
-    return fit_pulls(objective, start.start, about, lambda _message: None).values.young
+    return fit_pulls(objective, start.start, about).values.young
 
 
 def test_estimate_knows_that_the_branch_hangs(scanned, pull):
@@ -72,7 +72,7 @@ def test_estimate_knows_that_the_branch_hangs(scanned, pull):
 def test_forward_derivatives_under_weight(scanned, pull):
     """Positions and forces to log E and log density against central differences, fruit and all."""
     start = subject(scanned)
-    forward = forwards_of([pull], start, EstimateSettings(**SETTINGS), lambda _message: None)[0]
+    forward = forwards_of([pull], start, EstimateSettings(**SETTINGS))[0]
     assert isinstance(forward, QuasiStaticForward)
     values = replace(start.start, young=TRUTH)
     found = forward.simulate(values, ("density",), True)

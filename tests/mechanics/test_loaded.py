@@ -10,6 +10,7 @@ from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.loaded import NamedTarget, hang, target_masses
 from limber.mechanics.model import BranchModel
+from limber.progress import Progress
 
 GRAVITY = (0.0, -9.81, 0.0)
 
@@ -29,7 +30,7 @@ def loaded(mesh):
                NamedTarget("leaf", (0.012, 0.0, 0.15)))
     model = BranchModel(mesh, young=2e8, poisson=0.35, density=900.0, gravity=GRAVITY,
                         point_masses=target_masses(targets))
-    return hang(model, targets, warn=refuse)
+    return hang(model, targets, progress=Progress(on_warning=refuse))
 
 
 def test_targets_are_where_they_were_put_and_follow(loaded):
@@ -57,7 +58,7 @@ def test_what_cannot_carry_itself_is_told_and_has_no_weight():
     mesh = box_mesh((0.012, 0.012, 0.6), (1, 1, 30))
     told = []
     model = BranchModel(mesh, young=1e7, poisson=0.35, density=900, gravity=(0, 0, -9.81))
-    branch = hang(model, warn=told.append)
+    branch = hang(model, progress=Progress(on_warning=told.append))
     assert len(told) == 1
     assert "too soft to carry" in told[0]
     assert branch.model.weight_stiffness is None
@@ -81,7 +82,7 @@ def test_a_grasp_is_a_place_whatever_the_mesh(mode):
     for slices in (24, 31, 37):
         mesh = straight_beam(0.3, 0.006, 0.005, slice_count=slices)
         branch = hang(BranchModel(mesh, young=2e8, poisson=0.35, density=900.0, gravity=GRAVITY),
-                      warn=refuse)
+                      progress=Progress(on_warning=refuse))
         grasp = Grasp.at(mesh, point, 0.012, mode)
         np.testing.assert_allclose(grasp.centre, point, atol=1e-12)
         pose = grasp.rest_pose + [0.03, 0.02, -0.01, 0, 0, 0]

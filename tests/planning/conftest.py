@@ -13,6 +13,7 @@ from limber.mechanics.loaded import hang
 from limber.planning.compare import PlanSettings
 from limber.planning.field import GraspSamples, fit_field
 from limber.planning.grasp_model import grasp_model_of
+from limber.progress import Progress
 from limber.stages.energy import EnergySettings, sample_energy_field
 from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
@@ -102,8 +103,8 @@ def small_model(small_mesh, small_skeleton):
 def small_grasp_model(mesh, skeleton, gravity):
     """What planning asks of the small branch, under a gravity [m/s^2] or without weight."""
     data = {name: mesh.cell_data[name] for name in ("young", "poisson", "density")}
-    return grasp_model_of(hang(BranchModel(mesh, **data, gravity=gravity), warn=pytest.fail),
-                          skeleton)
+    return grasp_model_of(hang(BranchModel(mesh, **data, gravity=gravity),
+                               progress=Progress(on_warning=pytest.fail)), skeleton)
 
 
 @pytest.fixture(scope="session")

@@ -45,7 +45,8 @@ def test_deformation_aware_path_is_gentler_on_the_full_model(planned_branch):
 
 def test_reported_energies_are_the_full_models(planned_branch):
     """Energy, force and pose of a path's point are those that the branch model gives there."""
-    small_model = load_grasp_model(Branch.open(planned_branch), gravity=True, warn=pytest.fail)
+    small_model = load_grasp_model(Branch.open(planned_branch), gravity=True,
+        progress=Progress(on_warning=pytest.fail))
     plan = read_plan(planned_branch)["plan"]
     poses = np.array(plan["poses"])
     middle = len(poses) // 2

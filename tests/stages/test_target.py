@@ -8,6 +8,7 @@ import pytest
 from limber.cli import call
 from limber.errors import InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.progress import Progress
 from limber.stages.loading import load_branch, load_targets
 from limber.stages.target import TargetSettings, set_target
 from limber.store import Branch
@@ -35,7 +36,8 @@ def test_targets_are_set_replaced_and_removed(folder, capsys):
     targets = load_targets(Branch.open(folder))
     assert [(t.name, t.position, t.mass) for t in targets] == [
         ("flower", (0.0, 0.0, 0.25), 0.02), ("leaf", (0.0, 0.0, 0.1), 0.0)]
-    loaded = load_branch(Branch.open(folder), gravity=True, warn=pytest.fail)
+    loaded = load_branch(Branch.open(folder), gravity=True,
+        progress=Progress(on_warning=pytest.fail))
     assert [m.mass for m in loaded.model.point_masses] == [0.02]
     result = set_target(folder, "flower", TargetSettings(remove=True))
     assert result["targets"] == ["leaf"]

@@ -18,6 +18,7 @@ from limber.geometry.tets.marks import base_nodes
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights
+from limber.progress import Progress
 from limber.recordings.alignment import frames_of
 from limber.recordings.recording import Observations, Pull
 
@@ -131,8 +132,9 @@ class Bench:
         """Fit as ``limber estimate`` does; warnings are in the result, bases in ``cache``."""
         objective = self.objective(pulls, settings)
         messages: list[str] = []
-        found = fit_pulls(objective, objective.space.base, settings, messages.append,
-                          cache=cache, digest=self.branch.name)
+        found = fit_pulls(objective, objective.space.base, settings,
+                          Progress(on_warning=messages.append), cache=cache,
+                          digest=self.branch.name)
         found.warnings = messages
         return found
 

@@ -78,7 +78,7 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
     started = time.perf_counter()
     subject = fitting_subject(truth)
     objective = _objective(pulls, subject, settings)
-    found = fit_pulls(objective, subject.start, settings, lambda _message: None)
+    found = fit_pulls(objective, subject.start, settings)
     seconds = time.perf_counter() - started
     log_truth = np.log(truth.young)
     low, high = np.log(found.uncertainty.young_interval).T
@@ -115,6 +115,6 @@ def _subject(mesh: object, truth: Truth, poisson: float, density: float) -> Subj
 
 
 def _objective(pulls: list[Pull], subject: Subject, settings: EstimateSettings) -> Objective:
-    forwards = forwards_of(pulls, subject, settings, lambda _message: None)
+    forwards = forwards_of(pulls, subject, settings)
     return Objective(forwards, parameter_space(subject, forwards, settings),
                      force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])

@@ -14,6 +14,7 @@ from limber.mechanics.reduced import cache as cache_module
 from limber.mechanics.reduced.cache import ReducedCache, learnt_model, model_key
 from limber.mechanics.reduced.model import ReducedSettings
 from limber.mechanics.reduced.training import TrainingSettings
+from limber.progress import Progress
 
 SETTINGS = ReducedSettings(size=20, field_count=40, training=TrainingSettings(
     grasp_count=8, young_spread=1.0, vibration_every=0))
@@ -72,7 +73,7 @@ def test_all_that_a_model_depends_on_is_in_its_key(branch):
 def test_a_damaged_entry_is_dropped_and_said(learnt, tmp_path, damage):
     """Cut short, changed inside, empty or of another kind: removed with a word, never believed."""
     said = []
-    cache = ReducedCache(tmp_path, warn=said.append)
+    cache = ReducedCache(tmp_path, progress=Progress(on_warning=said.append))
     path = cache.store("key", learnt.reduced, learnt.snapshots)
     whole = path.read_bytes()
     middle = len(whole) // 2

@@ -3,7 +3,6 @@
 What of it is written is in :mod:`limber.estimation.summary`.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -153,18 +152,18 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         WorkError: the simulation finds no equilibrium.
         Cancelled: stopped before the first step.
     """
-    forwards = forwards_of(pulls, subject, settings, progress.warn)
+    forwards = forwards_of(pulls, subject, settings, progress)
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
     sigma = [pull.entry.sensor.force_sigma_n for pull in pulls]
     objective = Objective(forwards, parameter_space(subject, forwards, settings),
                           log=log, force_sigma=sigma, progress=progress,
                           expected_count=20 if settings.method == "gauss-newton" else 200)
-    return fit_pulls(objective, subject.start, settings, progress.warn, cache=cache, digest=digest)
+    return fit_pulls(objective, subject.start, settings, progress, cache=cache, digest=digest)
 
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
-              tell: Callable[[str], None], *, cache: Path | None = None, digest: str = "",
+              progress: Progress, *, cache: Path | None = None, digest: str = "",
               ) -> Estimate:
     """Judge what the data can tell, fit it, and say how sure the result is.
 
@@ -185,7 +184,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
         if any(forward.uses_force for forward in objective.forwards):
             suspicion = force_unit_suspicion(float(np.mean(start.young)))
             if suspicion:
-                tell(suspicion)
+                progress.warn(suspicion)
     if settings.method == "gauss-newton" and reduction is None:
         start = led_start(judged_on, start)
     first = _evaluated(judged_on, start)
@@ -196,17 +195,17 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     space, _ = link_unresolved(first, objective.space)
     objective = objective.with_space(space)
     try:
-        fit, objective = _fitted(objective, space.pack(start), settings, tell, reduction)
+        fit, objective = _fitted(objective, space.pack(start), settings, progress, reduction)
     except Stopped:
         fit = _best_so_far(objective)
     stopped = fit.status is FitStatus.stopped
     if settings.method == "gauss-newton" and not stopped:
-        fit, objective = _linked_at_the_end(fit, objective, settings, tell)
+        fit, objective = _linked_at_the_end(fit, objective, settings, progress)
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
-            tell(message)
+            progress.warn(message)
     found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged)
-    _judge(found, tell)
+    _judge(found, progress)
     if settings.hold_out and len(objective.forwards) > 1 and not stopped:
         found.held_out = _held_out(found, settings)
     return found
@@ -237,7 +236,7 @@ def _evaluated(objective: Objective, values: Values) -> Evaluation:
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
-            tell: Callable[[str], None], reduction: Reduction | None,
+            progress: Progress, reduction: Reduction | None,
             ) -> tuple[Fit, Objective]:
     def optimise(chosen: Objective, free: np.ndarray, is_near: bool = False) -> Fit:
         if settings.method == "nelder-mead":
@@ -249,8 +248,8 @@ def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
     if settings.method == "gauss-newton":
         start = _resumed(objective, start)
     if reduction is not None:
-        return fit_reduced(objective, start, optimise, _rough, reduction, tell)
-    return _refined(optimise(objective, start), objective, settings, tell), objective
+        return fit_reduced(objective, start, optimise, _rough, reduction, progress)
+    return _refined(optimise(objective, start), objective, settings, progress), objective
 
 
 def _rough(objective: Objective, free: np.ndarray) -> Fit:
@@ -265,7 +264,7 @@ def _resumed(objective: Objective, start: np.ndarray) -> np.ndarray:
 
 
 def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
-             tell: Callable[[str], None]) -> Fit:
+             progress: Progress) -> Fit:
     """Simulate more key frames where the spline between them is worse than the measurements."""
     for _ in range(3):
         coarse = []
@@ -278,8 +277,9 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
                 coarse.append(forward)
         if not coarse or settings.method == "nelder-mead":
             if coarse:
-                tell("Frames between the simulated ones are off by more than a third of the "
-                     "noise; use more --key-frames.")
+                progress.warn(
+                    "Frames between the simulated ones are off by more than a third of the "
+                    "noise; use more --key-frames.")
             return fit
         for forward in coarse:
             forward.refine()
@@ -301,7 +301,7 @@ def _best_so_far(objective: Objective) -> Fit:
 
 
 def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSettings,
-                       tell: Callable[[str], None]) -> tuple[Fit, Objective]:
+                       progress: Progress) -> tuple[Fit, Objective]:
     """Link what the data leave open at the solution, and only that, and fit again if it differs.
 
     Links are only added after the first time: what comes and goes would never end.
@@ -320,26 +320,28 @@ def _linked_at_the_end(fit: Fit, objective: Objective, settings: EstimateSetting
         fit = gauss_newton(objective, start, robust=settings.robust,
                            evaluation_limit=settings.evaluations)
     for message in messages:
-        tell(message)
+        progress.warn(message)
     return fit, objective
 
 
-def _judge(found: Estimate, tell: Callable[[str], None]) -> None:
+def _judge(found: Estimate, progress: Progress) -> None:
     if found.uncertainty.variance_factor > MISFIT_FACTOR:
-        tell(f"The fit is poor: residuals are {found.uncertainty.variance_factor**0.5:.1f} times "
-             "the stated noise, and the intervals do not hold. Is this a pull of this branch, in "
-             "its frame of reference? Does the skeleton run where the branch does?")
+        progress.warn(
+            f"The fit is poor: residuals are {found.uncertainty.variance_factor**0.5:.1f} times "
+            "the stated noise, and the intervals do not hold. Is this a pull of this branch, in "
+            "its frame of reference? Does the skeleton run where the branch does?")
     elif found.uncertainty.variance_factor > UNEXPLAINED_FACTOR:
-        tell(f"Residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated noise: "
-             "something acts that is not in the model, or the sensors are worse than stated. The "
-             "intervals were widened by as much.")
+        progress.warn(
+            f"Residuals are {found.uncertainty.variance_factor**0.5:.1f} times the stated noise: "
+            "something acts that is not in the model, or the sensors are worse than stated. The "
+            "intervals were widened by as much.")
     for sentence in in_words(found.cell_errors):
-        tell(sentence)
+        progress.warn(sentence)
     named = outliers(found.fit.evaluation, found.objective)
     if named:
         worst = "; ".join(f"{entry['pull']} {entry['what']} at {entry['time_s']:.2f} s "
                           f"({entry['deviations']:.0f} deviations)" for entry in named[:4])
-        tell(f"Outliers: {worst}{' ...' if len(named) > 4 else ''}.")
+        progress.warn(f"Outliers: {worst}{' ...' if len(named) > 4 else ''}.")
 
 
 def _held_out(found: Estimate, settings: EstimateSettings) -> dict[str, dict[str, Any]]:
@@ -374,7 +376,7 @@ def foretell(pull: Pull, subject: Subject, found: Estimate, settings: EstimateSe
     Raises:
         LimberError: it has nothing that could be compared.
     """
-    forward = forwards_of([pull], subject, settings, lambda _message: None)
+    forward = forwards_of([pull], subject, settings)
     alone = Objective(forward, found.objective.space,
                       force_sigma=[pull.entry.sensor.force_sigma_n])
     distance, force = held_out(alone, found.fit.evaluation.free, 0)
@@ -414,7 +416,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         if stiff is not None:
             error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
     found.model_error = error
-    _tell_largest_part(found.causes, progress.warn)
+    _tell_largest_part(found.causes, progress)
 
 
 def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,
@@ -430,7 +432,7 @@ def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSetting
     return ModelError(radii) if drawn is None else ModelError(drawn, axis_is_exact=False)
 
 
-def _tell_largest_part(parts: dict[str, np.ndarray], tell: Callable[[str], None]) -> None:
+def _tell_largest_part(parts: dict[str, np.ndarray], progress: Progress) -> None:
     """Say what would narrow a wide interval: what makes up most of its variance.
 
     Args:
@@ -443,6 +445,7 @@ def _tell_largest_part(parts: dict[str, np.ndarray], tell: Callable[[str], None]
     each = "; ".join(f"{cause['cause']} {100 * cause['deviation']:.0f} % ({cause['advice']})"
                      for cause in largest({name: part[worst:worst + 1]
                                            for name, part in parts.items()}))
-    tell(f"E at control point {worst + 1} has a standard deviation of "
-         f"{100 * min(total[worst], 99.0):.0f} %. Most of it comes from, and would be less with: "
-         f"{each}.")
+    progress.warn(
+        f"E at control point {worst + 1} has a standard deviation of "
+        f"{100 * min(total[worst], 99.0):.0f} %. Most of it comes from, and would be less with: "
+        f"{each}.")

@@ -1,6 +1,5 @@
 """From a branch and its pulls to what an optimiser needs."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,8 +22,6 @@ from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames, frames_of
 from limber.recordings.calibration import calibration_of
 from limber.recordings.recording import Pull, PullEntry
-
-Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,8 @@ def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],
     return Subject(mesh, skeleton, points, weights, model, start, field)
 
 
-def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings, warn: Warn,
+def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
+                progress: Progress = SILENT,
                 ) -> list[Forward]:
     """Make the forward simulation of each pull.
 
@@ -99,7 +97,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
         entry = _with_overrides(pull.entry, settings)
         frames = frames_of(pull)
         for message in frames.warnings:
-            warn(message)
+            progress.warn(message)
         rest = subject.control_points if entry.rest_points_m is None else np.array(
             entry.rest_points_m)
         if frames.positions.shape[1] not in (0, len(rest)):
@@ -108,7 +106,7 @@ def forwards_of(pulls: list[Pull], subject: Subject, settings: EstimateSettings,
                 "Each observed point needs its place at rest.",
                 "Give rest_points_m in pull.toml, or as many --fractions as markers.")
         rest = rest if frames.positions.shape[1] else np.empty((0, 3))
-        _check_rest(pull, frames, rest, warn)
+        _check_rest(pull, frames, rest, progress)
         forwards.append(_forward(pull.name, entry, frames, rest, subject, settings))
     return forwards
 
@@ -201,7 +199,7 @@ def _with_overrides(entry: PullEntry, settings: EstimateSettings) -> PullEntry:
     return entry.model_copy(update={k: v for k, v in given.items() if v is not None})
 
 
-def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, warn: Warn) -> None:
+def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, progress: Progress) -> None:
     """Warn where the first frame, at rest, shows the points elsewhere than the branch has them.
 
     Raises:
@@ -223,9 +221,10 @@ def _check_rest(pull: Pull, frames: Frames, rest: np.ndarray, warn: Warn) -> Non
             "Import it with --unit, or with --nominal (where on the branch the markers are).")
     limit = 5e-3 + 5 * pull.entry.sensor.position_sigma_m
     if np.nanmax(off) > limit:
-        warn(f"{pull.name}: at rest the observed points lie up to {np.nanmax(off) * 1e3:.0f} mm "
-             "from where this branch has them: another branch, another frame of reference, or "
-             "markers in another order.")
+        progress.warn(
+            f"{pull.name}: at rest the observed points lie up to {np.nanmax(off) * 1e3:.0f} mm "
+            "from where this branch has them: another branch, another frame of reference, or "
+            "markers in another order.")
 
 
 def _given(value: float | None, field: np.ndarray) -> float:

@@ -53,7 +53,6 @@ SETTLED_DEVIATIONS = 0.05
 
 Optimise = Callable[..., Fit]
 """Takes an objective, a free vector to start from, and whether that is near the solution."""
-Tell = Callable[[str], None]
 
 
 class Reduction:
@@ -115,11 +114,11 @@ class Reduction:
 
 
 def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rough: Optimise,
-                reduction: Reduction, tell: Tell, progress: Progress = SILENT,
+                reduction: Reduction, progress: Progress = SILENT,
                 ) -> tuple[Fit, Objective]:
     """Fit on reduced models of the pulls; returns the fit and the objective that it belongs to.
 
-    Where a reduced model does not carry the pulls, the full one fits them, and ``tell`` says so.
+    Where a reduced model does not carry the pulls, the full one fits them, and a warning says so.
 
     Args:
         objective: On the full model.
@@ -141,10 +140,11 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
     for attempt in range(REBUILD_LIMIT + 1):
         corrected = reduction.objective(objective, objective.space.unpack(free))
         try:
-            fit = _settled(corrected, free, optimise, tell)
+            fit = _settled(corrected, free, optimise, progress)
         except WorkError:
-            tell("The reduced model loses the branch at one of the recorded poses; the full model "
-                 "was used instead.")
+            progress.warn(
+                "The reduced model loses the branch at one of the recorded poses; the full model "
+                "was used instead.")
             return optimise(objective, free), objective
         objective.forward_count = corrected.forward_count
         free = fit.evaluation.free
@@ -159,15 +159,16 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
     return fit, corrected
 
 
-def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, tell: Tell) -> Fit:
+def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progress: Progress) -> Fit:
     """Fit, measure the reduced model's error there, fit again, until nothing moves."""
     fit = optimise(corrected, free)
     for _ in range(ROUND_LIMIT):
         values = corrected.space.unpack(fit.evaluation.free)
         if not all(forward.correct(values, corrected.space.extra)
                    for forward in corrected.forwards):
-            tell("The full model finds no equilibrium at the reduced model's fit: it could not be "
-                 "checked. Use --forward full.")
+            progress.warn(
+                "The full model finds no equilibrium at the reduced model's fit: it could not be "
+                "checked. Use --forward full.")
             return replace(fit, status=FitStatus.unconfirmed)
         # What was evaluated before belongs to another correction.
         corrected.forget()
@@ -178,8 +179,9 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, tell: T
         deviation = np.linalg.norm(spread, axis=1)
         if np.all(moved <= np.maximum(SETTLED, SETTLED_DEVIATIONS * deviation)):
             return fit
-    tell("The corrections of the reduced model did not settle: the last one changed a free value "
-         f"by {moved.max():.2g} (1 is a factor of 2.7).")
+    progress.warn(
+        "The corrections of the reduced model did not settle: the last one changed a free value "
+        f"by {moved.max():.2g} (1 is a factor of 2.7).")
     return replace(fit, status=FitStatus.unconfirmed)
 
 

@@ -5,7 +5,7 @@ where the branch was generated. What is known of it goes into ``pull.toml`` unde
 that an estimate can be scored; nothing that estimates reads it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,7 +106,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
         InputError: settings that do not go together. WorkError: the branch cannot be pulled so.
     """
     rng = np.random.default_rng(settings.seed)
-    model = _model(truth, settings, progress.warn)
+    model = _model(truth, settings, progress)
     is_weightless = not (model.gravity.any() and (settings.own_weight or model.hanging))
     entry = _entry(truth, settings, is_weightless)
     grasp = grasp_on(truth.mesh, entry.grasp)
@@ -141,13 +141,13 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
 
 
 def _model(truth: TrueBranch, settings: VirtualPullSettings,
-           warn: Callable[[str], None]) -> BranchModel:
+           progress: Progress) -> BranchModel:
     weights = young_weights(truth.mesh, truth.control_points)
     has_weight = settings.gravity and not truth.is_weightless
     model = BranchModel(truth.mesh, young=weights @ truth.young, poisson=settings.poisson,
                         density=settings.density, gravity=truth.gravity if has_weight else None,
                         damping=RayleighDamping(*settings.damping))
-    return model if settings.own_weight else hang(model, warn=warn).model
+    return model if settings.own_weight else hang(model, progress=progress).model
 
 
 def _kind(settings: VirtualPullSettings) -> str:

@@ -13,7 +13,6 @@ the gripper exerts; that of the strain energy alone is not, since the gripper al
 weight acts: :mod:`limber.mechanics.hanging`.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -27,6 +26,7 @@ from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.statics.solve import solve_static
+from limber.progress import SILENT, Progress
 from limber.sparse import NotPositiveDefiniteError
 
 
@@ -107,11 +107,11 @@ class LoadedBranch:
 
 
 def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
-         warn: Callable[[str], None]) -> LoadedBranch:
+         progress: Progress = SILENT) -> LoadedBranch:
     """Return a model's branch as it hangs in its mesh's shape.
 
     Where that shape would fall or roll over, since the branch is too soft to carry itself, its
-    weight is left out, everywhere alike, and ``warn`` says so.
+    weight is left out, everywhere alike, and a warning says so.
 
     Args:
         model: Its gravity is that of the scan; zero for a branch without weight. What targets
@@ -122,8 +122,9 @@ def hang(model: BranchModel, targets: tuple[NamedTarget, ...] = (), *,
     loaded = model.as_scanned()
     if is_stable(loaded):
         return LoadedBranch(loaded, targets)
-    warn("The branch is too soft to carry its own weight in the scanned shape: its weight is left "
-         "out. Check Young's modulus, density and gravity.")
+    progress.warn(
+        "The branch is too soft to carry its own weight in the scanned shape: its weight is left "
+        "out. Check Young's modulus, density and gravity.")
     return LoadedBranch(model.with_parameters(gravity=(0.0, 0.0, 0.0)), targets)
 
 

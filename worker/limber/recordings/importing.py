@@ -76,11 +76,10 @@ def import_recording(kind: str, source: Path, folder: Path, name: str, settings:
     """
     progress(0.1, f"reading {kind}")
     if kind == "force-displacement":
-        return _import_force_table(source, folder, settings, progress.warn)
+        return _import_force_table(source, folder, settings, progress)
     if settings.weight is not None or settings.load is not None:
-        return _import_load(kind, source, folder, name, settings, branch, progress.warn)
-    return _import_motion(kind, source, folder, name, settings, branch, progress.warn,
-                          progress.part(0.1, 1.0))
+        return _import_load(kind, source, folder, name, settings, branch, progress)
+    return _import_motion(kind, source, folder, name, settings, branch, progress.part(0.1, 1.0))
 
 
 def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
@@ -131,14 +130,14 @@ def kind_of(source: Path) -> str:
     return "force-displacement" if moved and forced else "markers"
 
 
-def _import_force_table(source: Path, folder: Path, settings: ImportSettings, warn: Any,
+def _import_force_table(source: Path, folder: Path, settings: ImportSettings, progress: Progress,
                         ) -> dict[str, Any]:
     displacement, force, warnings = read_force_displacement(
         source, unit=settings.unit, force_unit=settings.force_unit)
     found = force_slope(displacement, force, warnings=warnings)
     for message in found.warnings:
-        warn(message)
-    warn(f"No modulus from {source.name}. {WHY_NO_MODULUS}")
+        progress.warn(message)
+    progress.warn(f"No modulus from {source.name}. {WHY_NO_MODULUS}")
     table = np.column_stack([displacement, force])
     np.savetxt(folder / "force.csv", table, "%.9g", ",", header="displacement_m,force_n",
                comments="")
@@ -151,7 +150,7 @@ def _import_force_table(source: Path, folder: Path, settings: ImportSettings, wa
 
 
 def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                   branch: BranchFrame, warn: Any, progress: Progress) -> dict[str, Any]:
+                   branch: BranchFrame, progress: Progress) -> dict[str, Any]:
     if kind == "pull":
         shutil.copytree(source, folder, dirs_exist_ok=True)
         pull = read_pull(folder)
@@ -160,10 +159,10 @@ def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: I
         write_pull(folder, pull)
     cleaned = clean(pull)
     for message in cleaned.warnings:
-        warn(message)
+        progress.warn(message)
     entry = pull.entry
     if kind != "pull" and settings.time_offset is None and cleaned.observations is not None:
-        entry = _with_offset(cleaned, warn)
+        entry = _with_offset(cleaned, progress)
         write_entry(folder / "pull.toml", entry)
     seen = cleaned.observations
     return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
@@ -171,23 +170,25 @@ def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: I
             "time_offset_s": entry.time_offset_s}
 
 
-def _with_offset(pull: Pull, warn: Any) -> PullEntry:
+def _with_offset(pull: Pull, progress: Progress) -> PullEntry:
     """The pull's entry with the clocks' offset, as far as the recording tells it."""
     seen, offset = pull.observations.times, 0.0
     if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
         offset = float(pull.times[0] - seen[0])
-        warn(f"{pull.name}: the two clocks have no moment in common; the recordings were taken to "
-             "start together, and the offset was estimated from there.")
+        progress.warn(
+            f"{pull.name}: the two clocks have no moment in common; the recordings were taken to "
+            "start together, and the offset was estimated from there.")
     entry = pull.entry.model_copy(update={"time_offset_s": offset})
     found, sigma = estimate_offset(replace(pull, entry=entry))
     if sigma < 0.02:
         return entry.model_copy(update={"time_offset_s": found})
-    warn(f"{pull.name}: the clocks' offset cannot be told from this pull; {offset:g} s was taken.")
+    progress.warn(
+        f"{pull.name}: the clocks' offset cannot be told from this pull; {offset:g} s was taken.")
     return entry
 
 
 def _import_load(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                 branch: BranchFrame, warn: Any) -> dict[str, Any]:
+                 branch: BranchFrame, progress: Progress) -> dict[str, Any]:
     """A pull of a few frames from a recording of a branch that a steady load bends."""
     if kind not in ("markers", "c3d"):
         raise InputError(f"A steady load was given, but {source.name} is {kind}.",
@@ -200,7 +201,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
                          "How far it bends the branch depends on that.", "Give --grasp-point.")
     seen, labels = _markers(kind, source, settings)
     for message in seen.warnings:
-        warn(message)
+        progress.warn(message)
     still = settled(Observations(seen.times, seen.values.reshape(len(seen), -1, 3)), name)
     placed = _registered(still.rest, labels, name, settings, branch)
     used = placed.used if placed else np.flatnonzero(np.isfinite(still.rest).all(axis=1))
@@ -208,7 +209,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     if placed:
         rest, positions = placed.apply(rest), placed.apply(positions)
     for message in (*still.warnings, *(placed.warnings if placed else ())):
-        warn(message)
+        progress.warn(message)
     _require_near(rest, name, branch.nodes)
     sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
     load = _load(settings, branch)
@@ -223,7 +224,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
                             Observations(still.times, positions)))
     moved = positions[-1] - rest
     if suspicion := _against(moved, load):
-        warn(f"{name}: {suspicion}")
+        progress.warn(f"{name}: {suspicion}")
     return {"frame_count": len(still.times), "point_count": len(used), "time_offset_s": 0.0,
             "labels": [labels[k] for k in used], "load_n": load.tolist(),
             "displacement_m": moved.tolist(), "settled_s": still.duration,

@@ -1,10 +1,10 @@
 """The branch a session starts from, and what its reduced model is made of."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 from limber.mechanics.reduced.state import ReducedSettings
 from limber.mechanics.reduced.training import TrainingSettings
+from limber.progress import SILENT, Progress
 from limber.session.held import HeldBranch
 from limber.session.settings import SessionSettings
 from limber.stages.loading import load_branch
@@ -19,10 +19,10 @@ def reduced_settings(settings: SessionSettings) -> ReducedSettings:
 
 
 def load_held(folder: Path, settings: SessionSettings,
-              warn: Callable[[str], None] = lambda _message: None) -> HeldBranch:
+              progress: Progress = SILENT) -> HeldBranch:
     """Return the branch of a folder as it hangs, nothing held yet.
 
     Raises:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
     """
-    return HeldBranch(load_branch(Branch.open(folder), gravity=settings.gravity, warn=warn))
+    return HeldBranch(load_branch(Branch.open(folder), gravity=settings.gravity, progress=progress))

@@ -59,7 +59,8 @@ def main(arguments: list[str] | None = None) -> int:
         with tempfile.TemporaryDirectory(prefix="limber-reduced-") as own:
             settings = SessionSettings.model_validate_json(options.settings)
             folder = settings.cache_folder or default_folder()
-            cache = ReducedCache(folder if settings.cache else Path(own), warn=_warn)
+            cache = ReducedCache(folder if settings.cache else Path(own),
+                                 progress=Progress(on_warning=_warn))
             _serve(options.folder, settings, cache)
     except Cancelled as error:
         return error.exit_code

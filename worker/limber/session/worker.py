@@ -66,6 +66,7 @@ import numpy as np
 
 from limber.errors import InputError, LimberError
 from limber.mechanics.reduced.strain import compile_kernels
+from limber.progress import Progress
 from limber.session import protocol
 from limber.session.answering import Answering
 from limber.session.events import Events
@@ -93,8 +94,8 @@ class Session:
     def __init__(self, folder: Path, settings: SessionSettings):
         self.inbox = Inbox()
         self.events = Events(self.inbox.close)
-        self.held = load_held(folder, settings, lambda message: self.events.say(
-            event="warning", message=message))
+        self.held = load_held(folder, settings, Progress(
+            on_warning=lambda message: self.events.say(event="warning", message=message)))
         self.answering = Answering(folder, settings, self.held, self.inbox.put, self.events.say)
         if settings.grasp:
             self.answering.hold_marked(settings.mode)

@@ -30,7 +30,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
     from limber.stages.loading import load_grasp_model
 
     branch = Branch.open(folder)
-    grasp_model = load_grasp_model(branch, gravity=settings.gravity, warn=progress.warn)
+    grasp_model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
     digests = energy_inputs(grasp_model)
     if not force and branch.is_current("energy", settings, digests=digests):
         return branch.manifest.stages["energy"].result

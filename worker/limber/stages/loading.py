@@ -6,8 +6,6 @@ computation comes through here.
 
 import hashlib
 import json
-import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -23,8 +21,6 @@ from limber.progress import SILENT, Progress
 from limber.recordings.checks import clean
 from limber.recordings.recording import Pull, read_pull
 from limber.store import Branch
-
-Warn = Callable[[str], None]
 
 TARGETS_FORMAT = 1
 """Version of ``targets.json``."""
@@ -86,20 +82,20 @@ def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
     return tuple(map(float, load_skeleton(branch).point_at(float(fraction))))
 
 
-def load_branch(branch: Branch, *, gravity: bool = True, warn: Warn = warnings.warn,
+def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SILENT,
                 **overrides: object) -> LoadedBranch:
     """Return the branch as everything computes on it: as it hangs, with targets and grasp.
 
     Args:
         gravity: Whether it has any weight.
-        warn: Is told where it cannot carry itself and its weight is left out.
+        progress: Is told where it cannot carry itself and its weight is left out.
         overrides: As for BranchModel.
 
     Raises:
         BranchFolderError: there is no mesh. InputError: it lacks material data.
     """
     model = load_model(branch, gravity=branch.gravity if gravity else None, **overrides)
-    loaded = hang(model, load_targets(branch), warn=warn)
+    loaded = hang(model, load_targets(branch), progress=progress)
     return replace(loaded, grasp_point=load_grasp_point(branch))
 
 
@@ -124,13 +120,14 @@ def load_model(branch: Branch, **overrides: object) -> BranchModel:
     return BranchModel(mesh, **values, **{**known, **overrides})
 
 
-def load_grasp_model(branch: Branch, *, gravity: bool, warn: Warn) -> GraspModel:
+def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILENT) -> GraspModel:
     """Return what planning asks of a branch: :func:`limber.planning.grasp_model.grasp_model_of`.
 
     Raises:
         BranchFolderError: a file is missing. InputError: the mesh lacks material or grasp.
     """
-    return grasp_model_of(load_branch(branch, gravity=gravity, warn=warn), load_skeleton(branch))
+    return grasp_model_of(load_branch(branch, gravity=gravity, progress=progress),
+                          load_skeleton(branch))
 
 
 def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:

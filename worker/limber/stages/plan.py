@@ -72,7 +72,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
     field_path = branch.require("energy.npz", "energy")
     energy_stage = branch.manifest.stages["energy"]
     grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
-                                   warn=progress.warn)
+                                   progress=progress)
     digests = energy_inputs(grasp_model)
     if energy_stage.reads != digests:
         raise BranchFolderError(

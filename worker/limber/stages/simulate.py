@@ -101,7 +101,7 @@ def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> Br
               "lumped_mass": settings.lumped_mass,
               "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
     if settings.rest_shape:
-        return load_branch(branch, gravity=settings.gravity, warn=progress.warn, **values).model
+        return load_branch(branch, gravity=settings.gravity, progress=progress, **values).model
     return load_model(branch, gravity=branch.gravity if settings.gravity else None, **values)
 
 

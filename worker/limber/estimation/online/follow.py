@@ -180,7 +180,7 @@ def _rough(pull: Pull, subject: Subject, settings: EstimateSettings) -> Values |
     if way.max(initial=0.0) < MOVED * subject.model.extent:
         return None
     few = settings.model_copy(update={"key_frames": 4})
-    forwards = forwards_of([clean(pull)], subject, few, lambda _message: None)
+    forwards = forwards_of([clean(pull)], subject, few)
     objective = Objective(forwards, ParameterSpace.separate(subject.start),
                           force_sigma=[pull.entry.sensor.force_sigma_n])
     start = scaled_start(objective, subject.start)

@@ -17,7 +17,6 @@ import hashlib
 import os
 import time
 import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,12 +65,12 @@ class ReducedCache:
     Args:
         folder: Where; made if it is not there.
         limit_bytes: What all models may take; the one stored last always stays.
-        warn: Told of files that were damaged and are removed.
+        progress: Told of files that were damaged and are removed.
     """
 
     def __init__(self, folder: Path, *, limit_bytes: int = LIMIT_BYTES,
-                 warn: Callable[[str], None] = lambda _message: None):
-        self.folder, self.limit_bytes, self.warn = Path(folder), limit_bytes, warn
+                 progress: Progress = SILENT):
+        self.folder, self.limit_bytes, self._progress = Path(folder), limit_bytes, progress
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def path(self, key: str) -> Path:
@@ -93,7 +92,7 @@ class ReducedCache:
             found = ReducedModel.read(path), Snapshots.from_arrays(held)
         except (InputError, OSError, ValueError, KeyError, TypeError, EOFError,
                 zipfile.BadZipFile) as error:
-            self.warn(f"{path.name} in the cache of reduced models was damaged"
+            self._progress.warn(f"{path.name} in the cache of reduced models was damaged"
                       f" ({type(error).__name__}); it is removed, and the model learnt again")
             with contextlib.suppress(OSError):
                 path.unlink()
