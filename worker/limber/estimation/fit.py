@@ -163,7 +163,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
 
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
-              progress: Progress, *, cache: Path | None = None, digest: str = "",
+              progress: Progress = SILENT, *, cache: Path | None = None, digest: str = "",
               ) -> Estimate:
     """Judge what the data can tell, fit it, and say how sure the result is.
 

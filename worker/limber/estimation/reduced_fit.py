@@ -126,7 +126,6 @@ def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rou
         optimise: The fit wanted.
         rough: A quick fit of the full model, around which bases are made that are not there yet.
         reduction: The reduced models.
-        tell: Takes messages to the user.
     """
     free = start
     if not reduction.is_built:
