@@ -100,15 +100,15 @@ def test_a_clamped_gripper_needs_its_torque(small, small_bench):
     """
     pull = simulate_pull(small.truth(), "pull-1", VirtualPullSettings(
         young=small.young, poisson=0.36, frames=8, mode="clamped", phase=0.5, seed=2,
-        reach=0.2, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
+        gravity=False, reach=0.1, position_noise=0.0, force_noise=0.0, torque_noise=0.0))[0]
     sensor = pull.entry.sensor
     pull = driven(pull)
     found = small_bench.objective([pull], SETTINGS).evaluate(np.log(TRUTH))
     off = np.linalg.norm(found.pulls[0].positions - pull.observations.positions, axis=2)
     moved = np.linalg.norm(pull.observations.positions[-1] - pull.observations.positions[0],
                            axis=1)
-    # The patch is not stiffened, the mesh another one, and pressing magnifies both.
-    assert np.all(off[-1] < 0.12 * moved.max())
+    # The patch is not stiffened, and the mesh another one (half as coarse: 0.001 of the motion).
+    assert np.all(off[-1] < 0.03 * moved.max())
     deaf = driven(pull, sensor=sensor.model_copy(update={"torque_sigma_nm": None}))
     with pytest.raises(InputError, match="torque is not known"):
         small_bench.objective([deaf], SETTINGS)
