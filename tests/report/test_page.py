@@ -1,5 +1,6 @@
 """The report on folders that are not finished, and its refusals; a finished one: test_pipeline."""
 
+import numpy as np
 import pytest
 
 from limber.errors import BranchFolderError, InputError
@@ -73,3 +74,20 @@ def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():
         ["a", "1.20", "2.1 %", "0.034", "4.0 %", "the other pulls"],
         ["b", "3.00", "10.0 %", "-", "-", "this estimate"]]
     assert held_out_rows({"held_out": {}}) == []
+
+
+def test_named_targets_stand_in_figure_and_table(tmp_path):
+    """The place of a flower is a row of the scan's table."""
+    import shutil
+    from pathlib import Path
+
+    from limber.stages.target import TargetSettings, set_target
+
+    example = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+    folder = shutil.copytree(example, tmp_path / "example.branch")
+    branch = Branch.open(folder)
+    tip = np.loadtxt(branch.path("skeleton.swc"))[-1, 2:5]
+    set_target(folder, "flower", TargetSettings(at=tuple(tip), mass=0.02))
+    write_report(folder)
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    assert "Named targets" in html and ">flower<" in html and f"{tip[2]:.3f}" in html

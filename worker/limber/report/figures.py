@@ -1,6 +1,6 @@
 """The report's own figures: scan and skeleton, radii, mesh, pull and energy samples."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +18,8 @@ _CLOUD = "#a9b3ad"
 _SHOWN_POINTS = 30_000
 
 
-def scan_and_skeleton(branch: Branch) -> "Figure":
-    """Cloud, centreline tree and control points, from the front and from the side."""
+def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Cloud, centreline tree, control points and targets, from the front and from the side."""
     skeleton = Skeleton.read_swc(branch.path("skeleton.swc"))
     points = _cloud_points(branch)
     mesh = TetMesh.read(branch.path("mesh.vtu")) if branch.has("mesh.vtu") else None
@@ -31,6 +31,12 @@ def scan_and_skeleton(branch: Branch) -> "Figure":
             nodes = mesh.nodes[mesh.point_data["control_point"] >= 0]
             axis.scatter(nodes[:, first], nodes[:, 2], s=60, facecolors="none",
                          edgecolors="#b0126b", linewidths=1.4, zorder=5)
+        for target in targets:
+            place = target["position_m"]
+            axis.plot(place[first], place[2], marker="*", markersize=13, color="#e0a100",
+                      markeredgecolor="#5c4300", zorder=6)
+            axis.annotate(target["name"], (place[first], place[2]), (7, 5), fontsize=9,
+                          textcoords="offset points", zorder=6)
         axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
         axis.grid(alpha=0.25)
     return figure

@@ -95,9 +95,16 @@ def _scan(branch: Branch) -> Section:
     if not (branch.has("cloud.ply") and branch.has("skeleton.swc")):
         section.missing = "limber reconstruct CLOUD -o NAME.branch"
         return section
-    section.draw(figures.scan_and_skeleton(branch),
-                 "The aligned cloud (grey) with the centreline tree, one colour an order, and the "
-                 "control points (rings); from the front and from the side.")
+    targets = _targets(branch)
+    section.draw(figures.scan_and_skeleton(branch, targets),
+                 "The aligned cloud (grey) with the centreline tree, one colour an order, the "
+                 "control points (rings) and named targets (stars); from the front and from the "
+                 "side.")
+    if targets:
+        section.tables.append(("Named targets", [
+            ["target", "x [m]", "y [m]", "z [m]", "mass [kg]"],
+            *([target["name"], *(f"{value:.3f}" for value in target["position_m"]),
+               f"{target['mass_kg']:.4g}"] for target in targets)]))
     section.draw(figures.radii(branch), "Radius along the centreline, with its uncertainty where "
                                         "it is known, one colour an order.")
     result = _reconstruction(branch)
@@ -106,6 +113,12 @@ def _scan(branch: Branch) -> Section:
         section.text.append(f"{result['clamped_radius_count']} radii were limited to the cloud's "
                             "scale.")
     return section
+
+
+def _targets(branch: Branch) -> list[dict[str, Any]]:
+    if not branch.has("targets.json"):
+        return []
+    return json.loads(branch.path("targets.json").read_text(encoding="utf-8"))["targets"]
 
 
 def _mesh(branch: Branch) -> Section:
