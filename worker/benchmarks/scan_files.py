@@ -54,14 +54,16 @@ def metamorphic_rows(quick: bool, seed: int, progress: Progress) -> list[Row]:
     worst, crashes, notes = 0.0, [], []
     half = 0.0
     for number, (name, (cloud, settings)) in enumerate(subjects.items()):
-        first = _made(cloud, settings)
+        try:
+            first = _made(cloud, settings)
+        except LimberError as error:
+            crashes.append(f"{name}: {error.seen}")
+            continue
         for change, (changed, other) in changes(cloud, settings, seed).items():
             try:
                 made = _made(changed, other)
             except Exception as error:
                 crashes.append(f"{name}, {change}: {error}")
-                continue
-            if isinstance(first, Exception):
                 continue
             off = max(abs(made.numbers[key] / first.numbers[key] - 1)
                       for key in ("length_m", "mesh_volume_m3"))

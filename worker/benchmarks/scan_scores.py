@@ -93,6 +93,10 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     sigma = found.radius_sigma[here.high]
     covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
     main_off = main_axis_error(truth, found)
+    forks = found.forks()
+    stated = [float(found.probability[(found.parent == fork)
+                                      & (found.branch != found.branch[fork])].min())
+              for fork in forks]
     return {
         "centre_m": float(np.concatenate([away, back]).mean()),
         "centre_radii": float(in_radii.mean()), "centre_worst_radii": float(in_radii.max()),
@@ -103,8 +107,18 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "root_diameters": float(np.linalg.norm(found.nodes[0] - truth.nodes[0])
                                 / (2 * truth.radius[0])),
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
+        "told_forks": [[p, bool(r)] for p, r in zip(stated, right, strict=True)],
+        "told_nodes": _told_nodes(found.probability[here.high], away < np.maximum(
+            there.radius[near], 0.001)),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
         "right": float((away < np.maximum(there.radius[near], 0.001)).mean())}
+
+
+def _told_nodes(stated: np.ndarray, right: np.ndarray) -> list[list[float]]:
+    """Of each tenth of stated probabilities: how much length, their sum, and how much is right."""
+    place = np.minimum((10 * stated).astype(int), 9)
+    return [[float(np.bincount(place, values, 10)[k]) for values in (
+        np.ones(len(place)), stated, right.astype(float))] for k in range(10)]
 
 
 def main_axis_error(truth: Skeleton, found: Skeleton) -> float:

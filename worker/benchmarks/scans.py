@@ -141,6 +141,7 @@ def _table(done: dict[str, Outcomes]) -> list[Row]:
                      "118 of 120", f"{int((rooted <= 1).sum())} of {total} (worst "
                      f"{rooted.max():.1f} diameters)",
                      bool((rooted <= 1).sum() >= total * 118 / 120)))
+    table.append(_probability_row(list(done.values())))
     gaps = done["gaps"]
     held = int((gaps.column("main_axis_radii") <= 1).sum())
     text, worst = gaps.forks()[0], gaps.column("main_axis_radii").max()
@@ -150,6 +151,28 @@ def _table(done: dict[str, Outcomes]) -> list[Row]:
                      f"{text}{gaps.told()}",
                      held >= 0.95 * gaps.count))
     return table
+
+
+def _probability_row(kinds: list[Outcomes]) -> Row:
+    """Stated probabilities of forks and of nodes against how often they are there, in tenths."""
+    forks = np.array([told for one in kinds for score in one.scores
+                      for told in score["told_forks"]]).reshape(-1, 2)
+    place = np.minimum((10 * forks[:, 0]).astype(int), 9)
+    counted = np.stack([np.bincount(place, values, 10) for values in (
+        np.ones(len(forks)), forks[:, 0], forks[:, 1])], axis=1)
+    nodes = sum((np.array(score["told_nodes"]) for one in kinds for score in one.scores),
+                np.zeros((10, 3)))
+    texts, worst = [], 0.0
+    for name, bins, least in (("forks", counted, 10), ("nodes", nodes, 500)):
+        full = bins[bins[:, 0] >= least]
+        if len(full) == 0:
+            texts.append(f"{name}: too few")
+            continue
+        off = np.abs(full[:, 1] - full[:, 2]) / full[:, 0]
+        worst = max(worst, float(off.max()))
+        texts.append(f"{name}: worst of {len(full)} filled bins {100 * off.max():.0f} points")
+    return Row("stated probability of forks and nodes against outcome, 10 bins",
+               "within 10 points", "; ".join(texts), worst <= 0.10)
 
 
 def _view_rows(name: str, one: Outcomes, found: float | None, false: float | None,
