@@ -1,14 +1,18 @@
 """Two paths to the same goal region on one field: the shortest, and the gentle one."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from limber.errors import InputError, NoPathError
+from limber.planning.certificate import Certificate
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field import EnergyField, FieldArrays
+from limber.planning.gentle import plan_gentle
 from limber.planning.goals import Goal, allowed_points, goal_points
 from limber.planning.ompl_engine import ompl_missing
+from limber.planning.problem import GentleProblem
+from limber.planning.refine import refine
 from limber.planning.rrt_star import FoundPath, PathProblem, Search, plan_path
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
@@ -16,46 +20,93 @@ from limber.progress import SILENT, Progress
 
 @dataclass(frozen=True)
 class PathPair:
-    """RRT* (length alone) and D-RRT* between the same start and goal region.
+    """RRT* (length alone) and the gentle plan between the same start and goal region.
 
     ``approach`` [k, 3] leads gently from the rest pose to the start: a branch that is pushed
-    there straight may buckle on the way and be another branch when it arrives.
+    there straight may buckle on the way and be another branch when it arrives. ``certificate``
+    says how close the plan is to the best possible path on the field; ``compared`` has the
+    polylines [n, 3] of all paths that were found, by name.
     """
 
     baseline: FoundPath
     plan: FoundPath
     approach: np.ndarray
     cost: CostWeights
+    certificate: Certificate
+    compared: dict[str, np.ndarray]
 
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings, *,
               progress: Progress = SILENT) -> PathPair:
-    """Plan both paths under the same limits, with the same search.
+    """Plan both paths under the same limits, and bound the cost of any path from below.
 
     Raises:
         InputError: the start is not allowed.
-        NoPathError: the goal cannot be reached; says why.
+        NoPathError: the goal cannot be reached; says why, and whether that is proven.
     """
     limits = limits_of(field, settings)
     _check_start(field, start, limits)
     goals = goal_points(goal, field, limits, seed=settings.seed)
-    nearest = goals[np.argmin(np.linalg.norm(goals - start, axis=1))]
-    engine = chosen_engine(settings.engine)
-    search = Search(iterations=settings.iterations, seed=settings.seed)
+    # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
+    weighed = CostWeights.between(field, start, goal.centre(field),
+                                  deformation=settings.deformation_weight,
+                                  distance=settings.distance_weight)
+    trees = _trees(field, start, goal, goals, settings, weighed, progress.part(0.0, 0.5))
+    problem = GentleProblem(field, limits, weighed.weights, start, goal)
+    known = [path.points for path in trees.values()]
+    gentle = plan_gentle(problem, known, progress=progress.part(0.5, 1.0))
+    if settings.planner == "d-rrt-star":
+        if "D-RRT*" not in trees:
+            raise NoPathError(
+                f"D-RRT* found no path in {settings.iterations} iterations, but there is one.",
+                "The eikonal planner found it.",
+                "Allow more --iterations, or leave --planner away.")
+        plan = trees["D-RRT*"]
+        certificate = replace(gentle.certificate, upper=problem.cost(plan.points))
+    else:
+        certificate = gentle.certificate
+        plan = FoundPath(gentle.points, gentle.cost, gentle.cost, [
+            {"iteration": number + 1, "cost": level["upper"]}
+            for number, level in enumerate(certificate.levels)], engine="eikonal")
+    baseline = trees.get("RRT*") or _shortest(problem, gentle.points)
+    compared = {"straight line": np.stack([start, goal.centre(field)]),
+                "eikonal": gentle.points}
+    for name, path in trees.items():
+        compared[name] = path.points
+        compared[f"{name}, not smoothed"] = path.raw
+    return PathPair(baseline, plan, _approach(field, start, settings), weighed, certificate,
+                    compared)
 
+
+def _trees(field: EnergyField, start: np.ndarray, goal: Goal, goals: np.ndarray,
+           settings: PlanSettings, weighed: CostWeights, progress: Progress,
+           ) -> dict[str, FoundPath]:
+    """Return what RRT* and D-RRT* find: either, both or nothing."""
     def in_goal(points: np.ndarray) -> np.ndarray:
         return goal.distance(field, points) <= goal.tolerance
 
-    found = []
-    weighed = CostWeights.between(field, start, nearest, deformation=settings.deformation_weight,
-                                  distance=settings.distance_weight)
-    shortest = CostWeights(0.0, 1.0, weighed.energy_scale, weighed.length_scale)
+    engine = chosen_engine(settings.engine)
+    search = Search(iterations=settings.iterations, seed=settings.seed)
+    shortest = replace(weighed, deformation=0.0, distance=1.0)
+    found = {}
     for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
-        part = progress.part(0.45 * number, 0.45 * (number + 1))
+        part = progress.part(0.5 * number, 0.5 * (number + 1))
         part(0.0, name)
-        problem = PathProblem(start, goals, in_goal, field, limits, cost.weights)
-        found.append(plan_path(problem, search, engine=engine, progress=part))
-    return PathPair(*found, _approach(field, start, settings), weighed)
+        problem = PathProblem(start, goals, in_goal, field, limits_of(field, settings),
+                              cost.weights)
+        try:
+            found[name] = plan_path(problem, search, engine=engine, progress=part)
+        except NoPathError as error:
+            # No verdict: the eikonal planner finds the path, or proves that there is none.
+            progress.warn(f"{name}: {error}")
+    return found
+
+
+def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
+    """Return the path made as short as it can be, where RRT* found none."""
+    weights = problem.weights._replace(energy=0.0)
+    points, cost = refine(path, replace(problem, weights=weights))
+    return FoundPath(points, cost, cost, engine="refined")
 
 
 def _approach(field: EnergyField, start: np.ndarray, settings: PlanSettings) -> np.ndarray:

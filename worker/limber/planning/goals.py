@@ -23,6 +23,10 @@ class Goal(Protocol):
         """Return grasp positions likely to be in the region, shape [n, 3]."""
         ...
 
+    def centre(self, field: EnergyField) -> np.ndarray:
+        """Return one grasp position that stands for the region, the same for any seed, [3]."""
+        ...
+
     def describe(self) -> dict:
         """Return the goal as plain data."""
         ...
@@ -42,6 +46,9 @@ class GraspGoal:
         inside = _ball(count, generator) * self.tolerance + self.position
         inside[0] = self.position
         return inside
+
+    def centre(self, field: EnergyField) -> np.ndarray:
+        return np.array(self.position, float)
 
     def describe(self) -> dict:
         return {"kind": "grasp", "position_m": list(map(float, self.position)),
@@ -67,6 +74,10 @@ class TipGoal:
             points = points + _damped_steps(field.tip_gradient(points),
                                             target - field.tip(points))
         return points
+
+    def centre(self, field: EnergyField) -> np.ndarray:
+        points = self.guess(field, 50, np.random.default_rng(0))
+        return points[np.argmin(self.distance(field, points))]
 
     def describe(self) -> dict:
         return {"kind": "tip", "position_m": list(map(float, self.position)),

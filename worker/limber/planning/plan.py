@@ -1,4 +1,4 @@
-"""RRT* and D-RRT* on the energy field, then both on the full model.
+"""The shortest and the gentlest path on the energy field, then both on the full model.
 
 The field serves to search. Every energy, force and strain that is reported comes from the finite
 elements along the found paths; how far the field was off is reported beside them.
@@ -17,11 +17,15 @@ from limber.planning.compare import (
     plan_pair,
     random_start,
 )
+from limber.planning.cost import STEP, PathMeasures, measure_path, resample
 from limber.planning.field import EnergyField
 from limber.planning.goals import Goal, GraspGoal, TipGoal, default_goal
 from limber.planning.grasp_model import GraspModel
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
+from limber.threads import one_thread
+
+_WIDE_GAP = 5.0  # percent, above which the user is told in a warning
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class PlannedMotion:
 
     Attributes:
         summary: The stage's result.
-        baseline, plan: RRT* and D-RRT*.
+        baseline, plan: The shortest path (RRT*), and the gentle one.
     """
 
     summary: dict[str, Any]
@@ -46,6 +50,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         InputError: the start is not allowed, or two goals are given.
         NoPathError: no path; the message says why.
     """
+    one_thread()
     goal = _goal(field, settings)
     start = _start(field, goal, settings)
     pair = plan_pair(field, start, goal, settings, progress=progress.part(0.0, 0.3))
@@ -88,7 +93,11 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
     before, after = baseline.measures, plan.measures
     return {
         "goal": goal.describe() | {"chosen": settings.goal is None and settings.tip_goal is None},
-        "start_m": start, "seed": settings.seed, "engine": chosen_engine(settings.engine),
+        "start_m": start, "seed": settings.seed, "planner": settings.planner,
+        "engine": chosen_engine(settings.engine),
+        "certificate": pair.certificate.describe(),
+        "paths_on_field": {name: asdict(_on_field(field, points))
+                           for name, points in pair.compared.items()},
         "weights": {"deformation": settings.deformation_weight,
                     "distance": settings.distance_weight,
                     "energy_scale_j": pair.cost.energy_scale,
@@ -116,13 +125,22 @@ def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:
             "unsolved_count": path.unsolved_count}
 
 
+def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
+    fine = resample(points, STEP / 5)
+    return measure_path(fine, field.energy(fine), np.linalg.norm(field.force(fine), axis=1))
+
+
 def _doubts(summary: dict[str, Any], *paths: ResolvedPath) -> list[str]:
     doubts = []
-    for key, label in (("baseline", "RRT*"), ("plan", "D-RRT*")):
+    for key, label in (("baseline", "shortest"), ("plan", "gentle")):
         error = summary[key]["field_energy_error"]
         if error > 0.15:
             doubts.append(f"Along the {label} path the energy field was off by {100 * error:.0f} % "
                           "of the full model's energy; more samples would help.")
+    gap = summary["certificate"]["gap_percent"]
+    if gap is not None and gap > _WIDE_GAP:
+        doubts.append(f"The path may be up to {gap:.1f} % dearer than the best possible one; "
+                      "`--planner eikonal`, the default, comes closest.")
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
         doubts.append(f"{unsolved} poses along the paths had no acceptable solution and are left "

@@ -90,6 +90,7 @@ class FoundPath:
         history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
         node_count: Size of the tree.
         engine: Which engine found it.
+        raw: The tree's polyline before shortcuts, shape [k, 3]; None from a search without trees.
     """
 
     points: np.ndarray
@@ -98,6 +99,7 @@ class FoundPath:
     history: list[dict[str, float]] = field(default_factory=list)
     node_count: int = 0
     engine: str = "own"
+    raw: np.ndarray | None = None
 
 
 def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
@@ -126,7 +128,7 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     points = slide_end(points, problem.goals, problem.limits, problem.weights)
     points = polish(points, problem.energy_field, problem.limits, problem.weights)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
-                     history, node_count, engine)
+                     history, node_count, engine, raw)
 
 
 def _search(problem: PathProblem, search: Search, progress: Progress,

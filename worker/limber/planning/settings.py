@@ -33,7 +33,7 @@ class PlanSettings(Settings):
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_energy", "max_force"),
-        "solver": ("iterations", "engine", "seed"),
+        "solver": ("planner", "iterations", "engine", "seed"),
     }
     experts = ("start_seed", "iterations", "engine")
 
@@ -55,7 +55,10 @@ class PlanSettings(Settings):
         "Deformation energy that no pose may exceed [J]."))
     max_force: float | None = Field(None, gt=0, description=(
         "Force of the gripper that no pose may exceed [N]."))
-    iterations: int = Field(3000, ge=100, le=200_000, description="Samples of each planner.")
+    planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
+        "eikonal: the cheapest way on a grid, refined, mostly within 1 % of the best possible "
+        "path; d-rrt-star: the paper's D-RRT*. Either comes with a proven bound."))
+    iterations: int = Field(3000, ge=100, le=200_000, description="Samples of RRT* and D-RRT*.")
     engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
-        "OMPL's RRT* or our own; auto: OMPL where it is installed."))
+        "For RRT* and D-RRT*: OMPL's or our own; auto: OMPL where it is installed."))
     seed: int = Field(0, ge=0, description="Of both planners.")

@@ -65,7 +65,7 @@ def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
 
     def cost(flat: np.ndarray) -> tuple[float, np.ndarray]:
         moved = np.concatenate([corners[:1], flat.reshape(inner), corners[-1:]])
-        value, gradient = _smooth_cost(moved, energy_field, weights)
+        value, gradient = smooth_cost(moved, energy_field, weights)
         return value, gradient[1:-1].ravel()
 
     best = minimize(cost, corners[1:-1].ravel(), jac=True, method="L-BFGS-B",
@@ -80,7 +80,7 @@ def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
     return path
 
 
-def _smooth_cost(path: np.ndarray, energy_field: EnergyField, weights: EdgeWeights,
+def smooth_cost(path: np.ndarray, energy_field: EnergyField, weights: EdgeWeights,
                  ) -> tuple[float, np.ndarray]:
     """Return the trapezoidal cost of a polyline and its gradient to each point, [n, 3]."""
     edges = np.diff(path, axis=0)

@@ -43,6 +43,14 @@ class TrustRegion:
         return _contain(np.ascontiguousarray(points, float).reshape(-1, self.accepted.shape[1]),
                         self.planes, self.accepted, self.rejected)
 
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Return how far ``points`` [n, d] are above the hull's highest plane [m], [n].
+
+        Negative inside; nowhere does it grow faster than a metre a metre.
+        """
+        return _heights(np.ascontiguousarray(points, float).reshape(-1, self.accepted.shape[1]),
+                        self.planes)
+
     @property
     def low(self) -> np.ndarray:
         """Lower corner of the bounding box [m], shape [d]."""
@@ -89,6 +97,19 @@ def _nearest(point, others):
             squared += (point[k] - others[i, k]) ** 2
         best = min(best, squared)
     return best
+
+
+@compiled
+def _heights(points, planes):
+    dimension = points.shape[1]
+    out = np.full(len(points), -np.inf)
+    for n in range(len(points)):
+        for i in range(len(planes)):
+            height = planes[i, dimension]
+            for k in range(dimension):
+                height += planes[i, k] * points[n, k]
+            out[n] = max(out[n], height)
+    return out
 
 
 @compiled

@@ -246,11 +246,15 @@ def _plan(branch: Branch, name: str) -> Section:
 
     section = Section(f"Paths: {name}")
     plan = read_plan(branch.path(f"plans/{name}.json")).summary
-    section.tables.append(("RRT* (length alone) against D-RRT* (deformation-aware), both scored "
-                           "on the full model", comparison_rows(plan)))
+    section.tables.append(("Shortest path (length alone) against the gentle one "
+                           "(deformation-aware), both scored on the full model",
+                           comparison_rows(plan)))
     section.text.append(
-        f"D-RRT* saves {plan['energy_saved_percent']:.1f} % of the energy along the path for "
-        f"{plan['length_added_percent']:+.1f} % of length. Seed {plan['seed']}.")
+        f"The gentle path saves {plan['energy_saved_percent']:.1f} % of the energy along the "
+        f"path for {plan['length_added_percent']:+.1f} % of length. Seed {plan['seed']}.")
+    if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
+        section.text.append(f"Certificate: on the energy field it is at most {gap:.1f} % above the "
+                            "best possible path; no path is cheaper than the lower bound.")
     for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
     return section

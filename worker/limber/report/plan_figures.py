@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {"baseline": "#c0504d", "plan": "#1f5fa8"}
-_LABELS = {"baseline": "RRT* (length alone)", "plan": "D-RRT* (deformation-aware)"}
+_LABELS = {"baseline": "shortest (length alone)", "plan": "gentle (deformation-aware)"}
 _GRID = 160  # points of the slice along its longer side
 
 

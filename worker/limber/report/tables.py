@@ -24,8 +24,8 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
 
 
 def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
-    """Return the paper's comparison of both paths, with peaks and changes in percent."""
-    rows = [["measure", "RRT*", "D-RRT*", "change"]]
+    """Return shortest against gentle path, with peaks and changes in percent."""
+    rows = [["measure", "shortest", "gentle", "change"]]
     for label, key, unit in [
             ("path length", "length_m", "m"),
             ("energy along the path", "energy_integral_jm", "J m"),

@@ -1,0 +1,195 @@
+"""The lower bound: below every path, close to the best, and its one assumption by brute force."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.errors import NoPathError
+from limber.planning import certificate
+from limber.planning.certificate import certify
+from limber.planning.compare import plan_pair
+from limber.planning.cost import CostWeights
+from limber.planning.gentle import plan_gentle
+from limber.planning.goals import GraspGoal, TipGoal
+from limber.planning.problem import GentleProblem
+from limber.planning.refine import refine, violation
+from limber.planning.settings import PlanSettings
+from limber.planning.smoothing import smooth_cost
+from limber.planning.trust import TrustRegion
+
+START = np.array([-0.06, -0.03, 0.02])
+GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)
+
+
+def problem_on(field, *, start=START, goal=GOAL, deformation=1.0, **limits):
+    weights = CostWeights.between(field, start, goal.centre(field), deformation=deformation,
+                                  distance=1.5).weights
+    return GentleProblem(field, field.limited(**limits), weights, start, goal)
+
+
+@pytest.fixture(scope="module")
+def across(ridge_field):
+    """A path that has to get round the ridge, with its certificate."""
+    problem = problem_on(ridge_field)
+    return problem, plan_gentle(problem)
+
+
+def bulges(problem, count):
+    """Paths from start to goal that leave the line in random directions."""
+    generator = np.random.default_rng(5)
+    part = np.linspace(0.0, 1.0, 40)[:, None]
+    end = problem.goal.centre(problem.energy_field)
+    for _ in range(count):
+        side = 0.05 * generator.normal(size=3)
+        yield problem.start + part * (end - problem.start) + np.sin(np.pi * part) * side
+
+
+def test_bound_is_below_and_plan_within_a_percent_of_an_independent_optimum(across):
+    """Of many refined bulges none is below the bound, and the plan is as good as the best."""
+    problem, found = across
+    best = min(refine(path, problem)[1] for path in bulges(problem, 6))
+    assert found.certificate.lower <= best
+    assert found.cost <= 1.01 * best
+    assert found.certificate.gap < 0.02
+    assert found.cost == pytest.approx(found.certificate.upper)
+
+
+def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across, monkeypatch):
+    """At random points of open cells |grad u| <= c, with c from the field and not from the grid."""
+    problem, found = across
+    seen = []
+    original = certificate.subsolution
+
+    def kept(ground, known, shape, inside, **options):
+        result = original(ground, known, shape, inside, **options)
+        seen.append((ground, result[0], inside))
+        return result
+
+    monkeypatch.setattr(certificate, "subsolution", kept)
+    grids = []
+    bound = certificate._bound
+    monkeypatch.setattr(certificate, "_bound", lambda problem, grid, cell: (
+        grids.append(grid), bound(problem, grid, cell))[1])
+    certify(problem, lambda _path: found.cost)
+    generator = np.random.default_rng(2)
+    checked = 0
+    for grid in grids:
+        ground, u, inside = next(item for item in seen
+                                 if item[1].shape == grid.open_cells.shape)
+        cells = np.argwhere(ground.open_cells & ~inside)
+        cells = cells[generator.integers(len(cells), size=3000)]
+        place = generator.uniform(size=(len(cells), 3))
+        slope = np.linalg.norm(_spline_slope(u, cells, place), axis=1) / grid.spacing
+        points = grid.points(cells + place)
+        rate = problem.weights.length + problem.weights.energy * problem.energy_field.energy(points)
+        assert (slope <= rate * (1 + 1e-9)).all()
+        assert (slope > 0.9 * rate).mean() > 0.3  # and not for being far below
+        checked += len(cells)
+    assert checked >= 6000
+
+
+def _spline_slope(u, cells, place):
+    """Slopes [n, 3] of the quadratic B-spline per cell edge at ``place`` [n, 3] in ``cells``."""
+    t = place[:, :, None]
+    value = np.concatenate([(1 - t) ** 2 / 2, 0.5 + t - t**2, t**2 / 2], axis=2)
+    slope = np.concatenate([t - 1, 1 - 2 * t, t], axis=2)
+    block = np.stack([u[tuple(slice(k - 1, k + 2) for k in cell)] for cell in cells])
+    return np.stack([np.einsum("nijk,ni,nj,nk->n", block, *[
+        (slope if axis == component else value)[:, axis] for axis in range(3)])
+        for component in range(3)], axis=1)
+
+
+def test_without_deformation_the_bound_is_the_distance(well_field):
+    """Length alone: the best cost is the straight distance to the goal's face."""
+    problem = problem_on(well_field, deformation=0.0)
+    found = plan_gentle(problem)
+    line = np.linalg.norm(np.array(GOAL.position) - START)
+    best = 1.5 * (line - GOAL.tolerance) / line
+    assert found.certificate.lower <= best * (1 + 1e-9)
+    assert found.certificate.lower == pytest.approx(best, rel=0.01)
+    assert found.cost == pytest.approx(best, rel=0.002)
+
+
+def test_from_the_rest_pose_and_for_the_tip(ridge_field):
+    """A bound holds for a goal of the tip too, and is close."""
+    wanted = ridge_field.tip(np.array([GOAL.position]))[0]
+    problem = problem_on(ridge_field, start=ridge_field.rest.copy(),
+                         goal=TipGoal(tuple(wanted), 0.015))
+    found = plan_gentle(problem)
+    best = min(refine(path, problem)[1] for path in bulges(problem, 4))
+    assert found.certificate.lower <= min(best, found.cost) * (1 + 1e-9)
+    assert found.cost <= 1.01 * best
+    assert found.certificate.gap < 0.05
+
+
+def test_field_error_lowers_the_bound(across):
+    """What the energy may be wrong by is taken off the bound, about its share of the cost."""
+    problem, found = across
+    unsure = plan_gentle(replace(problem, field_error=0.02))
+    length = np.linalg.norm(np.diff(found.points, axis=0), axis=1).sum()
+    off = 0.02 * problem.weights.energy * length
+    assert found.certificate.lower - unsure.certificate.lower == pytest.approx(off, rel=0.3)
+
+
+def test_no_path_is_proven_where_a_limit_separates(well_field):
+    """A wall of refused poses between start and goal: that there is no path is proven, and said."""
+    start, goal = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
+    accepted = well_field.samples.positions
+    accepted = accepted[np.abs(accepted[:, 0]) > 0.05]
+    walled = replace(well_field, region=TrustRegion.of(accepted, _wall()))
+    with pytest.raises(NoPathError, match=r"No path exists.*Proven on a grid"):
+        plan_gentle(problem_on(walled, start=start, goal=goal))
+
+
+def _wall():
+    """Refused poses in a layer across x = 0."""
+    y, z = np.meshgrid(np.arange(-0.25, 0.26, 0.02), np.arange(-0.25, 0.26, 0.02))
+    return np.stack([0 * y, y, z], axis=-1).reshape(-1, 3)
+
+
+def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
+    """With a limit on force that binds, the refined path keeps it and gets close to it."""
+    free = plan_gentle(problem_on(ridge_field))
+    force = np.linalg.norm(ridge_field.force(free.points), axis=1)
+    ends = max(force[0], force[-1])
+    limit = max(0.93 * force.max(), 1.02 * ends)
+    held = plan_gentle(problem_on(ridge_field, max_force=limit))
+    kept = np.linalg.norm(ridge_field.force(held.points), axis=1)
+    assert kept.max() <= limit
+    assert held.cost >= free.cost * (1 - 1e-6)
+    assert held.certificate.lower <= held.cost
+
+
+def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
+    """Analytic gradients agree with central differences, limits broken and goal missed."""
+    problem = problem_on(ridge_field, max_energy=0.02, max_force=0.5)
+    path = next(bulges(problem, 1))[::4] * 1.6
+    path[-1] += 0.05
+    direction = np.random.default_rng(0).normal(size=path.shape)
+    step = 1e-6
+
+    def both(points):
+        value, slope = smooth_cost(points, problem.energy_field, problem.weights)
+        broken, push = violation(points, problem, 1e-3, 0.2)
+        return value + 50.0 * broken, slope + 50.0 * push
+
+    ahead, behind = both(path + step * direction)[0], both(path - step * direction)[0]
+    assert violation(path, problem, 1e-3, 0.2)[0] > 0.01
+    assert (both(path)[1] * direction).sum() == pytest.approx((ahead - behind) / (2 * step),
+                                                              rel=1e-3)
+
+
+def test_costs_of_two_seeds_compare(ridge_field):
+    """Scales and the plan's cost do not depend on the seed; D-RRT* is never below the bound."""
+    found = [plan_pair(ridge_field, START, GOAL, PlanSettings(
+        seed=seed, iterations=300, engine="own", planner=planner))
+        for seed, planner in ((0, "eikonal"), (1, "d-rrt-star"))]
+    assert found[0].cost == found[1].cost
+    first, second = (pair.certificate for pair in found)
+    assert first.lower == pytest.approx(second.lower, rel=0.01)
+    assert first.upper <= second.upper * (1 + 1e-9)
+    assert max(first.lower, second.lower) <= first.upper
+    assert set(found[0].compared) == {
+        "straight line", "eikonal", "RRT*", "RRT*, not smoothed", "D-RRT*",
+        "D-RRT*, not smoothed"}

@@ -1,0 +1,333 @@
+"""How close to the best a path is: a proven lower bound on the cost of every path.
+
+On the field in three coordinates the gentlest path is a shortest path in a metric that stretches
+by c = a_def E / (E0 L0) + a_dis / L0. A sub-solution on a grid (:mod:`limber.planning.subsolution`)
+bounds its cost from below. The grid is turned so that its first axis runs from the start to the
+goal, and refined where a better path than the known one could still run: a cell through which
+even the bounds say no path is as cheap drops out, and what is left is a thin tube.
+
+Limits: a cell where motion is surely not allowed is closed; a cell in doubt stays open, so the
+bound stays one. If closed cells separate start and goal, that proves that no path exists.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.ndimage import binary_dilation, label, maximum_filter
+
+from limber.errors import NoPathError
+from limber.planning.problem import GentleProblem
+from limber.planning.subsolution import (
+    CURVATURE_FACTOR,
+    Terrain,
+    corner_values,
+    corners_of,
+    curvature_allowance,
+    least_in_cells,
+    second_differences,
+    spline_value,
+    subsolution,
+    terrain,
+)
+from limber.progress import SILENT, Progress
+
+_FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
+_MOST_CELLS = 300_000  # of any grid's tube; the next refinement is left away
+_LEVELS = 5
+_CUT = 3  # of a cell's edge from one grid to the next
+_CHILDREN = _CUT**3
+_ENOUGH = 0.01  # gap below which no further refinement is worth its time
+_NEAR = np.ones((3, 3, 3))
+_BEYOND = 1.2  # on the steepest measured growth of the goal's distance
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A lower bound and how it was reached.
+
+    Attributes:
+        lower: No path to the goal costs less.
+        upper: Cost of the best path known, infinite without one.
+        levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper``.
+        field_error_j: What was subtracted from the energy before bounding [J].
+    """
+
+    lower: float
+    upper: float
+    levels: list[dict[str, float]] = field(default_factory=list)
+    field_error_j: float = 0.0
+
+    @property
+    def gap(self) -> float:
+        """How far above the best the known path can be at most: upper / lower - 1."""
+        return self.upper / self.lower - 1.0 if self.lower > 0.0 else np.inf
+
+    def describe(self) -> dict:
+        """Return the certificate as plain data."""
+        gap = 100.0 * self.gap if np.isfinite(self.gap) else None
+        levels = [{name: value if np.isfinite(value) else None for name, value in level.items()}
+                  for level in self.levels]
+        return {"lower_bound": self.lower, "upper_bound": self.upper, "gap_percent": gap,
+                "field_error_j": self.field_error_j, "levels": levels}
+
+
+Improve = Callable[[np.ndarray | None], float]
+"""Takes a rough path [n, 3] along the cheapest way of a grid; returns the best known cost."""
+
+
+@dataclass
+class _Grid:
+    """Cells in the turned frame; corner ``(i, j, k)`` lies at ``origin + (i, j, k) h``."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+    spacing: float
+    open_cells: np.ndarray
+
+    def points(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the positions [n, 3] of corners ``numbers`` [n, 3]; halves are centres."""
+        return self.origin + (numbers * self.spacing) @ self.axes
+
+    def spread(self, corners: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return ``values`` at ``corners`` [n, 3] of the whole grid, nan elsewhere."""
+        return _spread(tuple(n + 1 for n in self.open_cells.shape), corners, values)
+
+
+def _spread(shape: tuple[int, ...], places: np.ndarray, values: np.ndarray) -> np.ndarray:
+    whole = np.full(shape, np.nan)
+    whole[tuple(places.T)] = values
+    return whole
+
+
+def certify(problem: GentleProblem, improve: Improve, *, enough: float = _ENOUGH,
+            progress: Progress = SILENT) -> Certificate:
+    """Return a lower bound on the cost of every path, refined until it is close to the known one.
+
+    Raises:
+        NoPathError: closed cells separate start and goal; it is proven that no path exists.
+    """
+    grid, cell = _first_grid(problem)
+    lower, upper, levels = 0.0, np.inf, []
+    for level in range(_LEVELS):
+        progress(level / _LEVELS, "bounding the best path", lower=lower, upper=upper)
+        found = _bound(problem, grid, cell)
+        if level == 0:
+            upper = improve(None)  # after the first bound, which may prove that there is no path
+        upper = min(upper, improve(found.rough_path))
+        lower = max(lower, min(found.lower, upper))
+        levels.append({"spacing_m": grid.spacing, "open_cells": int(found.open_cells.sum()),
+                       "lower": lower, "upper": upper})
+        if upper <= (1.0 + enough) * lower:
+            break
+        keep = found.keep(upper)
+        if _CHILDREN * keep.sum() > _MOST_CELLS:
+            break
+        grid, cell = _refined(grid, keep, cell)
+    return Certificate(lower, upper, levels, problem.field_error)
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """The sub-solution of the goal on one grid, and what it says."""
+
+    lower: float
+    ground: Terrain
+    to_goal: np.ndarray
+    cell: np.ndarray
+    slack: float
+    rough_path: np.ndarray
+
+    @property
+    def open_cells(self) -> np.ndarray:
+        return self.ground.open_cells
+
+    def keep(self, upper: float) -> np.ndarray:
+        """Return the cells through which a path could still be cheaper than ``upper``."""
+        through = least_in_cells(self.to_goal + _from_start(self.ground, self.cell),
+                                 self.open_cells)
+        return self.open_cells & np.isfinite(through) & (through - self.slack <= upper)
+
+
+def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
+    # One corner more than the active cells': for the second differences there.
+    corners = np.argwhere(binary_dilation(corners_of(binary_dilation(grid.open_cells, _NEAR)),
+                                          _NEAR))
+    points = grid.points(corners)
+    open_cells = grid.open_cells & ~_surely_closed(problem, grid, corners, points)
+    if not open_cells[tuple(cell)]:
+        raise _separated(problem, grid, open_cells)
+    # Only what hangs together with the start, also by an edge or a corner of a cell.
+    together = label(open_cells, _NEAR)[0]
+    open_cells = together == together[tuple(cell)]
+    raw = grid.spread(corners, problem.energy_field.energy(points) - problem.field_error)
+    rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
+    ground = terrain(rate, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
+    known, shape, inside, slack, meets = _about_goal(problem, grid, ground)
+    if not meets:
+        raise _separated(problem, grid, open_cells)
+    to_goal, factor = subsolution(ground, known, shape, inside)
+    lower = spline_value(to_goal, cell) - factor * slack
+    return _Bounds(max(lower, 0.0), ground, to_goal, cell, factor * slack,
+                   _descent(grid, to_goal, cell))
+
+
+def _about_goal(problem: GentleProblem, grid: _Grid, ground: Terrain,
+                ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]:
+    """Return cells on and about the goal, a signed length there, cells inside it, its error [m].
+
+    Every point of the goal lies in a cell that has all its coefficients among the known ones;
+    there the spline of the length is at most the error (a spline whose coefficients are a
+    function's values differs from it by ``h^2 / 8 sum_i max |second derivative|``). Last: whether
+    any open cell may have a point of the goal.
+    """
+    h = ground.spacing
+    cells = np.argwhere(ground.active)
+    centres = grid.points(cells + 0.5)
+    distance = _spread(ground.open_cells.shape, cells,
+                       problem.goal.distance(problem.energy_field, centres)
+                       - problem.goal.tolerance)
+    filled = np.nan_to_num(distance, nan=np.inf)
+    growth = _growth(distance, np.abs(filled) <= 4.0 * h, h)
+    length = distance / growth
+    curved = CURVATURE_FACTOR / 8.0 * sum(
+        maximum_filter(second, 3) for second in second_differences(length))
+    half = 0.5 * h * np.sqrt(3.0)
+    touching = ground.open_cells & (filled <= growth * half)
+    known = filled <= growth * 3.0 * half
+    inside = filled < -growth * half
+    border = touching & ~inside
+    slack = float(curved[border].max()) if border.any() else 0.0
+    return (known, np.nan_to_num(np.maximum(length, -2.0 * h)), inside, slack,
+            bool(touching.any()))
+
+
+def _growth(distance: np.ndarray, near: np.ndarray, h: float) -> float:
+    """Return the most that the goal's distance grows a metre, among cells ``near`` it."""
+    growth = 1.0
+    for axis in range(3):
+        step = np.abs(np.diff(distance, axis=axis)) / h
+        first, second = (np.take(near, range(k, near.shape[axis] - 1 + k), axis=axis)
+                         for k in (0, 1))
+        growth = max(growth, float(np.max(step, where=first & second, initial=0.0)))
+    # A grasp's distance grows by a metre at most; a target's by what the field says, and more.
+    return growth if growth <= 1.0 + 1e-9 else growth * _BEYOND * np.sqrt(3.0)
+
+
+def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
+    h = ground.spacing
+    offsets = [(np.arange(n) - k).reshape([-1 if a == axis else 1 for a in range(3)])
+               for axis, (n, k) in enumerate(zip(ground.open_cells.shape, cell, strict=True))]
+    away = h * np.sqrt(sum(offset**2 for offset in offsets))
+    rounded = np.sqrt(away**2 + 4.0 * h**2) - 2.0 * h  # a cone with a blunt tip: no kink
+    nothing = np.zeros(ground.open_cells.shape, bool)
+    u, factor = subsolution(ground, away <= 3.0 * h, rounded, nothing, rounds=2)
+    # The spline lies above its blunt tip's zero at the start by at most its error there.
+    return u - factor * CURVATURE_FACTOR * 3.0 * h / 16.0
+
+
+def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, points: np.ndarray,
+                   ) -> np.ndarray:
+    """Return the cells in which no point is allowed."""
+    limits, region = problem.limits, problem.energy_field.region
+    far = grid.spacing * np.sqrt(3.0)  # from a corner to any point of the cell
+    height = region.height(points)
+    # Heights above planes grow by at most a metre a metre: one corner speaks for its cell.
+    closed = _corners_of(grid, nodes, height - far).max(axis=0) > 0.0
+    if len(region.rejected):
+        from scipy.spatial import cKDTree
+
+        beyond = (cKDTree(region.accepted).query(points)[0]
+                  - cKDTree(region.rejected).query(points)[0])
+        closed |= _corners_of(grid, nodes, beyond - 2.0 * far).max(axis=0) > 0.0
+    if limits.max_energy < np.inf:
+        energy = grid.spread(nodes, problem.energy_field.energy(points))
+        closed |= _all_above(energy, limits.max_energy + problem.field_error)
+    if limits.max_force < np.inf:
+        force = grid.spread(nodes, (problem.energy_field.force(points)**2).sum(axis=1))
+        closed |= _all_above(force, limits.max_force**2)
+    return closed
+
+
+def _corners_of(grid: _Grid, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(corner_values(grid.spread(nodes, values)), nan=-np.inf)
+
+
+def _all_above(values: np.ndarray, limit: float) -> np.ndarray:
+    least = np.nan_to_num(corner_values(values).min(axis=0), nan=-np.inf)
+    return least - curvature_allowance(values) > limit
+
+
+def _first_grid(problem: GentleProblem) -> tuple[_Grid, np.ndarray]:
+    """Return a grid over the sampled region, and the cell in whose centre the start lies."""
+    region, start = problem.energy_field.region, problem.start
+    axes = _axes(problem.goal.centre(problem.energy_field) - start)
+    corners = (region.accepted - start) @ axes.T
+    low = np.minimum(corners.min(axis=0), 0.0)
+    high = np.maximum(corners.max(axis=0), 0.0)
+    spacing = float(np.cbrt(np.prod(high - low) / _FIRST_CELLS))
+    before = np.ceil(-low / spacing - 0.5).astype(int) + 2
+    after = np.ceil(high / spacing - 0.5).astype(int) + 3
+    open_cells = np.pad(np.ones(tuple(before + after - 4), bool), 2)
+    return _Grid(start - ((before + 0.5) * spacing) @ axes, axes, spacing, open_cells), before
+
+
+def _axes(direction: np.ndarray) -> np.ndarray:
+    """Return three unit rows, the first along ``direction``."""
+    length = float(np.linalg.norm(direction))
+    if length == 0.0:
+        return np.eye(3)
+    first = direction / length
+    second = np.cross(first, np.eye(3)[np.argmin(np.abs(first))])
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)])
+
+
+def _refined(grid: _Grid, keep: np.ndarray, cell: np.ndarray) -> tuple[_Grid, np.ndarray]:
+    """Return cells of a third the edge over ``keep``, in the smallest box; and the start's.
+
+    A third, not a half: so the start stays in the centre of a cell.
+    """
+    places = np.argwhere(keep)
+    low = np.minimum(places.min(axis=0), cell)
+    high = np.maximum(places.max(axis=0), cell) + 1
+    box = keep[low[0]:high[0], low[1]:high[1], low[2]:high[2]]
+    for axis in range(3):
+        box = np.repeat(box, _CUT, axis=axis)
+    # Closed cells all around, for the coefficients and second differences next to the tube.
+    spacing = grid.spacing / _CUT
+    origin = grid.points(low[None].astype(float))[0] - 2.0 * spacing * grid.axes.sum(axis=0)
+    return (_Grid(origin, grid.axes, spacing, np.pad(box, 2)),
+            _CUT * (cell - low) + _CUT // 2 + 2)
+
+
+def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Return the way downhill from the start by cells' centres [n, 3]: the course of a path."""
+    reach = np.stack(np.meshgrid(*[np.arange(-2, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    reach = reach[np.abs(reach).sum(axis=1) > 0]
+    length = np.linalg.norm(reach, axis=1)
+    way, here = [cell], cell
+    while u[tuple(here)] > 0.0 and len(way) < sum(u.shape):
+        near = here + reach
+        within = ((near >= 0) & (near < u.shape)).all(axis=1)
+        drop = (u[tuple(here)] - u[tuple(near[within].T)]) / length[within]
+        best = int(np.argmax(drop))
+        if not drop[best] > 0.0:
+            break
+        here = near[within][best]
+        way.append(here)
+    return grid.points(np.array(way) + 0.5)
+
+
+def _separated(problem: GentleProblem, grid: _Grid, open_cells: np.ndarray) -> NoPathError:
+    limits = problem.limits
+    kept = [f"{name} {value:.3g} {unit}" for name, value, unit in (
+        ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N")) if value < np.inf]
+    what = (" at most " + " and ".join(kept)) if kept else ""
+    share = 100.0 * open_cells.mean()
+    return NoPathError(
+        f"No path exists: with{what or ' poses that the branch accepts'} no way leads from the "
+        "start to the goal.",
+        f"Proven on a grid of {1e3 * grid.spacing:.1f} mm: cells where motion is surely not "
+        f"allowed separate the two ({share:.0f} % of the region's box is open).",
+        "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")

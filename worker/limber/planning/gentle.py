@@ -1,0 +1,64 @@
+"""The gentlest path with its certificate: eikonal descent, refinement, bound.
+
+Each grid of the certificate shows the cheapest way on it; refined, it is a path. The first paths
+that are tried are the straight line and what other planners found.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.errors import NoPathError
+from limber.planning.certificate import Certificate, certify
+from limber.planning.cost import arc_lengths
+from limber.planning.problem import GentleProblem
+from limber.planning.refine import refine
+from limber.progress import SILENT, Progress
+
+
+@dataclass(frozen=True)
+class GentlePath:
+    """A path [n, 3], its cost, and how close to the best it is."""
+
+    points: np.ndarray
+    cost: float
+    certificate: Certificate
+
+
+def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, *,
+                progress: Progress = SILENT) -> GentlePath:
+    """Return the gentlest path that was found, and a lower bound on every path.
+
+    ``others`` are paths [n, 3] to start from besides the straight line.
+
+    Raises:
+        NoPathError: it is proven that there is none, or none was found; says which.
+    """
+    best: list = [None, np.inf]
+
+    def improve(rough: np.ndarray | None) -> float:
+        if rough is None:
+            starts = [_straight(problem), *(others or [])]
+        else:
+            starts = [rough]
+        for path in starts:
+            if len(path) < 2 or not arc_lengths(path)[-1] > 0.0:
+                continue
+            points, cost = refine(path, problem)
+            if cost < best[1]:
+                best[:] = points, cost
+        return best[1]
+
+    certificate = certify(problem, improve, progress=progress)
+    if best[0] is None:
+        raise NoPathError(
+            "No allowed path to the goal was found, nor is it proven that none exists.",
+            f"The bound says a path costs at least {certificate.lower:.3g} "
+            f"(grid of {1e3 * certificate.levels[-1]['spacing_m']:.1f} mm).",
+            "Sample more poses with `limber energy --samples`, or loosen the limits a little.")
+    return GentlePath(best[0], best[1], certificate)
+
+
+def _straight(problem: GentleProblem) -> np.ndarray:
+    end = problem.goal.centre(problem.energy_field)
+    return problem.start + np.linspace(0.0, 1.0, 40)[:, None] * (end - problem.start)

@@ -1,0 +1,43 @@
+"""One planning problem: where from, where to, what a metre costs and what is not allowed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.planning.cost import EdgeWeights, resample
+from limber.planning.field import EnergyField, FieldArrays
+from limber.planning.goals import Goal
+
+_FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
+
+
+@dataclass(frozen=True)
+class GentleProblem:
+    """Any path from ``start`` [3] into ``goal`` within ``limits`` (see ``EnergyField.limited``).
+
+    ``weights`` are the cost of an edge. ``field_error`` [J] is subtracted from the energy where a
+    lower bound is asked for, so that it holds for every branch whose energy lies that near.
+    """
+
+    energy_field: EnergyField
+    limits: FieldArrays
+    weights: EdgeWeights
+    start: np.ndarray
+    goal: Goal
+    field_error: float = 0.0
+
+    def cost(self, path: np.ndarray) -> float:
+        """Return the cost of a polyline [n, 3]; infinite if it breaks a limit or misses the goal.
+
+        Finer than the planners' edges: what is reported must not owe to their quadrature.
+        """
+        from limber.planning.cost import path_cost
+
+        if self.goal_excess(path[-1]) > 1e-9:
+            return np.inf
+        fine = resample(np.ascontiguousarray(path, float), _FINE)
+        return float(path_cost(fine, self.limits, self.weights._replace(step=_FINE)))
+
+    def goal_excess(self, point: np.ndarray) -> float:
+        """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
+        return float(self.goal.distance(self.energy_field, point[None])[0]) - self.goal.tolerance
