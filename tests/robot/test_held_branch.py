@@ -9,7 +9,12 @@ from tests.subjects.meshes import box_mesh
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.robot.kinematics import inverted, matrices
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.held_branch import BranchSetting, HeldBranch, grasp_stiffness
+from limber.robot.virtual.held_branch import (
+    BranchSetting,
+    HeldBranch,
+    extrapolated,
+    grasp_stiffness,
+)
 from limber.robot.virtual.launch import VirtualRobot
 
 TIP = np.array([0.0, 0.0, 0.3])
@@ -35,7 +40,7 @@ def setting(beam, tmp_path_factory) -> BranchSetting:
     base = np.zeros(6)
     base[:3] = np.r_[middle, TIP[2]] - gripper[:3, 3]
     point = (float(middle[0]), float(middle[1]), 0.2)
-    return BranchSetting(path, tuple(base), grasp, points=(point,))
+    return BranchSetting(path, tuple(base), grasp, points=(point,), compliance=0.0)
 
 
 def model_of(beam) -> BranchModel:
@@ -139,6 +144,21 @@ def test_sliding_in_the_grip_lets_the_force_fall(held):
     held.slide(0.5)
     after = np.linalg.norm(held.wrench(moved, 0.002)[:3])
     assert 0.3 * before < after < 0.7 * before
+
+
+def test_what_gives_way_is_in_series_with_the_branch(held):
+    """A wrench F at compliance C is that of the branch C F nearer to its rest."""
+    flange = Controller("ur5e").flange
+    held.wrench(flange, 0.002)
+    assert closed(held, flange) == "held"
+    solution, patch = held._solution, held._gripper @ held._offset
+    patch = patch.copy()
+    patch[:3, 3] += [0.001, -0.002, 0.0005]
+    felt = extrapolated(solution, patch, 1e-4)
+    back = patch.copy()
+    back[:3, 3] -= 1e-4 * felt[:3]
+    assert felt == pytest.approx(extrapolated(solution, back, 0.0), abs=1e-9)
+    assert np.linalg.norm(felt) < np.linalg.norm(extrapolated(solution, patch, 0.0))
 
 
 def test_closing_on_nothing_is_told(held):

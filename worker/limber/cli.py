@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 # Designed, not built: named so that nobody looks for them in vain.
 NOT_YET = {
-    "execute": "follow a path with a robot (paths are in plans/NAME.csv)",
     "batch": "many jobs, on this machine or a cluster (`limber reconstruct` takes a folder)",
 }
 

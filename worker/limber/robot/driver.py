@@ -29,8 +29,8 @@ from limber.robot.samples import Dashboard, Sample, SampleStream
 from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
 from limber.robot.trajectory import Trajectory
 
-WATCHDOG_HZ = 20.0
-"""The controller ends the program when it hears nothing for a twentieth of a second."""
+WATCHDOG_HZ = 10.0
+"""The controller ends the program when it hears nothing for a tenth of a second."""
 PARENT_SECONDS = 1.0
 """The parent says something at least this often, or the robot stops."""
 

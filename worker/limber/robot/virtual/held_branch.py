@@ -35,6 +35,8 @@ class BranchSetting:
         jaw: Half width of what the gripper takes hold of along the branch [m].
         grip: Force that the grip bears before the branch slips out [N].
         break_strain: Greatest principal strain that the branch bears.
+        compliance: What arm, fingers and bark give way by [m/N]. A branch is so stiff along its
+            axis that a tenth of a millimetre would be newtons in a grip that gives nothing.
     """
 
     mesh: Path
@@ -45,6 +47,7 @@ class BranchSetting:
     jaw: float = 0.012
     grip: float = 80.0
     break_strain: float = 0.2
+    compliance: float = 5e-5
 
     @classmethod
     def of_truth(cls, truth: Any, cell: Any, path: Path, *, poisson: float = 0.35,
@@ -135,7 +138,7 @@ class HeldBranch:
             self.lose("broken")
             return np.zeros(6)
         self._jump *= np.exp(-seconds / _BLEND_SECONDS)
-        on_branch = extrapolated(solution, patch) + self._jump
+        on_branch = self._extrapolated(solution, patch) + self._jump
         if np.linalg.norm(on_branch[:3]) > self.setting.grip:
             self.lose("slipped")
             return np.zeros(6)
@@ -211,10 +214,15 @@ class HeldBranch:
             self._busy, self._age = False, 0.0
             if before is not None:
                 # The wrench goes over to the new solution, a branch's force does not jump.
-                self._jump += extrapolated(before, patch) - extrapolated(self._solution, patch)
+                self._jump += (self._extrapolated(before, patch)
+                               - self._extrapolated(self._solution, patch))
             self._points_age = self._asked_age
         if not self._busy:
-            self._pipe.send(("solve", patch))
+            given_way = patch.copy()
+            if self._solution is not None:
+                force = self._extrapolated(self._solution, patch)[:3]
+                given_way[:3, 3] -= self.setting.compliance * force
+            self._pipe.send(("solve", given_way))
             self._busy, self._asked_age = True, 0.0
 
     def _receive(self, kind: str) -> dict[str, Any]:
@@ -226,6 +234,9 @@ class HeldBranch:
         assert got == kind
         return content
 
+    def _extrapolated(self, solution: Solution, patch: np.ndarray) -> np.ndarray:
+        return extrapolated(solution, patch, self.setting.compliance)
+
     def _at_flange(self, wrench: np.ndarray, patch: np.ndarray, flange: np.ndarray) -> np.ndarray:
         """A wrench at the patch, branch frame, as one at the flange in its frame."""
         rotation = (self._base[:3, :3] @ flange[:3, :3]).T
@@ -235,11 +246,16 @@ class HeldBranch:
         return np.concatenate((force, torque + crossed(lever, force)))
 
 
-def extrapolated(solution: Solution, patch: np.ndarray) -> np.ndarray:
-    """Return the wrench at a frame of the patch [4, 4] near that of a solution, shape [6]."""
+def extrapolated(solution: Solution, patch: np.ndarray, compliance: float) -> np.ndarray:
+    """Return the wrench with the gripper where the patch's frame would be ``patch`` [4, 4].
+
+    The patch stays behind by ``compliance`` [m/N] times the force; near the frame of a solution.
+    """
     change = np.concatenate((patch[:3, 3] - solution.frame[:3, 3],
                              rotation_vector(patch @ inverse_of(solution.frame))))
-    return solution.wrench + solution.stiffness @ change
+    yielding = np.eye(6)
+    yielding[:, :3] += compliance * solution.stiffness[:, :3]
+    return np.linalg.solve(yielding, solution.wrench + solution.stiffness @ change)
 
 
 def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:

@@ -1,0 +1,218 @@
+"""A path as motion of a robot, and `limber execute` on the virtual robot that holds the branch."""
+
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from limber.errors import InputError, NoPathError, SafetyStop
+from limber.mechanics.status import Status
+from limber.robot.calibration import fit_base
+from limber.robot.cell import Cell
+from limber.robot.execution import across, followed, robot_motion
+from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
+from limber.stages.execute import ExecuteOptions, ExecuteSettings, execute
+from limber.stages.loading import load_grasp_model, load_skeleton
+from limber.store import Branch
+
+FRACTION = 0.92
+
+
+def test_a_base_is_found_from_touched_points():
+    """Six points, 0.3 mm of error: found within what it says of itself, times three."""
+    rng = np.random.default_rng(3)
+    truth = np.array([0.6, -0.2, 0.1, 0.3, -0.4, 1.2])
+    frame = matrices(truth)
+    on_branch = rng.uniform(-0.2, 0.3, (6, 3))
+    touched = (on_branch - frame[:3, 3]) @ frame[:3, :3] + 3e-4 * rng.standard_normal((6, 3))
+    fit = fit_base(touched, on_branch)
+    turn = Rotation.from_rotvec(fit.pose[3:]) * Rotation.from_rotvec(truth[3:]).inv()
+    assert turn.magnitude() < 3 * fit.rotation_sigma
+    middle = touched.mean(axis=0)
+    off = (matrices(fit.pose) - frame) @ np.r_[middle, 1.0]
+    assert np.linalg.norm(off[:3]) < 3 * np.sqrt(3) * fit.position_sigma
+    assert fit.residual < 1e-3
+
+
+@pytest.mark.parametrize("spoil, told", [
+    (lambda a, b: (a[:2], b[:2]), "Three or more"),
+    (lambda a, b: (a, np.outer(np.arange(6), [0, 0, 0.1])), "across their line"),
+    (lambda a, b: (a[[1, 0, 2, 3, 4, 5]], b), "Point"),
+    (lambda a, b: (1000 * a, b), "Point"),
+])
+def test_bad_points_are_named(spoil, told):
+    points = np.random.default_rng(0).uniform(-0.2, 0.3, (6, 3))
+    with pytest.raises(InputError, match=told):
+        fit_base(*spoil(points, points + 0.1))
+
+
+def test_the_robot_holds_the_piece_along_the_whole_path():
+    """From joints through the tool to the piece: where the plan has it, turned as it turns."""
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)})
+    part = np.linspace(0, 1, 20)[:, None]
+    poses = np.hstack([np.array([0.0, 0.0, 0.5]) + part * [0.08, 0.03, -0.02],
+                       part * [0.1, 0.2, -0.05]])
+    forces = part * np.array([4.0, 1.0, 0.0])
+    motion = robot_motion(cell, poses, forces, np.array([0, 0, 1.0]), speed=0.03)
+    flange = forward(cell.arm, motion.joints.joints)
+    grasp = cell.grasp_frames(flange)
+    first = len(motion.approach.times) - 1
+    grip = inverted(matrices(poses[0])) @ grasp[first]
+    last = pose_vectors(grasp[-1] @ inverted(grip))
+    assert last == pytest.approx(poses[-1], abs=1e-9)
+    way = grasp[first, :3, 3] - grasp[0, :3, 3]
+    assert way == pytest.approx(cell.approach.distance_m * grasp[first, :3, 2], abs=1e-9)
+    # The gripper comes across the branch.
+    assert abs(grasp[first, :3, 2] @ [0, 0, 1]) < 1e-9
+    assert motion.path.expected[-1, :3] == pytest.approx(forces[-1])
+    speed = np.linalg.norm(np.diff(motion.path.poses[:, :3], axis=0), axis=1) / np.diff(
+        motion.path.times)
+    assert speed.max() <= 0.03 * (1 + 1e-6)
+    assert motion.joints.speed_share(cell.arm, np.concatenate(
+        [motion.approach.times, motion.approach.duration + motion.path.times[1:]])) < 1
+
+
+def test_a_path_out_of_reach_and_a_speed_over_the_cells_are_refused():
+    cell = Cell(robot={"model": "ur3e"}, base={"pose": (2.0, 0.1, 0.0, 0, 0, 0.4)})
+    poses = np.zeros((5, 6))
+    poses[:, 0] = np.linspace(0, 0.1, 5)
+    with pytest.raises(NoPathError, match="reach"):
+        robot_motion(cell, poses, np.zeros((5, 3)), np.array([0, 0, 1.0]), speed=0.03)
+    with pytest.raises(InputError, match="over the cell"):
+        robot_motion(cell, poses, np.zeros((5, 3)), np.array([0, 0, 1.0]), speed=0.2)
+
+
+def test_ways_across_a_branch_are_right_handed_and_across():
+    for axis in ([0, 0, 1], [1, 0, 0], [0.3, -0.5, 0.2]):
+        for vector in across(np.array(axis, float)):
+            turn = Rotation.from_rotvec(vector).as_matrix()
+            assert np.linalg.det(turn) == pytest.approx(1.0)
+            assert abs(turn[:, 2] @ axis) < 1e-9
+
+
+def test_what_was_followed_is_measured():
+    samples = np.full((50, 31), np.nan)
+    along = np.linspace(0, 0.1, 50)
+    samples[:, 1:4] = np.column_stack([along, np.full(50, 2e-3), np.zeros(50)])
+    samples[:, 13:16] = np.column_stack([10 * along, np.full(50, 0.02), np.zeros(50)])
+    samples[:, 25:28] = np.column_stack([10 * along, np.zeros((50, 2))])
+    found = followed(samples, np.array([[0, 0, 0], [0.1, 0, 0.0]]))
+    assert found.path_error == pytest.approx(2e-3)
+    assert found.force_error == pytest.approx(0.02, abs=1e-3)
+
+
+def planned_in(folder, force: float = 0.5) -> None:
+    """Write the way on which a growing sideways force takes the branch: it stretches nothing."""
+    from limber.mechanics import solve_static
+
+    branch = Branch.open(folder)
+    model = load_grasp_model(branch, gravity=True)
+    direction = sideways(branch, FRACTION)
+    state, positions = model.rest, []
+    for part in np.linspace(0, force, 9):
+        state = solve_static(model.model, grasp=model.grasp, grasp_force=part * direction,
+                             start=state)
+        assert state.converged
+        positions.append(model.pose(state.displacement)[:3])
+    results = model.follow(np.array(positions), model.rest.displacement)
+    assert all(result.status == Status.converged for result in results)
+    rows = [np.r_[k, model.pose(result.displacement), 0, np.linalg.norm(result.reaction_force), 0]
+            for k, result in enumerate(results)]
+    with branch.stage("plan:path") as stage:
+        lines = ["s_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,energy_j,force_n,strain"]
+        lines += [",".join(f"{x:.9g}" for x in row) for row in rows]
+        stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+@pytest.fixture
+def planned_folder(branch_template, tmp_path):
+    """The small branch with its true moduli in the mesh, and a plan."""
+    import shutil
+
+    from limber.estimation.virtual_pull import VirtualPullSettings
+    from limber.mechanics.young_field import young_weights
+    from limber.stages.loading import load_mesh
+    from limber.stages.virtual_pull import load_truth
+
+    folder = shutil.copytree(branch_template, tmp_path / "planned.branch")
+    branch = Branch.open(folder)
+    truth = load_truth(branch, VirtualPullSettings())
+    mesh = load_mesh(branch)
+    young = young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float)
+    held = np.linalg.norm(mesh.nodes - load_skeleton(branch).point_at(FRACTION), axis=1) < 0.012
+    with branch.stage("estimate") as stage:
+        mesh.with_data(cell_data={**mesh.cell_data, "young": young},
+                       point_data={**mesh.point_data, "grasp": held.astype(int)},
+                       ).write(stage.path("mesh.vtu"))
+    planned_in(folder)
+    return folder
+
+
+def test_a_dry_run_moves_nothing_and_says_what_it_would_do(planned_folder, tmp_path):
+    """Nobody listens at the address: a dry run needs no robot."""
+    cell = standing_at(Branch.open(planned_folder), "127.0.0.97", fraction=FRACTION)
+    result = execute(planned_folder, "path", cell_file(cell, tmp_path), ExecuteSettings(),
+                     ExecuteOptions())
+    assert result["armed"] is False and result["reached"] is None
+    assert result["predicted_peak_force_n"] > 0.1
+    assert result["singularity_distance"] >= cell.limits.singularity
+    preview = np.genfromtxt(planned_folder / "executions" / "path-preview.csv", delimiter=",",
+                            names=True)
+    assert np.all(np.diff(preview["t_s"]) > 0)
+
+
+def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):
+    branch = Branch.open(planned_folder)
+    cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)
+    for changes, told in (({"branch": "other"}, "calibrated for branch other"),
+                          ({"limits": cell.limits.model_copy(update={"soft_force_n": 0.05})},
+                           "soft limit")):
+        path = cell_file(cell.model_copy(update=changes), tmp_path)
+        with pytest.raises(InputError, match=told):
+            execute(planned_folder, "path", path, ExecuteSettings(), ExecuteOptions())
+    path = cell_file(cell, tmp_path)
+    with pytest.raises(InputError, match="Nobody confirmed"):
+        execute(planned_folder, "path", path, ExecuteSettings(), ExecuteOptions(arm=True))
+
+
+def armed(planned_folder, tmp_path, address, *, unexpected: float):
+    pytest.importorskip("rtde_control")
+    branch = Branch.open(planned_folder)
+    # The gripper stands where the approach begins, and comes as the cell's robot was put.
+    back = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}).approach.distance_m
+    # What is predicted is a branch that turns freely; the virtual gripper clamps it, and clamped
+    # it is so stiff along its axis that hundredths of a millimetre are newtons.
+    cell = standing_at(branch, address, fraction=FRACTION, back=back, unexpected_force_n=unexpected,
+                       soft_force_n=15.0, hard_force_n=20.0)
+    skeleton = load_skeleton(branch)
+    axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
+    settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
+    path = cell_file(cell, tmp_path)
+    with robot_holding(branch, cell, tmp_path) as robot:
+        result = execute(planned_folder, "path", path, settings,
+                         ExecuteOptions(arm=True, confirm="path"))
+        time.sleep(0.2)
+        state = robot.state
+    return result, state
+
+
+def test_an_armed_run_approaches_holds_follows_returns_and_lets_go(planned_folder, tmp_path,
+                                                                  worker_address):
+    result, state = armed(planned_folder, tmp_path, worker_address, unexpected=8.0)
+    assert result["reached"] and result["path_error_m"] < 1e-3
+    assert state["branch"] == "free" and np.linalg.norm(state["tool_speed"]) < 1e-3
+    assert (planned_folder / "executions" / "path" / "samples.csv").stat().st_size > 1e5
+    assert np.linalg.norm(np.subtract(state["pose"][:3], result["start_pose_base"][:3])) < 1e-3
+
+
+def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, tmp_path,
+                                                            worker_address):
+    """An allowance of 0.9 N is passed on the way: exit 4, a report, far below the hard limit."""
+    with pytest.raises(SafetyStop, match="stopped"):
+        armed(planned_folder, tmp_path, worker_address, unexpected=0.9)
+    found = Branch.open(planned_folder).manifest.stages["execute:path"].result
+    assert not found["reached"] and found["stop_reason"]
+    assert found["peak_force_n"] is None or found["peak_force_n"] < 10

@@ -1,0 +1,331 @@
+"""Follow a planned path with a robot; without --arm a dry run that moves nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from limber.errors import InputError, SafetyStop, WorkError
+from limber.progress import SILENT, Progress
+from limber.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.robot.cell import Cell
+    from limber.robot.execution import RobotMotion
+    from limber.robot.link import RobotLink
+    from limber.robot.trajectory import Trajectory
+
+
+class ExecuteInputs(BranchInputs):
+    """A branch folder, one of its plans and the robot's cell."""
+
+    groups: ClassVar[Groups] = {"input": ("name", "cell")}
+
+    name: str = Field("path", description="Name of the plan.")
+    cell: Path = Field(description="The robot's cell file.")
+
+
+class ExecuteSettings(Settings):
+    """How the path is followed."""
+
+    groups: ClassVar[Groups] = {"motion": ("speed", "hold", "gripper_rotation", "gravity")}
+
+    speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
+    hold: float = Field(2.0, ge=0, le=3600, description="Time at the path's end [s].")
+    gripper_rotation: tuple[float, float, float] | None = Field(
+        None, description="Rotation vector of the gripper at the grasp, branch frame [rad]; "
+        "without it the way across the branch that keeps farthest from singularities.")
+    gravity: bool = Field(True, description="Predict forces of the branch with its weight.")
+
+
+class ExecuteOptions(Settings):
+    """Dry run, or motion."""
+
+    groups: ClassVar[Groups] = {"running": ("arm", "confirm", "after_stop")}
+
+    arm: bool = Field(False, description="Move the robot. Without it: a dry run.",
+                      json_schema_extra={"switch": True})
+    confirm: str | None = Field(
+        None, description="The plan's name, typed: the robot moves. Without it the name is asked "
+        "for at the terminal.")
+    after_stop: Literal["ask", "hold", "retreat"] = Field(
+        "ask", description="What to do after a stop; ask: at the terminal, else hold.")
+
+
+def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
+            options: ExecuteOptions, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Check a plan for a robot, and with ``arm`` follow it.
+
+    The branch's force along the path is solved anew on the full model; the guard stops where the
+    measured one differs from it. Armed, the robot approaches the branch, the gripper closes, the
+    path is followed, held and gone back, the gripper opens and the robot leaves.
+
+    Returns:
+        ``armed``, ``reached``, ``stop_reason``, ``peak_force_n``, ``path_error_m`` (None in a dry
+        run) and what was computed: duration, predicted peak force, distances from singularities
+        and joint limits, where the robot has to stand.
+
+    Raises:
+        InputError: plan, cell and branch do not belong together, or nobody confirmed.
+        NoPathError: the arm cannot follow the path; says where and why.
+        SafetyStop: it was stopped; the log is in the folder all the same.
+    """
+    from limber.robot.belonging import check_branch
+    from limber.robot.cell import read_cell
+
+    branch, cell = Branch.open(folder), read_cell(cell_file)
+    if warning := check_branch(cell, branch.uuid, folder):
+        progress.warn(warning)
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
+        raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
+    progress(0.02, "forces along the path")
+    poses, forces, axis = _predicted(branch, name, settings, progress)
+    progress(0.4, "inverse kinematics")
+    from limber.robot.execution import robot_motion
+
+    motion = robot_motion(cell, poses, forces, axis, speed=settings.speed,
+                          rotation=settings.gripper_rotation)
+    result = _summary(cell, motion, forces)
+    _check_limits(cell, poses, forces)
+    if not options.arm:
+        _write_preview(branch, name, settings, cell, motion)
+        return result | {"armed": False, "reached": None, "stop_reason": None,
+                         "peak_force_n": None, "path_error_m": None}
+    _confirmed(name, options)
+    return _armed(branch, cell, name, settings, options, motion, result, progress)
+
+
+def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: Progress,
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses and forces of the grasp from rest to the path's end, and the branch's axis there."""
+    from limber.planning.grasp_model import refusal
+    from limber.stages.loading import load_grasp_model, load_skeleton
+
+    path = branch.require(f"plans/{name}.csv", "plan")
+    table = np.genfromtxt(path, delimiter=",", names=True)
+    if table.size < 2 or "x_m" not in (table.dtype.names or ()):
+        raise InputError(f"{path} is no path.", "", "Plan again.")
+    planned = np.column_stack([table[column] for column in ("x_m", "y_m", "z_m")])
+    model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
+    rest = model.rest_position
+    way = float(np.linalg.norm(planned[0] - rest))
+    # From rest the branch is first taken to where the plan starts.
+    leading = rest + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
+        planned[0] - rest)
+    positions = np.vstack([leading, planned]) if way > 1e-4 else planned
+    poses, forces, state = [], [], model.rest.displacement
+    for number, position in enumerate(positions):
+        result = model.follow(position[None], state)[0]
+        if reason := refusal(result):
+            raise WorkError(f"Pose {number + 1} of {len(positions)} has no believable solution "
+                            f"({reason}).", "Its force is not known, so it is not taken there.",
+                            "Plan a gentler path.")
+        state = result.displacement
+        poses.append(model.pose(state))
+        forces.append(result.reaction_force)
+        progress(0.02 + 0.38 * number / len(positions), "forces along the path")
+    poses = np.array(poses)
+    poses[:, :3] = positions
+    skeleton = load_skeleton(branch)
+    nearest = int(np.argmin(np.linalg.norm(skeleton.nodes - rest, axis=1)))
+    parent = int(skeleton.parent[nearest])
+    other = nearest if parent >= 0 else 1
+    axis = skeleton.nodes[other] - skeleton.nodes[int(skeleton.parent[other])]
+    return poses, np.array(forces), axis
+
+
+def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
+    peak = float(np.linalg.norm(forces, axis=1).max())
+    if peak >= cell.limits.soft_force_n:
+        raise InputError(
+            f"The path needs {peak:.3g} N, the soft limit is {cell.limits.soft_force_n:.3g} N.",
+            "The guard would pause on the way.",
+            "Plan with a lower --max-force, or raise limits.soft_force_n in the cell file.")
+    box = cell.workspace
+    if box is not None:
+        outside = np.any((poses[:, :3] < box.low_m) | (poses[:, :3] > box.high_m), axis=1)
+        if outside.any():
+            place = ", ".join(f"{x:.3f}" for x in poses[int(outside.argmax()), :3])
+            raise InputError(f"The path leaves the workspace at ({place}) m.",
+                             "The guard would stop there.", "Plan inside it, or correct the cell.")
+
+
+def _summary(cell: Cell, motion: RobotMotion, forces: np.ndarray) -> dict[str, Any]:
+    steps = np.concatenate([motion.approach.times,
+                            motion.approach.duration + motion.path.times[1:]])
+    return {
+        "robot": cell.arm.name, "duration_s": 2 * (motion.approach.duration + motion.path.duration),
+        "pose_count": len(motion.path.times),
+        "predicted_peak_force_n": float(np.linalg.norm(forces, axis=1).max()),
+        "singularity_distance": motion.joints.singularity,
+        "joint_limit_margin_rad": motion.joints.limit_margin,
+        "joint_speed_share": motion.joints.speed_share(cell.arm, steps),
+        "gripper_rotation": motion.rotation, "start_pose_base": motion.approach.poses[0],
+        "start_joints_rad": motion.joints.joints[0]}
+
+
+def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: Cell,
+                   motion: RobotMotion) -> None:
+    """What the robot would do, for the viewport: poses in the branch's frame, joints, forces."""
+    from limber.robot.kinematics import matrices, pose_vectors
+
+    base = matrices(np.array(cell.base.pose))
+    rows = []
+    begin = 0.0
+    first = len(motion.approach.times)
+    for trajectory, joints in ((motion.approach, motion.joints.joints[:first]),
+                               (motion.path, motion.joints.joints[first - 1:])):
+        poses = pose_vectors(base @ matrices(trajectory.poses))
+        assert trajectory.expected is not None
+        rows.append(np.column_stack([begin + trajectory.times, poses, joints,
+                                     trajectory.expected[:, :3]]))
+        begin += trajectory.duration + 0.5
+    header = ("t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,"
+              "fx_n,fy_n,fz_n")
+    lines = [header, *(",".join(f"{x:.7g}" for x in row) for row in np.vstack(rows))]
+    with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
+        stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
+                                                               encoding="utf-8")
+
+
+def _confirmed(name: str, options: ExecuteOptions) -> None:
+    typed = options.confirm
+    if typed is None and sys.stdin.isatty():
+        typed = input(f"The robot will move. Type {name} to go on: ").strip()
+    if typed != name:
+        raise InputError("Nobody confirmed that the robot may move.", "",
+                         f"Give --confirm {name}, with the workspace free and a hand at the "
+                         "emergency stop.")
+
+
+def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
+           options: ExecuteOptions, motion: RobotMotion, summary: dict[str, Any],
+           progress: Progress) -> dict[str, Any]:
+    from limber.robot.execution import followed
+    from limber.robot.kinematics import matrices
+    from limber.robot.link import COLUMNS, RobotLink
+
+    log = f"executions/{name}/samples.csv"
+    with branch.writing(f"the execution of {name}"):
+        stream = branch.stream(log)
+        batches: list[np.ndarray] = []
+        try:
+            stream.append(",".join(COLUMNS))
+
+            def take(rows: np.ndarray) -> None:
+                batches.append(rows)
+                for row in rows:
+                    stream.append(",".join("" if np.isnan(x) else f"{x:.7g}" for x in row))
+            with RobotLink(cell, take) as link:
+                event, on_path = _steps(cell, link, motion, settings, options, batches, progress)
+                warnings = list(link.warnings)
+        finally:
+            stream.close()
+        for warning in warnings:
+            progress.warn(warning)
+        samples = np.concatenate(batches)[on_path[0]:on_path[1]] if on_path else None
+        base = matrices(np.array(cell.base.pose))
+        path = (base @ matrices(motion.path.poses))[:, :3, 3]
+        found = followed(samples, path) if samples is not None and len(samples) else None
+        reached = event["event"] == "reached"
+        result = summary | {
+            "armed": True, "reached": reached,
+            "stop_reason": None if reached else event["reason"],
+            "peak_force_n": found.peak_force if found else None,
+            "path_error_m": found.path_error if found else None,
+            "force_error_of_peak": found.force_error if found else None}
+        with branch.stage(f"execute:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
+            stage.adopt(log)
+            from limber.plain import plain
+
+            stage.path(f"executions/{name}/report.json").write_text(
+                json.dumps(plain(result), indent=1) + "\n", encoding="utf-8")
+            stage.result.update(result)
+    if not reached:
+        raise SafetyStop(f"The robot was stopped: {event['reason']}.",
+                         f"Its log is in executions/{name}.",
+                         "Look at the branch and the robot before anything moves; plan again from "
+                         "where it is.")
+    return result
+
+
+def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSettings,
+           options: ExecuteOptions, batches: list[np.ndarray], progress: Progress,
+           ) -> tuple[dict[str, Any], tuple[int, int] | None]:
+    """Go through approach, grasp, path, return and leaving; stops at the first that stops."""
+    progress(0.5, "taring: keep the gripper free")
+    time.sleep(0.2)
+    link.tare(1.0)
+    on_path: tuple[int, int] | None = None
+    legs: list[tuple[str, Trajectory]] = [
+        ("approach", motion.approach), ("path", motion.path), ("return", motion.way_back),
+        ("leaving", motion.leaving)]
+    event: dict[str, Any] = {}
+    for number, (title, trajectory) in enumerate(legs):
+        progress(0.55 + 0.1 * number, title)
+        begin = sum(map(len, batches))
+        event = _followed_to_its_end(link, trajectory)
+        if title == "path":
+            on_path = (begin, sum(map(len, batches)))
+        if event["event"] != "reached":
+            if _choice(options) == "retreat":
+                link.acknowledge()
+                link.retreat()
+            return event, on_path
+        if title == "approach":
+            _grip(cell, link, close=True)
+        elif title == "path":
+            time.sleep(settings.hold)
+        elif title == "return":
+            _grip(cell, link, close=False)
+    return event, on_path
+
+
+def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:
+    try:
+        return link.follow(trajectory)
+    except KeyboardInterrupt:
+        # Ctrl-C stops the arm before anything else.
+        link.stop()
+        raise
+
+
+def _grip(cell: Cell, link: RobotLink, *, close: bool) -> None:
+    if cell.tool.gripper == "digital_output":
+        link.gripper(close)
+        time.sleep(1.0)
+    elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
+        input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
+
+
+def _choice(options: ExecuteOptions) -> str:
+    if options.after_stop != "ask":
+        return options.after_stop
+    if not sys.stdin.isatty():
+        return "hold"
+    typed = input("The robot has stopped. Type retreat to go back the way it came; anything else "
+                  "holds: ")
+    return "retreat" if typed.strip() == "retreat" else "hold"
+
+
+def run(inputs: ExecuteInputs, settings: ExecuteSettings, options: ExecuteOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return execute(inputs.branch_folder, inputs.name, inputs.cell, settings, options,
+                   progress=progress)
+
+
+STAGE = StageDescription(
+    "execute", 110, run, ExecuteInputs, ExecuteSettings, ExecuteOptions, key="execute:{name}",
+    reads=("plans/{name}.csv", "mesh.vtu", "skeleton.swc"),
+    writes=("executions/{name}/samples.csv", "executions/{name}/report.json"))
