@@ -70,3 +70,11 @@ def worker_address(worker_id) -> str:
     """A loopback address of this test process: the client knows no other ports."""
     number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 0
     return f"127.0.0.{11 + number}"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what moves a robot in a process: it is held to wall clocks, wants a core to itself."""
+    for item in items:
+        in_a_process = "worker_address" in getattr(item, "fixturenames", ())
+        if in_a_process or item.path.name == "test_faults.py":
+            item.add_marker(pytest.mark.real_time)
