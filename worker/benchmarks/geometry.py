@@ -28,11 +28,11 @@ from limber.progress import Progress
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 SCANS = (("coffeetree_branch/branch.xyz", ["--unit", "m"]),
-         ("aRchi_tree_1/Tree_1.ply", ["--unit", "m"]),
+         ("aRchi_tree_1/Tree_1.ply", ["--unit", "m", "--leave-out"]),
          ("apple_rgbd/frame_00025.ply", ["--unit", "mm", "--up", "0", "-1", "0"]),
          ("apple_rgbd/frame_00125.ply", ["--unit", "mm", "--up", "0", "-1", "0"]),
-         ("tomato_maize/tomato_03-05.xyz", ["--unit", "mm"]),
-         ("tomato_maize/maize_03-13.ply", ["--unit", "mm"]))
+         ("tomato_maize/tomato_03-05.xyz", ["--unit", "mm", "--unexplained", "1"]),
+         ("tomato_maize/maize_03-13.ply", ["--unit", "mm", "--unexplained", "1"]))
 
 
 def rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:

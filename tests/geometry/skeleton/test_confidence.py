@@ -30,11 +30,11 @@ def _twig_points(radius: float, count: int) -> np.ndarray:
 
 
 def test_gaps_and_thin_twigs_are_said(tmp_path) -> None:
-    """A stretch without points is bridged; a twig under three spacings is unresolved, and its
+    """A stretch without points is bridged; a twig under one spacing is unresolved, and its
     interval is wide; the file keeps it all."""
     points = np.vstack([_tube(0, 0.08, 0.008, 1500), _tube(0.14, 0.4, 0.008, 4500, seed=2),
-                        _twig_points(0.002, 40)])
-    told = assessed(_stem(0.008, 0.004), points, 0.0003)
+                        _twig_points(0.0015, 30)])
+    told = assessed(_stem(0.008, 0.0015), points, 0.0003)
     z, stem = told.nodes[:, 2], told.branch == 0
     assert set(told.radius_state[stem & (z > 0.09) & (z < 0.13)]) == {BRIDGED}
     assert set(told.radius_state[stem & (z > 0.16)]) == {MEASURED}

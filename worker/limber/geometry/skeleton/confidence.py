@@ -1,6 +1,6 @@
 """What a scan leaves open of its skeleton: radii that it does not resolve, gaps, doubtful twigs.
 
-Where a branch is thinner than three of the points' spacings, or than their noise, its points tell
+Where a branch is thinner than the points' spacing, or than their noise, its points tell
 little of its radius. Then what branches are like says more: a twig is thinner than what carries it
 and tapers. Both are weighed, and the interval is as wide as that leaves it.
 """
@@ -23,7 +23,8 @@ from limber.geometry.skeleton.skeleton import (
 STATES = {"measured": MEASURED, "limited": LIMITED, "interpolated": INTERPOLATED,
           "unresolved": UNRESOLVED, "bridged": BRIDGED}
 
-_SPACINGS = 3.0  # diameter in point spacings, under which a radius is not resolved
+# Diameter in point spacings, under which a radius is not resolved: too few points a radius.
+_SPACINGS = 1.0
 _BESIDE = 4  # nodes to each side whose points tell the spacing
 _NOISES = 1.0  # radius in standard deviations of the noise, likewise
 _GAP = 4.0  # radii without a point that are a gap, not a hole

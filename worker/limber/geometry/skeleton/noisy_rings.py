@@ -20,6 +20,7 @@ _BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not see
 _FEW = 0.12  # share of points there that noise can put
 _FRONT, _EDGE = np.deg2rad(40.0), np.deg2rad(65.0)
 _ALONG = 0.65  # scatter at the edges over that in front, under which it is along the sight alone
+_SIGHT_LEAST = 0.75
 _GRAZING = np.deg2rad(81.0)  # beyond about that no sensor sees a surface
 _LEAST_SEEN = 0.01
 _ANGLE = 2 * np.pi * (np.arange(_PLACES) + 0.5) / _PLACES
@@ -93,7 +94,8 @@ def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout:
     """
     mean = out * np.where(sharpness > 1, 1 - 0.5 / np.maximum(sharpness, 1.0), 0.5)[:, None]
     if seen.along_sight:
-        return mean
+        # Scatter along the sight widens no silhouette: what it adds to the radius is bounded.
+        return out * np.clip(1 - 0.5 / np.maximum(sharpness, 1e-9), _SIGHT_LEAST, 1.0)[:, None]
     # By the radius alone: chosen by their distance too, near points would count otherwise than far.
     blurred = np.flatnonzero(stout < _SHARP)
     side, cross = _sides(axis[blurred], seen.view)

@@ -144,7 +144,10 @@ def check_explained(result: Any, limit: float) -> None:
     Raises:
         InputError: more do.
     """
-    share = unexplained_share(result)
+    # A depth camera's scatter is noise, not leaves: there only what noise does not reach counts.
+    radius = result.skeleton.radius[result.node_of_point]
+    share = unexplained_share(result) if result.leafy else float(np.mean(
+        result.residual > np.maximum(radius, 3 * result.noise)))
     if share > limit:
         raise InputError(
             f"{100 * share:.0f} % of the points lie on no round axis (allowed: "

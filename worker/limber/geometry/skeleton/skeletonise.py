@@ -66,6 +66,7 @@ class SkeletonResult:
         pruned: Number of spurs pruned.
         second_base: Where the plant seems to stand on the ground a second time [m], shape [3].
         other_root: An end that is about as likely the root [m], shape [3].
+        leafy: Most points lay on no cylinder, and axes were led through the middle of leaves.
     """
 
     skeleton: Skeleton
@@ -79,6 +80,7 @@ class SkeletonResult:
     pruned: int = 0
     second_base: np.ndarray | None = None
     other_root: np.ndarray | None = None
+    leafy: bool = False
 
     @property
     def warnings(self) -> list[str]:
@@ -149,7 +151,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
-    if float(np.mean(residual > fitted.skeleton.radius[segment])) > LEAF_SHARE:
+    leafy = float(np.mean(residual > fitted.skeleton.radius[segment])) > LEAF_SHARE
+    if leafy:
         base = graph.nodes[start]
         graph = level_graph(
             points[thin], base, gap_factor=settings.gap_factor, up=up,
@@ -168,7 +171,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     result = SkeletonResult(
         fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
         graph.split_off, graph.loops, pruned + more,
-        second_base(fitted.skeleton, up), other_root)
+        second_base(fitted.skeleton, up), other_root, leafy)
     progress(1.0, "skeleton", nodes=fitted.skeleton.node_count)
     return result
 
