@@ -34,8 +34,8 @@ _PRIOR, _FIT, _FIT_NOISE = 0.35, 0.5, 0.25
 _BIAS = 0.4  # of the radius: what is left of the noise's bias, over (noise / radius)^2
 _MODEL = 0.012  # of the radius: branches are not quite round
 _BRIDGED_SIGMA = 0.15  # of the radius
-# Logistic in ln(1 + points / 10), ln(1 + reach / carrier's radius) and the bridged share of a twig,
-# fitted to generated branches (seeds 400 to 415 of each kind of the bench `scans`).
+# Logistic in ln(1 + points / 10), ln(1 + reach / carrier's radius) and the bridged share of a twig.
+# Chosen, not fitted: the bench `scans` holds the probabilities against what was there.
 _DOUBT = (-1.5, 0.9, 1.4, -1.5)
 
 
