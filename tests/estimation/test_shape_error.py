@@ -12,6 +12,7 @@ from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.shape_error import shape_error
+from limber.progress import Progress
 
 SETTINGS = EstimateSettings(hold_out=False, poisson=0.36)
 QUANTILE = 2.306 / 1.960  # Student's with 8 shapes over the normal one
@@ -66,7 +67,7 @@ def test_the_largest_part_of_a_wide_interval_is_named():
         if geometry is not None:
             parts["shape of the scan"] = np.array([0.01, geometry])**2
         messages: list[str] = []
-        _tell_largest_part(parts, messages.append)
+        _tell_largest_part(parts, Progress(on_warning=messages.append))
         return messages
 
     assert told(0.05, 0.08) == []

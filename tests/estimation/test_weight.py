@@ -21,7 +21,8 @@ from limber.store import Branch
 
 GRAVITY = (9.0, 0.0, -3.9)
 TRUTH = np.array([1.2e8, 0.9e8, 0.7e8, 0.5e8])
-SETTINGS = {"mesh_check": False, "shapes": 0, "hold_out": False, "key_frames": 4}
+SETTINGS = {"mesh_check": False, "shapes": 0, "hold_out": False, "key_frames": 4,
+            "field": "inverse_distance"}  # that of the truth: nothing but weight is to be told
 
 
 @pytest.fixture(scope="module")
