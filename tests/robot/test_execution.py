@@ -220,7 +220,7 @@ def test_an_armed_run_ends_where_it_should_or_is_stopped_with_a_report(planned_f
 
 def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, tmp_path,
                                                             worker_address):
-    """An allowance within the sensor's own noise is passed on the way: exit 4, a report, far below the hard limit."""
+    """An allowance within the sensor's noise is passed: exit 4, a report, far below the limit."""
     with pytest.raises(SafetyStop, match="stopped"):
         armed(planned_folder, tmp_path, worker_address, unexpected=0.2)
     found = Branch.open(planned_folder).manifest.stages["execute:path"].result
