@@ -89,7 +89,8 @@ NUMERICAL = ("geometry", "mechanics", "recordings", "perception", "estimation", 
 # The same between the parts of two packages; what is a plain file there is not ordered.
 PARTS = {"geometry": ("cloud", "skeleton", "surface", "tets"),
          "mechanics": ("elements", "linear", "statics", "dynamics", "reduced"),
-         "estimation": ("forward", "online")}
+         "estimation": ("forward", "doubt", "online"),
+         "planning": ("field", "bound", "planners")}
 
 
 def core_imports() -> dict[str, set[str]]:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from tests.subjects.paper_branches import Bench
 
+from limber.estimation.doubt.identifiability import identifiability, require_scale
 from limber.estimation.forward.dynamic import DynamicForward
-from limber.estimation.identifiability import identifiability, require_scale
 from limber.estimation.objective import Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values

@@ -7,14 +7,14 @@ import pytest
 from tests.subjects.paper_branches import measured
 
 from limber.errors import Cancelled, InputError
+from limber.estimation.doubt.identifiability import identifiability, link_unresolved, require_scale
+from limber.estimation.doubt.uncertainty import uncertainty
 from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.identifiability import identifiability, link_unresolved, require_scale
 from limber.estimation.objective import Objective, Stopped
 from limber.estimation.optimise import gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.preparation import require_scale_in_principle
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty import uncertainty
 from limber.progress import Progress
 from limber.recordings.recording import Observations
 

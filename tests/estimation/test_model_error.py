@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from tests.subjects.paper_branches import Bench
 
-from limber.estimation.model_error import (
+from limber.estimation.doubt.model_error import (
     ModelError,
     geometry_error,
     mesh_error,
     refined,
     total_interval,
 )
-from limber.estimation.uncertainty import repeated
+from limber.estimation.doubt.uncertainty import repeated
 from limber.geometry.skeleton.files import write_cylinders
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator

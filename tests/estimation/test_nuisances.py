@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.subjects.paper_branches import measured
 
-from limber.estimation.causes import ADVICE, largest, variance_parts
+from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
 from limber.estimation.fit import fit_pulls
 from limber.estimation.forward.watched import WatchedForward
 from limber.estimation.nuisances import eliminated, in_words

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from tests.subjects.paper_branches import measured
 
-from limber.estimation import shape_error as module
+from limber.estimation.doubt import shape_error as module
+from limber.estimation.doubt.shape_error import shape_error
 from limber.estimation.fit import _tell_largest_part
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.shape_error import shape_error
 from limber.progress import Progress
 
 SETTINGS = EstimateSettings(hold_out=False, poisson=0.36)

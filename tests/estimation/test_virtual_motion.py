@@ -7,8 +7,8 @@ import pytest
 from tests.subjects.paper_branches import Bench
 
 from limber.errors import InputError
+from limber.estimation.doubt.identifiability import identifiability
 from limber.estimation.forward.dynamic import DynamicForward
-from limber.estimation.identifiability import identifiability
 from limber.estimation.objective import Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values

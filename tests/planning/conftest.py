@@ -11,8 +11,8 @@ from limber.geometry.tets.marks import mark
 from limber.mechanics import BranchModel
 from limber.mechanics.loaded import hang
 from limber.planning.compare import PlanSettings
-from limber.planning.field import GraspSamples, fit_field
-from limber.planning.grasp_model import grasp_model_of
+from limber.planning.field.energy_field import GraspSamples, fit_field
+from limber.planning.field.grasp_model import grasp_model_of
 from limber.progress import Progress
 from limber.stages.energy import EnergySettings, sample_energy_field
 from limber.stages.plan import plan as plan_paths

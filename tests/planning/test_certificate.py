@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from limber.errors import NoPathError
-from limber.planning import certificate
-from limber.planning.certificate import certify
+from limber.planning.bound import certificate
+from limber.planning.bound.certificate import certify
 from limber.planning.compare import plan_pair
 from limber.planning.cost import CostWeights
-from limber.planning.gentle import plan_gentle
+from limber.planning.field.trust import TrustRegion
 from limber.planning.goals import GraspGoal, TipGoal
+from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.refine import refine, violation
+from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
-from limber.planning.refine import refine, violation
 from limber.planning.settings import PlanSettings
-from limber.planning.smoothing import smooth_cost
-from limber.planning.trust import TrustRegion
 
 START = np.array([-0.06, -0.03, 0.02])
 GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError, WorkError
-from limber.planning.field import EnergyField, error_measures, fit_field
+from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
 
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
 

@@ -11,7 +11,7 @@ from limber.cli import call
 from limber.errors import BranchFolderError, Cancelled, ConvergenceError, InputError, NoPathError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.compare import PlanSettings
-from limber.planning.field import EnergyField
+from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals import default_goal
 from limber.planning.resolve import resolve_path
 from limber.progress import Progress

@@ -8,9 +8,9 @@ from tests.planning.conftest import small_grasp_model
 
 from limber.errors import Cancelled, WorkError
 from limber.mechanics import Grasp, solve_static
-from limber.planning.chart import Chart
-from limber.planning.grasp_model import Reach
-from limber.planning.sampling import sample_branch, sample_positions, without_taut
+from limber.planning.field.chart import Chart
+from limber.planning.field.grasp_model import Reach
+from limber.planning.field.sampling import sample_branch, sample_positions, without_taut
 from limber.progress import Progress
 from limber.stages.energy import EnergySettings
 from limber.stages.loading import load_grasp_model

@@ -1,6 +1,6 @@
 """Warming up compiles what planning needs, and runs in a second where it is compiled."""
 
-from limber.planning.rrt_star import _grow
+from limber.planning.planners.rrt_star import _grow
 from limber.planning.warm_up import warm_up
 
 

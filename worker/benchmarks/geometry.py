@@ -15,9 +15,9 @@ from benchmarks.geometry_crowns import CROWNS, against_graph, crown_rows, explai
 from benchmarks.table import Row
 from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import GeneratedBranch, generate_branch
-from limber.geometry.skeleton.axis_fit import median_radii
-from limber.geometry.skeleton.contraction import contract
+from limber.geometry.skeleton.contraction.laplacian_contraction import contract
 from limber.geometry.skeleton.files import read_cylinders
+from limber.geometry.skeleton.radii.axis_fit import median_radii
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.surface.forks import smooth_forks

@@ -25,12 +25,12 @@ from limber.mechanics.loaded import LoadedBranch
 from limber.plain import plain
 from limber.planning.compare import PlanSettings, plan_pair, random_start
 from limber.planning.cost import measure_path
-from limber.planning.field import EnergyField, error_measures, fit_field
+from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
+from limber.planning.field.grasp_model import GraspModel, grasp_model_of
+from limber.planning.field.sampling import sample_branch, sample_positions, without_taut
 from limber.planning.goals import GraspGoal, default_goal
-from limber.planning.grasp_model import GraspModel, grasp_model_of
-from limber.planning.ompl_engine import ompl_missing
+from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.resolve import resolve_path
-from limber.planning.sampling import sample_branch, sample_positions, without_taut
 from limber.progress import Progress
 from limber.stages.energy import EnergySettings
 

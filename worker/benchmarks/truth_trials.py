@@ -21,7 +21,7 @@ from benchmarks.truth_branch import (
     exact_pull,
     recorded,
 )
-from limber.estimation.causes import variance_parts
+from limber.estimation.doubt.causes import variance_parts
 from limber.estimation.field_form import open_field
 from limber.estimation.fit import fit_pulls
 from limber.estimation.objective import Objective

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.skeleton.bridges import filled, free_ends, hypotheses
-from limber.geometry.skeleton.pieces import join_pieces
+from limber.geometry.skeleton.contraction.pieces import join_pieces
 
 Z = np.array([0.0, 0.0, 1.0])
 

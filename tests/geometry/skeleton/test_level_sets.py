@@ -6,8 +6,8 @@ from scipy.spatial import cKDTree
 
 from benchmarks.geometry_crowns import axis_scores, explained, generated_crown
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.contraction import contract
-from limber.geometry.skeleton.level_sets import is_sparse, level_graph
+from limber.geometry.skeleton.contraction.laplacian_contraction import contract
+from limber.geometry.skeleton.contraction.level_sets import is_sparse, level_graph
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 _UP = np.array([0.0, 0.0, 1.0])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.axis_fit import fit_axes
-from limber.geometry.skeleton.noisy_rings import mean_places, seen_sides
+from limber.geometry.skeleton.radii.axis_fit import fit_axes
+from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
-from limber.geometry.skeleton.pieces import join_pieces, second_base
+from limber.geometry.skeleton.contraction.pieces import join_pieces, second_base
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonSettings, skeletonise
 

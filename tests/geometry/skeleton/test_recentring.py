@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.contraction import contract
-from limber.geometry.skeleton.recentring import recentred
+from limber.geometry.skeleton.contraction.laplacian_contraction import contract
+from limber.geometry.skeleton.contraction.recentring import recentred
 
 
 def _half_tube(radius, noise, count=3000, seed=0, arc=np.pi):

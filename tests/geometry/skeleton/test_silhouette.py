@@ -9,7 +9,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.sight import View
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.stages.reconstruct import reconstruct

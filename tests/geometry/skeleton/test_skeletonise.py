@@ -6,9 +6,9 @@ import pytest
 from benchmarks.geometry import score_skeleton
 from limber.errors import Cancelled, InputError
 from limber.geometry.generated import generate_branch
-from limber.geometry.skeleton.contraction import cloud_laplacian, contract
+from limber.geometry.skeleton.contraction.laplacian_contraction import cloud_laplacian, contract
+from limber.geometry.skeleton.contraction.tangent_laplacian import tangent_laplacian
 from limber.geometry.skeleton.skeletonise import SkeletonSettings, skeletonise, thinned
-from limber.geometry.skeleton.tangent_laplacian import tangent_laplacian
 from limber.progress import Progress
 
 RNG = np.random.default_rng(0)
@@ -140,9 +140,9 @@ def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch):
     """One solve for nodes far apart gives the same deviations as one solve for each node."""
     points, root = forked_branch.cloud.points, forked_branch.skeleton.nodes[0]
     quick = skeletonise(points, root=root).skeleton
-    monkeypatch.setattr("limber.geometry.skeleton.axis_fit._PROBE", 10**9)
+    monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 10**9)
     exact = skeletonise(points, root=root).skeleton
     np.testing.assert_allclose(quick.radius_sigma, exact.radius_sigma, rtol=0.02)
-    monkeypatch.setattr("limber.geometry.skeleton.axis_fit._PROBE", 2)
+    monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 2)
     near = skeletonise(points, root=root).skeleton
     assert not np.allclose(near.radius_sigma, exact.radius_sigma, rtol=0.02)

@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 
 from limber.errors import Cancelled, WorkError
-from limber.estimation.causes import largest, variance_parts
-from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.forward.forward import Forward
-from limber.estimation.identifiability import (
+from limber.estimation.doubt.causes import largest, variance_parts
+from limber.estimation.doubt.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
     identifiability,
     link_unresolved,
     require_scale,
 )
-from limber.estimation.model_error import ModelError, geometry_error, mesh_error
+from limber.estimation.doubt.model_error import ModelError, geometry_error, mesh_error
+from limber.estimation.doubt.shape_error import shape_error
+from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
+from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.forward.forward import Forward
 from limber.estimation.nuisances import in_words, told
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
@@ -33,9 +35,7 @@ from limber.estimation.preparation import (
 )
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.shape_error import shape_error
 from limber.estimation.start import led_start, scaled_start
-from limber.estimation.uncertainty import Uncertainty, outliers, uncertainty
 from limber.mechanics.points import point_operator
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import force_unit_suspicion

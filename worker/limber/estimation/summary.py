@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from limber.estimation.causes import largest
+from limber.estimation.doubt.causes import largest
+from limber.estimation.doubt.model_error import total_interval
+from limber.estimation.doubt.uncertainty import outliers
 from limber.estimation.fit import Estimate
-from limber.estimation.model_error import total_interval
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.uncertainty import outliers
 from limber.recordings.recording import Pull
 
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from limber.constants import GRAVITY
 from limber.errors import InputError
+from limber.estimation.doubt.model_error import refined
 from limber.estimation.gripper_path import MotionWanted, moved
-from limber.estimation.model_error import refined
 from limber.estimation.settings import VirtualPullSettings
 from limber.geometry.cloud.camera import D455, Camera, write_camera
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points

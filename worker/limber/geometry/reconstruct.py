@@ -18,10 +18,10 @@ from limber.geometry.left_out import (
     twig_mass,
 )
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.plausibility import check_explained
-from limber.geometry.skeleton.silhouette import within_silhouette, without_hidden_twigs
+from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
 from limber.geometry.skeleton.upright import upright_rotation

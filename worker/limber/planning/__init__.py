@@ -4,7 +4,7 @@ Positions for the grasp within a branch's reach:
 
 >>> import numpy as np
 >>> from limber.planning import sample_positions
->>> from limber.planning.grasp_model import Reach
+>>> from limber.planning.field.grasp_model import Reach
 >>> reach = Reach(np.zeros(3), arc_length=0.5, chord=0.48, tip=np.array([0, 0, 0.6]))
 >>> sample_positions(reach, np.array([0, 0, 0.48]), 32, deflection=0.4).shape
 (32, 3)
@@ -13,19 +13,19 @@ Positions for the grasp within a branch's reach:
 from limber.lazy import exports
 
 _PLACES = {
-    "EnergyField": "field",
+    "EnergyField": "field.energy_field",
     "EnergySettings": "settings",
     "GraspGoal": "goals",
-    "GraspModel": "grasp_model",
-    "GraspSamples": "field",
+    "GraspModel": "field.grasp_model",
+    "GraspSamples": "field.energy_field",
     "PlanSettings": "settings",
     "PlannedMotion": "plan",
     "TipGoal": "goals",
-    "fit_field": "field",
-    "grasp_model_of": "grasp_model",
+    "fit_field": "field.energy_field",
+    "grasp_model_of": "field.grasp_model",
     "plan_motion": "plan",
-    "sample_branch": "sampling",
-    "sample_positions": "sampling",
+    "sample_branch": "field.sampling",
+    "sample_positions": "field.sampling",
 }
 
 __getattr__, __dir__ = exports(__name__, _PLACES)

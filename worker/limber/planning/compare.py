@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from limber.errors import InputError, NoPathError
-from limber.planning.certificate import Certificate
+from limber.planning.bound.certificate import Certificate
 from limber.planning.cost import STEP, CostWeights
-from limber.planning.field import EnergyField, FieldArrays
-from limber.planning.gentle import plan_gentle
+from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.goals import Goal, allowed_points, goal_points
-from limber.planning.ompl_engine import ompl_missing
+from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.ompl_engine import ompl_missing
+from limber.planning.planners.refine import refine
+from limber.planning.planners.rrt_star import FoundPath, PathProblem, Search, plan_path
 from limber.planning.problem import GentleProblem
-from limber.planning.refine import refine
-from limber.planning.rrt_star import FoundPath, PathProblem, Search, plan_path
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
 

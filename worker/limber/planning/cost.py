@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from limber.compiled import compiled
-from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
+from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
 
 STEP = 0.005
 """Longest distance between points where an edge is evaluated [m]; also the paper-like spacing."""

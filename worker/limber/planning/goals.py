@@ -7,7 +7,7 @@ import numpy as np
 
 from limber.compiled import compiled
 from limber.errors import NoPathError
-from limber.planning.field import EnergyField, FieldArrays, allowed_at, energy_at
+from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
 
 
 class Goal(Protocol):

@@ -18,9 +18,9 @@ from limber.planning.compare import (
     random_start,
 )
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
-from limber.planning.field import EnergyField
+from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals import Goal, GraspGoal, TipGoal, default_goal
-from limber.planning.grasp_model import GraspModel
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread

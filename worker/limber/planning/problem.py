@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.planning.cost import EdgeWeights, resample
-from limber.planning.field import EnergyField, FieldArrays
+from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.goals import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked

@@ -8,7 +8,7 @@ from limber.errors import ConvergenceError
 from limber.jobs import run_tasks
 from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
-from limber.planning.grasp_model import GraspModel, refusal
+from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.progress import SILENT, Progress
 
 _APPROACH_STEP = 0.02  # [m] between poses on the way from rest to the start

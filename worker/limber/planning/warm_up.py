@@ -3,7 +3,7 @@
 import numpy as np
 
 from limber.planning.compare import PlanSettings, plan_pair
-from limber.planning.field import GraspSamples, fit_field
+from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.goals import GraspGoal
 from limber.progress import SILENT, Progress
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from limber.estimation.identifiability import UNRESOLVED_DEVIATION
-from limber.estimation.uncertainty import OUTLIER
+from limber.estimation.doubt.identifiability import UNRESOLVED_DEVIATION
+from limber.estimation.doubt.uncertainty import OUTLIER
 
 OBSERVED, SIMULATED, TRUE = "#222222", "#2a6fb0", "#c0602a"
 

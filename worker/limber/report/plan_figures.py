@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from limber.planning.cost import arc_lengths
-from limber.planning.field import EnergyField
+from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
 from limber.store import Branch
 

@@ -20,8 +20,8 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         BranchFolderError: no mesh yet.
         WorkError: too few poses could be solved.
     """
-    from limber.planning.field import fit_field
-    from limber.planning.sampling import (
+    from limber.planning.field.energy_field import fit_field
+    from limber.planning.field.sampling import (
         energy_inputs,
         sample_branch,
         sample_positions,

@@ -108,7 +108,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
 def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: Progress,
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses and forces of the grasp from rest to the path's end, and the branch's axis there."""
-    from limber.planning.grasp_model import refusal
+    from limber.planning.field.grasp_model import refusal
     from limber.stages.loading import load_grasp_model, load_skeleton
 
     path = branch.require(f"plans/{name}.csv", "plan")

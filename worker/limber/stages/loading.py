@@ -16,7 +16,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
 from limber.mechanics.model import BranchModel, PointMass
-from limber.planning.grasp_model import GraspModel, grasp_model_of
+from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import clean
 from limber.recordings.recording import Pull, read_pull
@@ -121,7 +121,9 @@ def load_model(branch: Branch, **overrides: object) -> BranchModel:
 
 
 def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILENT) -> GraspModel:
-    """Return what planning asks of a branch: :func:`limber.planning.grasp_model.grasp_model_of`.
+    """Return what planning asks of a branch.
+
+    See :func:`limber.planning.field.grasp_model.grasp_model_of`.
 
     Raises:
         BranchFolderError: a file is missing. InputError: the mesh lacks material or grasp.

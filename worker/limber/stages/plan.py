@@ -26,8 +26,8 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
-    from limber.planning.field import EnergyField
-    from limber.planning.grasp_model import GraspModel
+    from limber.planning.field.energy_field import EnergyField
+    from limber.planning.field.grasp_model import GraspModel
     from limber.planning.plan import PlannedMotion
     from limber.planning.plan_file import Way
 
@@ -58,9 +58,9 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
         InputError: a name that is none, a start that is not allowed, or two goals.
         NoPathError: no path; the message says why.
     """
-    from limber.planning.field import EnergyField
+    from limber.planning.field.energy_field import EnergyField
+    from limber.planning.field.sampling import energy_inputs
     from limber.planning.plan import plan_motion
-    from limber.planning.sampling import energy_inputs
     from limber.stages.loading import load_grasp_model
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(

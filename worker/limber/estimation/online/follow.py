@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from limber.errors import Cancelled, InputError
+from limber.estimation.doubt.model_error import ModelError, geometry_error, total_interval
 from limber.estimation.forward.forward import under_its_weight
-from limber.estimation.model_error import ModelError, geometry_error, total_interval
 from limber.estimation.objective import Objective
 from limber.estimation.online.exact import Beside, FullBranch, Here
 from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
-from limber.geometry.skeleton.contraction import ContractionStatus
-from limber.geometry.skeleton.curve_graph import CurveGraph
+from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
+from limber.geometry.skeleton.contraction.laplacian_contraction import ContractionStatus
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2

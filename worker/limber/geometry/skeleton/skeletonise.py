@@ -8,7 +8,28 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.axis_fit import (
+from limber.geometry.skeleton.confidence import assessed, shares
+from limber.geometry.skeleton.contraction.curve_graph import (
+    CurveGraph,
+    curve_graph,
+    end_chain,
+    prune_spurs,
+    rooted,
+)
+from limber.geometry.skeleton.contraction.laplacian_contraction import (
+    Contraction,
+    ContractionStatus,
+    contract,
+)
+from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
+from limber.geometry.skeleton.contraction.pieces import second_base
+from limber.geometry.skeleton.plausibility import (
+    check_no_sheet,
+    check_one_plant,
+    check_round,
+    warnings,
+)
+from limber.geometry.skeleton.radii.axis_fit import (
     AxisFit,
     attached,
     fit_axes,
@@ -17,23 +38,6 @@ from limber.geometry.skeleton.axis_fit import (
     nearest_cylinders,
     resampled,
     tapered,
-)
-from limber.geometry.skeleton.confidence import assessed, shares
-from limber.geometry.skeleton.contraction import Contraction, ContractionStatus, contract
-from limber.geometry.skeleton.curve_graph import (
-    CurveGraph,
-    curve_graph,
-    end_chain,
-    prune_spurs,
-    rooted,
-)
-from limber.geometry.skeleton.level_sets import POINT_LIMIT, is_sparse, level_graph
-from limber.geometry.skeleton.pieces import second_base
-from limber.geometry.skeleton.plausibility import (
-    check_no_sheet,
-    check_one_plant,
-    check_round,
-    warnings,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 from limber.progress import SILENT, Progress

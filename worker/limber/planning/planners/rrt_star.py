@@ -17,8 +17,8 @@ import numpy as np
 from limber.compiled import compiled
 from limber.errors import NoPathError
 from limber.planning.cost import EdgeWeights, edge_cost, path_cost
-from limber.planning.field import EnergyField, FieldArrays
-from limber.planning.smoothing import polish, shortcut, slide_end
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.planners.smoothing import polish, shortcut, slide_end
 from limber.progress import SILENT, Progress
 
 _CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
@@ -111,7 +111,7 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
         MissingDependencyError: ``ompl`` was asked for and is not installed.
     """
     if engine == "ompl":
-        from limber.planning.ompl_engine import search_with_ompl
+        from limber.planning.planners.ompl_engine import search_with_ompl
 
         raw, history, node_count = search_with_ompl(problem, search, progress)
     else:

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, maximum_filter
 
 from limber.compiled import compiled
-from limber.planning.marching import march
+from limber.planning.bound.marching import march
 
 CURVATURE_FACTOR = 2.0
 """What second differences at a cell's corners are multiplied by to bound derivatives inside."""

@@ -19,7 +19,7 @@ import scipy.sparse as sparse
 from scipy.spatial import cKDTree
 
 from limber.errors import WorkError
-from limber.geometry.skeleton.recentring import recentred
+from limber.geometry.skeleton.contraction.recentring import recentred
 from limber.progress import SILENT, Progress
 from limber.sparse import CholmodFactor, NotPositiveDefiniteError, SuperLuFactor, general_factor
 
@@ -132,7 +132,7 @@ def cloud_laplacian(points: np.ndarray) -> sparse.csc_matrix:
     try:
         import robust_laplacian
     except ImportError:
-        from limber.geometry.skeleton.tangent_laplacian import tangent_laplacian
+        from limber.geometry.skeleton.contraction.tangent_laplacian import tangent_laplacian
 
         return tangent_laplacian(points, NEIGHBOURS)
     laplacian, _ = robust_laplacian.point_cloud_laplacian(points, n_neighbors=NEIGHBOURS)

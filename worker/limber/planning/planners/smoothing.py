@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from limber.planning.cost import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
-from limber.planning.field import EnergyField, FieldArrays
+from limber.planning.field.energy_field import EnergyField, FieldArrays
 
 _POLISH_POINTS = 40  # corners of the path while it is polished
 _MIN_GAP = 1e-9  # [m] keeps the length's gradient finite where two corners meet

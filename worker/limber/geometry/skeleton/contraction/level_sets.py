@@ -13,8 +13,12 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.curve_graph import CurveGraph, keep_largest, neighbour_links
-from limber.geometry.skeleton.pieces import join_pieces
+from limber.geometry.skeleton.contraction.curve_graph import (
+    CurveGraph,
+    keep_largest,
+    neighbour_links,
+)
+from limber.geometry.skeleton.contraction.pieces import join_pieces
 
 POINT_LIMIT = 30_000
 """Points that levels are made of at most: more tell no finer twigs apart, they only take longer."""

@@ -2,7 +2,7 @@
 
 Solves |grad u| = rate on the nodes of a regular grid (Sethian 1999, "Fast marching methods",
 SIAM Review 41, sections 5 and 6). The result is a candidate only: what a proof needs is checked
-by :mod:`limber.planning.subsolution`, however the candidate was found.
+by :mod:`limber.planning.bound.subsolution`, however the candidate was found.
 """
 
 import numpy as np

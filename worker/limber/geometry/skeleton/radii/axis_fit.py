@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.noisy_rings import mean_places, seen_sides
+from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress

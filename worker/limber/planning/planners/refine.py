@@ -12,9 +12,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from limber.planning.cost import resample
-from limber.planning.field import EnergyField
+from limber.planning.field.energy_field import EnergyField
+from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
-from limber.planning.smoothing import smooth_cost
 
 _POINTS = 48  # of the polyline while it is moved
 _ROUNDS = (1e2, 1e3, 1e4, 1e5)  # penalty per squared violation, relative to the path's length

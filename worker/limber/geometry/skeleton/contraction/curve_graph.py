@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import (
 )
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.pieces import Joined, join_pieces
+from limber.geometry.skeleton.contraction.pieces import Joined, join_pieces
 
 _Z = np.array([0.0, 0.0, 1.0])
 

@@ -45,7 +45,7 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     the fit; a robust share of the residuals is used, so that outliers do not widen the interval.
     Errors that last from frame to frame, as those of points found in depth images do, do not
     average out: the covariance grows by how many frames repeat each other. What the mesh gets
-    wrong is not in it (:mod:`limber.estimation.model_error`).
+    wrong is not in it (:mod:`limber.estimation.doubt.model_error`).
     """
     # Priors and links are no measurements: neither do they tell the noise, nor does its scale act
     # on them.

@@ -1,10 +1,11 @@
 """How close to the best a path is: a proven lower bound on the cost of every path.
 
 On the field in three coordinates the gentlest path is a shortest path in a metric that stretches
-by c = a_def E / (E0 L0) + a_dis / L0. A sub-solution on a grid (:mod:`limber.planning.subsolution`)
-bounds its cost from below. The grid is turned so that its first axis runs from the start to the
-goal, and refined where a better path than the known one could still run: a cell through which
-even the bounds say no path is as cheap drops out, and what is left is a thin tube.
+by c = a_def E / (E0 L0) + a_dis / L0. A sub-solution on a grid
+(:mod:`limber.planning.bound.subsolution`) bounds its cost from below. The grid is turned so that
+its first axis runs from the start to the goal, and refined where a better path than the known one
+could still run: a cell through which even the bounds say no path is as cheap drops out, and what
+is left is a thin tube.
 
 Limits: a cell where motion is surely not allowed is closed; a cell in doubt stays open, so the
 bound stays one. If closed cells separate start and goal, that proves that no path exists.
@@ -17,8 +18,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, label, maximum_filter
 
 from limber.errors import NoPathError
-from limber.planning.problem import GentleProblem
-from limber.planning.subsolution import (
+from limber.planning.bound.subsolution import (
     CURVATURE_FACTOR,
     Terrain,
     corner_values,
@@ -30,6 +30,7 @@ from limber.planning.subsolution import (
     subsolution,
     terrain,
 )
+from limber.planning.problem import GentleProblem
 from limber.progress import SILENT, Progress
 
 _FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region

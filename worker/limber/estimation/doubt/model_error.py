@@ -40,7 +40,7 @@ class ModelError:
             the branch's radii came without a deviation.
         mesh: From the mesh, shape [K]; None where it was not measured.
         axis_is_exact: Whether ``geometry`` is of the radii alone (:func:`geometry_error`), not
-            of axis and radii (:func:`limber.estimation.shape_error.shape_error`).
+            of axis and radii (:func:`limber.estimation.doubt.shape_error.shape_error`).
         mesh_factor: Young's modulus of the material over that of the model on its mesh, which is
             too stiff by as much; shape [K]. ``mesh`` is what that leaves open.
     """

@@ -15,9 +15,9 @@ import numpy as np
 
 from limber.compiled import compiled
 from limber.errors import InputError, WorkError
-from limber.planning.chart import Chart, mapped, pulled_back_size
-from limber.planning.radial import RadialInterpolant, gradient_at, value_at
-from limber.planning.trust import TrustRegion, trusted_at
+from limber.planning.field.chart import Chart, mapped, pulled_back_size
+from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
+from limber.planning.field.trust import TrustRegion, trusted_at
 from limber.progress import SILENT, Progress
 
 

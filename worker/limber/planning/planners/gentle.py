@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.errors import NoPathError
-from limber.planning.certificate import Certificate, certify
+from limber.planning.bound.certificate import Certificate, certify
 from limber.planning.cost import arc_lengths
+from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem
-from limber.planning.refine import refine
 from limber.progress import SILENT, Progress
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from limber.errors import WorkError
 from limber.jobs import run_tasks
 from limber.mechanics.status import Status
-from limber.planning.field import GraspSamples
-from limber.planning.grasp_model import GraspModel, Reach, refusal
+from limber.planning.field.energy_field import GraspSamples
+from limber.planning.field.grasp_model import GraspModel, Reach, refusal
 from limber.progress import SILENT, Progress
 
 _LAYER = 0.06  # share of the reach

@@ -1,0 +1,1 @@
+"""Axes and radii of a skeleton from the points around them."""

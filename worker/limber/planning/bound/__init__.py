@@ -1,0 +1,1 @@
+"""The certificate: a proven lower bound on the cost of every path on a field."""
