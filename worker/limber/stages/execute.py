@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from limber.errors import InputError, SafetyStop, WorkError
 from limber.progress import SILENT, Progress
+from limber.robot.attendant import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs
 from limber.stages.registry import StageDescription
@@ -58,7 +58,7 @@ class ExecuteOptions(Settings):
     confirm: str | None = Field(
         None, description="The plan's name, typed: the robot moves. Without it the name is asked "
         "for at the terminal.")
-    after_stop: Literal["ask", "hold", "retreat"] = Field(
+    after_stop: AfterStop = Field(
         "ask", description="What to do after a stop; ask: at the terminal, else hold.")
 
 
@@ -101,7 +101,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         _write_preview(branch, name, settings, cell, motion)
         return result | {"armed": False, "reached": None, "stop_reason": None,
                          "peak_force_n": None, "path_error_m": None}
-    _confirmed(name, options)
+    require_confirmation(name, options.confirm)
     return _armed(branch, cell, name, settings, options, motion, result, progress)
 
 
@@ -198,16 +198,6 @@ def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: C
                                                                encoding="utf-8")
 
 
-def _confirmed(name: str, options: ExecuteOptions) -> None:
-    typed = options.confirm
-    if typed is None and sys.stdin.isatty():
-        typed = input(f"The robot will move. Type {name} to go on: ").strip()
-    if typed != name:
-        raise InputError("Nobody confirmed that the robot may move.", "",
-                         f"Give --confirm {name}, with the workspace free and a hand at the "
-                         "emergency stop.")
-
-
 def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
            options: ExecuteOptions, motion: RobotMotion, summary: dict[str, Any],
            progress: Progress) -> dict[str, Any]:
@@ -278,16 +268,14 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
         if title == "path":
             on_path = (begin, sum(map(len, batches)))
         if event["event"] != "reached":
-            if _choice(options) == "retreat":
-                link.acknowledge()
-                link.retreat()
+            retreat_if_chosen(link, options.after_stop)
             return event, on_path
         if title == "approach":
-            _grip(cell, link, close=True)
+            grip(cell, link, close=True)
         elif title == "path":
             time.sleep(settings.hold)
         elif title == "return":
-            _grip(cell, link, close=False)
+            grip(cell, link, close=False)
     return event, on_path
 
 
@@ -298,24 +286,6 @@ def _followed_to_its_end(link: RobotLink, trajectory: Trajectory) -> dict[str, A
         # Ctrl-C stops the arm before anything else.
         link.stop()
         raise
-
-
-def _grip(cell: Cell, link: RobotLink, *, close: bool) -> None:
-    if cell.tool.gripper == "digital_output":
-        link.gripper(close)
-        time.sleep(1.0)
-    elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
-        input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
-
-
-def _choice(options: ExecuteOptions) -> str:
-    if options.after_stop != "ask":
-        return options.after_stop
-    if not sys.stdin.isatty():
-        return "hold"
-    typed = input("The robot has stopped. Type retreat to go back the way it came; anything else "
-                  "holds: ")
-    return "retreat" if typed.strip() == "retreat" else "hold"
 
 
 def run(inputs: ExecuteInputs, settings: ExecuteSettings, options: ExecuteOptions,

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
 
 from limber.errors import InputError, SafetyStop, WorkError
 from limber.progress import SILENT, Progress
+from limber.robot.attendant import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs
 from limber.stages.registry import StageDescription
@@ -63,7 +63,7 @@ class RecordOptions(Settings):
     markers: int | None = Field(
         None, ge=1, le=65535, description="Port on the robot's address at which a tracker sends "
         "the points that it sees as JSON lines (the virtual robot's is 63400).")
-    after_stop: Literal["ask", "hold", "retreat"] = Field(
+    after_stop: AfterStop = Field(
         "ask", description="What to do after a stop; ask: at the terminal, else hold.")
     recover: bool = Field(False, description="Move nothing: take over what a killed recording "
                           "of this name has left.", json_schema_extra={"switch": True})
@@ -102,7 +102,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     if f"pulls/{name}/robot.csv" in branch.streams():
         raise InputError(f"A recording {name} was cut off.", "It would be lost.",
                          "Take it over with --recover, or give another --name.")
-    _confirmed(name, options)
+    require_confirmation(name, options.confirm)
     with branch.writing(f"the recording {name}"):
         ended = _recorded(branch, cell, name, settings, options, progress)
         result = _finish(branch, name, settings, ended)
@@ -111,17 +111,6 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
                          f"{result['sample_count']} samples are in pulls/{name}.",
                          "Look at the branch and the robot before anything moves.")
     return result
-
-
-def _confirmed(name: str, options: RecordOptions) -> None:
-    """The robot moves only when somebody has typed the recording's name."""
-    typed = options.confirm
-    if typed is None and sys.stdin.isatty():
-        typed = input(f"The robot will move. Type {name} to go on: ").strip()
-    if typed != name:
-        raise InputError("Nobody confirmed that the robot may move.", "",
-                         f"Give --confirm {name}, with the workspace free and a hand at the "
-                         "emergency stop.")
 
 
 def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
@@ -142,7 +131,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             recorders.append(recorder)
             progress(0.05, "taring: keep the gripper free")
             tared = link.tare(1.0)
-            _close_gripper(cell, link)
+            grip(cell, link, close=True)
             time.sleep(0.5)
             _write_entry(entry_lines, cell, point, tared, tracker, recorder, marker_lines)
             recorder.close_gripper()
@@ -155,11 +144,9 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 # What was seen last comes a little later.
                 time.sleep(0.5)
                 _write_markers(tracker, marker_lines, recorder)
-                if cell.tool.gripper == "digital_output":
-                    link.gripper(False)
-            elif _choice(options) == "retreat":
-                link.acknowledge()
-                link.retreat()
+                grip(cell, link, close=False)
+            else:
+                retreat_if_chosen(link, options.after_stop)
             ended |= {"peak_force_n": recorder.peak_force, "sample_count": recorder.count}
             return ended
     finally:
@@ -262,13 +249,6 @@ def _tool_pose(cell: Cell, link: RobotLink) -> np.ndarray:
     return pose_vectors(flange @ matrices(np.array(cell.tool.grasp_pose)))
 
 
-def _close_gripper(cell: Cell, link: RobotLink) -> None:
-    if cell.tool.gripper == "digital_output":
-        link.gripper(True)
-    elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
-        input("Close the gripper on the branch by hand, then press Enter ")
-
-
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
                  tracker: MarkerStream | None, recorder: PullRecorder,
                  marker_lines: Stream | None) -> None:
@@ -294,16 +274,6 @@ def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, 
         f"{max(tared['sigma'][:3]):.2g} N")
     for line in entry_text(entry).splitlines():
         lines.append(line)
-
-
-def _choice(options: RecordOptions) -> str:
-    if options.after_stop != "ask":
-        return options.after_stop
-    if not sys.stdin.isatty():
-        return "hold"
-    typed = input("The robot has stopped. Type retreat to go back the way it came; anything else "
-                  "holds: ")
-    return "retreat" if typed.strip() == "retreat" else "hold"
 
 
 def _finish(branch: Branch, name: str, settings: RecordSettings, ended: dict[str, Any],
