@@ -1,5 +1,6 @@
 """From a scan to tetrahedra: skeleton, surface and mesh of a branch, in its own frame."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from limber.geometry.left_out import (
 )
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
+from limber.geometry.skeleton.edits import Edit, edited
 from limber.geometry.skeleton.plausibility import check_explained
 from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
@@ -74,15 +76,20 @@ class Reconstruction:
 
 
 def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleton | None = None,
-                      eye: np.ndarray | None = None, progress: Progress = SILENT,
-                      ) -> Reconstruction:
+                      edits: Sequence[Edit] = (), eye: np.ndarray | None = None,
+                      keep: Callable[[Alignment, Skeleton], None] | None = None,
+                      progress: Progress = SILENT) -> Reconstruction:
     """Make skeleton, surface and tetrahedra of a scan.
 
     Args:
         raw: The scan, in the file's unit.
         settings: How.
         own: The user's own skeleton in the scan's frame [m], instead of ours.
+        edits: What its user changed in the skeleton, in the file's coordinates; those that no
+            longer fit are left out and told.
         eye: Where the depth camera stood [m], shape [3], if the scan is its image.
+        keep: Gets the alignment and the skeleton as soon as it is found, before anything that may
+            still refuse it or fail.
         progress: Called as it goes; gets what the user should know.
 
     Raises:
@@ -92,20 +99,45 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     for text in prepared.warnings:
         progress.warn(text)
     found = _skeleton(prepared, settings, own, progress.part(0.02, 0.55))
-    if own is None:
-        check_explained(found, settings.unexplained)
+    whole = found
     if prepared.view is not None and own is None:
         found, text = seen_skeleton(found, prepared, settings.silhouette_reach)
         if text:
             progress.warn(text)
     alignment, cloud, found = _aligned(prepared, found, settings)
+    if keep is not None:
+        keep(alignment, found.skeleton)
+    if own is None:
+        check_explained(whole, settings.unexplained)
+    # Kept beside the mesh's own, which edits of the skeleton make anew.
+    told = list(prepared.warnings)
     for text in found.warnings:
+        told.append(text)
         progress.warn(text)
+    if edits:
+        found = _edited(found, [edit.aligned(alignment) for edit in edits], progress)
+        cloud = labelled(cloud, found.skeleton)
     meshed = mesh_skeleton(found.skeleton, settings, progress.part(0.55, 0.98))
     gravity = gravity_after(alignment, settings.up)
     numbers = meshed.numbers | found.report() | {
-        "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity}
+        "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,
+        "skeleton_warnings": told}
     return Reconstruction(alignment, cloud, meshed, gravity, numbers)
+
+
+def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
+    """Return a cloud that says which node each point belongs to, and how far off it lies [m]."""
+    node, residual = nearest_cylinders(skeleton, cloud.points)
+    return Cloud(cloud.points, cloud.attributes | {
+        "skeleton_node": node.astype(np.int32), "residual": residual.astype(np.float32)})
+
+
+def _edited(found: SkeletonResult, edits: Sequence[Edit], progress: Progress) -> SkeletonResult:
+    misfits: list[str] = []
+    skeleton = edited(found.skeleton, edits, misfits)
+    for text in misfits:
+        progress.warn(f"{text} It was left out.")
+    return replace(found, skeleton=skeleton)
 
 
 def gravity_after(alignment: Alignment, up: tuple[float, float, float]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The tables that the report and the demo share, as rows of text with a header row."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
@@ -77,6 +78,27 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
             _known(score.get("rms_force_n"), "{:.3g}"),
             _known(score.get("relative_force"), "{:.1f} %", 100),
             "the other pulls" if score.get("in_fit", True) else "this estimate"])
+    return rows
+
+
+def doubt_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the doubtful parts of a skeleton.
+
+    Args:
+        doubtful: Each with ``kind``, ``branch``, ``at`` [3], ``length_m``, ``radius_m`` and
+            ``value`` (see :class:`limber.geometry.skeleton.doubts.Doubt`).
+    """
+    told = {"unlikely branch": "probability {:.2f}", "unresolved radius": "sigma {:.0%} of it",
+            "kink": "{:.0f} degrees", "starts backwards": "{:.0f} degrees"}
+    rows = [["what", "branch", "at", "length [mm]", "radius [mm]", "how doubtful"]]
+    for part in doubtful:
+        value = part["value"]
+        if part["kind"] in ("kink", "starts backwards"):
+            value = math.degrees(value)
+        rows.append([part["kind"], str(part["branch"]),
+                     " ".join(f"{place:.8g}" for place in part["at"]),
+                     f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
+                     told[part["kind"]].format(value) if part["kind"] in told else "no points"])
     return rows
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -20,13 +21,21 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
-    from limber.geometry.reconstruct import Reconstruction
+    from limber.geometry.cloud.cloud import Cloud
+    from limber.geometry.reconstruct import MeshedBranch
+    from limber.geometry.skeleton.edits import Edit
+    from limber.geometry.skeleton.skeleton import Skeleton
+
+EDITS = "edits.json"
+"""The edits that a branch keeps, in the coordinates of the scan's file."""
+KEPT = "scan_skeleton"
+"""The skeleton as it was found, in the coordinates of the scan's file: .swc and .csv."""
 
 
 class ReconstructInputs(Settings):
     """A scan, what is known of it, and the branch folder to make."""
 
-    groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "camera", "mask"),
+    groups: ClassVar[Groups] = {"input": ("cloud", "skeleton", "edits", "camera", "mask"),
                                "output": ("output",)}
 
     cloud: Path = argument("A point cloud file, or a folder of them: then each becomes a branch "
@@ -36,6 +45,9 @@ class ReconstructInputs(Settings):
         json_schema_extra={"short": "-o"})
     skeleton: Path | None = Field(
         None, description="Your own skeleton (SWC or cylinder CSV) in the cloud's coordinates.")
+    edits: Path | None = Field(
+        None, description="Edits of the skeleton (JSON, see `limber skeleton`); they stay in the "
+        "branch folder and are applied again by each reconstruct without --skeleton.")
     camera: Path | None = Field(
         None, description="camera.toml: then CLOUD is a depth image.")
     mask: Path | None = Field(
@@ -43,10 +55,13 @@ class ReconstructInputs(Settings):
 
 
 def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | None = None, *,
-                skeleton_path: Path | None = None, camera_path: Path | None = None,
-                mask_path: Path | None = None, force: bool = False,
-                progress: Progress = SILENT) -> dict[str, Any]:
+                skeleton_path: Path | None = None, edits_path: Path | None = None,
+                camera_path: Path | None = None, mask_path: Path | None = None,
+                force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Make a branch folder of a scan: skeleton, surface and tetrahedra.
+
+    The skeleton is kept in the scan's own coordinates as soon as it is found
+    (``scan_skeleton.swc`` and ``.csv``), also where a later step fails.
 
     Args:
         cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
@@ -54,6 +69,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         settings: How.
         skeleton_path: The user's own skeleton in the scan's coordinates and unit (SWC or
             cylinder CSV), instead of ours.
+        edits_path: Edits of the skeleton; without them those that the folder has, if the
+            skeleton is not the user's own.
         camera_path: ``camera.toml``, if ``cloud_path`` is a depth image.
         mask_path: The depth image's mask of the branch.
         force: Run even if nothing has changed.
@@ -64,12 +81,13 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
 
     Raises:
         InputError: the scan, the skeleton or the folder cannot be used.
-        WorkError: the work failed; the folder is as it was.
+        WorkError: the work failed; the folder is as it was but for the kept skeleton.
     """
     from limber.constants import UNIT_METRES
     from limber.geometry.cloud.depth_files import read_depth
     from limber.geometry.cloud.files import read_points
     from limber.geometry.reconstruct import reconstruct_cloud
+    from limber.geometry.skeleton.edits import edits_text, read_edits
     from limber.geometry.skeleton.files import read_skeleton
 
     settings = settings or ReconstructSettings()
@@ -80,18 +98,43 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     for name, path in (("skeleton", skeleton_path), ("camera", camera_path), ("mask", mask_path)):
         if path is not None:
             digests[name] = file_digest(require_file(path, f"A {name} file"))
+    if edits_path is not None:
+        edits = read_edits(edits_path)
+    else:
+        edits = [] if skeleton_path is not None else load_edits(branch)
+    digests |= edits_digest(edits)
     if not force and branch.is_current("reconstruct", settings, digests=digests):
         return branch.manifest.stages["reconstruct"].result
     warnings: list[str] = []
+    if edits_path is None and not edits and branch.has(EDITS):
+        progress.keeping(warnings).warn(
+            "The edits of edits.json are not applied: the given skeleton is used as it is.")
+    kept: list[Skeleton] = []
+
+    def keep(alignment: Alignment, skeleton: Skeleton) -> None:
+        with branch.stage("skeleton", settings, digests=digests) as early:
+            _keep_skeleton(early, alignment, skeleton, settings.unit)
+        kept.append(skeleton)
     with branch.stage("reconstruct", settings, digests=digests) as stage:
         own = None if skeleton_path is None else read_skeleton(
             skeleton_path, scale=UNIT_METRES[settings.unit])
-        made = reconstruct_cloud(raw, settings, own=own, eye=_eye(camera_path),
-                                 progress=progress.keeping(warnings))
+        try:
+            made = reconstruct_cloud(raw, settings, own=own, edits=edits, eye=_eye(camera_path),
+                                     keep=keep, progress=progress.keeping(warnings))
+        except LimberError as error:
+            if kept and not isinstance(error, Cancelled):
+                progress.warn(
+                    f"The skeleton as it was found is in {branch.folder / KEPT}.swc, in the scan's "
+                    "coordinates: mend it and give it back (--skeleton), or edit it (--edits).")
+            raise
         stage.manifest.alignment = made.alignment
         stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
                                  "sha256": digests["cloud"]}
-        _write(stage, made)
+        write_branch(stage, made.cloud, made.meshed)
+        if edits:
+            stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
+        elif edits_path is not None:
+            stage.remove(EDITS)
         if _copy_truth(Path(cloud_path), stage, made.alignment):
             stage.manifest.source["truth"] = "truth/truth.json"
         stage.result.update(made.numbers | {"warnings": warnings})
@@ -141,11 +184,22 @@ def reconstruct_folder(clouds: Path, folder: Path, settings: ReconstructSettings
     return {"done": done, "failed": failed, "done_count": len(done), "failed_count": len(failed)}
 
 
-def _write(stage: Stage, made: Reconstruction) -> None:
+def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit: str) -> None:
+    """Write a skeleton in the coordinates and the unit of the scan's file."""
     from limber.geometry.skeleton.files import write_cylinders
 
-    meshed = made.meshed
-    made.cloud.write_ply(stage.path("cloud.ply"))
+    in_file = skeleton.in_file(alignment)
+    in_file.write_swc(stage.path(f"{KEPT}.swc"), unit=unit)
+    write_cylinders(in_file, stage.path(f"{KEPT}.csv"))
+    stage.result.update(node_count=skeleton.node_count, length_m=skeleton.length,
+                        alignment=alignment)
+
+
+def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
+    """Write the files of a branch that has been meshed."""
+    from limber.geometry.skeleton.files import write_cylinders
+
+    cloud.write_ply(stage.path("cloud.ply"))
     meshed.skeleton.write_swc(stage.path("skeleton.swc"))
     write_cylinders(meshed.skeleton, stage.path("skeleton.csv"))
     meshed.surface.write_ply(stage.path("surface.ply"))
@@ -154,6 +208,24 @@ def _write(stage: Stage, made: Reconstruction) -> None:
         stage.path("point_masses.json").write_text(json.dumps(meshed.masses, indent=1) + "\n")
     else:
         stage.remove("point_masses.json")  # of an earlier run: its twigs are in the mesh now
+
+
+def load_edits(branch: Branch) -> list[Edit]:
+    """Return the edits of its skeleton that a branch keeps.
+
+    Raises:
+        InputError: the file has been changed by hand, and is none now.
+    """
+    from limber.geometry.skeleton.edits import read_edits
+
+    return read_edits(branch.path(EDITS)) if branch.has(EDITS) else []
+
+
+def edits_digest(edits: list[Edit]) -> dict[str, str]:
+    """Return what a manifest remembers of edits: nothing of none."""
+    from limber.geometry.skeleton.edits import edits_text
+
+    return {"edits": hashlib.sha256(edits_text(edits).encode()).hexdigest()} if edits else {}
 
 
 def _eye(camera_path: Path | None) -> np.ndarray | None:
@@ -195,14 +267,18 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     if inputs.cloud.is_dir():
+        one = [name for name in ("skeleton", "edits", "camera", "mask") if getattr(inputs, name)]
+        if one:
+            raise InputError(f"{inputs.cloud} is a folder, and --{one[0]} was given.",
+                             "That belongs to one scan.", "Reconstruct that scan by itself.")
         return reconstruct_folder(inputs.cloud, inputs.output, settings, force=options.force,
                                   progress=progress)
     return reconstruct(inputs.cloud, inputs.output, settings, skeleton_path=inputs.skeleton,
-                       camera_path=inputs.camera, mask_path=inputs.mask, force=options.force,
-                       progress=progress)
+                       edits_path=inputs.edits, camera_path=inputs.camera, mask_path=inputs.mask,
+                       force=options.force, progress=progress)
 
 
 STAGE = StageDescription(
     "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", "truth/"))
+            "point_masses.json", f"{KEPT}.swc", f"{KEPT}.csv", EDITS, "truth/"))

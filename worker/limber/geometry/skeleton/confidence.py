@@ -11,17 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
-from limber.geometry.skeleton.skeleton import (
-    BRIDGED,
-    INTERPOLATED,
-    LIMITED,
-    MEASURED,
-    UNRESOLVED,
-    Skeleton,
-)
-
-STATES = {"measured": MEASURED, "limited": LIMITED, "interpolated": INTERPOLATED,
-          "unresolved": UNRESOLVED, "bridged": BRIDGED}
+from limber.geometry.skeleton.skeleton import BRIDGED, STATES, UNRESOLVED, Skeleton
 
 # Diameter in point spacings, under which a radius is not resolved: too few points a radius.
 _SPACINGS = 1.0

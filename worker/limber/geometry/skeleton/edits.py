@@ -1,26 +1,41 @@
 """Edits of a skeleton by its user: a small list that is applied again after each reconstruction.
 
-Nodes are named by their place, not by their number: a new reconstruction numbers them anew.
+Nodes are named by their place, not by their number: a new reconstruction numbers them anew. A
+file of edits is a JSON list, its places and radii in the coordinates and the unit of the scan's
+file, as `limber skeleton` lists them::
+
+    [{"do": "delete", "at": [0.12, 0.03, 0.85]},
+     {"do": "radius", "at": [0.00, 0.01, 0.30], "radius": 0.011}]
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from limber.alignment import Alignment
 from limber.errors import InputError
-from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
+from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 
 Place = tuple[float, float, float]
-_FAR = 8.0  # radii from an axis, from which a place is none on it
+_FAR = 4.0  # radii from an axis, from which a place is none on it
+_KNOWN = 0.02  # of a radius that a user gave
 
 
 class _Edit(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     at: Place
+
+    def aligned(self, alignment: Alignment) -> Self:
+        """Return the edit with places and radius in the branch's frame [m]."""
+        places = {name: tuple(alignment.apply(np.array(getattr(self, name))).tolist())
+                  for name in ("at", "to") if getattr(self, name, None) is not None}
+        sizes = {"radius": self.radius * alignment.scale} if hasattr(self, "radius") else {}
+        return self.model_copy(update=places | sizes)
 
 
 class MoveNode(_Edit):
@@ -36,10 +51,27 @@ class DeleteBranch(_Edit):
     do: Literal["delete"] = "delete"
 
 
+class MergeBranch(_Edit):
+    """Up to ``at`` a branch is one with the branch at ``to``, from where it goes on.
+
+    What it carried before ``at`` hangs on the nearest nodes of that other branch.
+    """
+
+    do: Literal["merge"] = "merge"
+    to: Place
+
+
 class Bridge(_Edit):
-    """Hang the branch that starts nearest to ``at`` on the node nearest to ``to`` instead."""
+    """Hang the whole branch at ``at`` on the node nearest to ``to`` instead."""
 
     do: Literal["bridge"] = "bridge"
+    to: Place
+
+
+class SplitBranch(_Edit):
+    """Cut a branch at ``at``; what lies beyond hangs on the node nearest to ``to`` instead."""
+
+    do: Literal["split"] = "split"
     to: Place
 
 
@@ -50,35 +82,77 @@ class SetRoot(_Edit):
 
 
 class SetRadius(_Edit):
-    """Set the radius [m] of the node nearest to ``at``, known to 2 %."""
+    """Set the radius at ``at``, or all along the axes from ``at`` to ``to``; known to 2 %."""
 
     do: Literal["radius"] = "radius"
     radius: float = Field(gt=0)
+    to: Place | None = None
 
 
-Edit = Annotated[MoveNode | DeleteBranch | Bridge | SetRoot | SetRadius, Field(discriminator="do")]
+class ConfirmBranch(_Edit):
+    """The branch at ``at`` is there, and what carries it: no more doubt."""
+
+    do: Literal["confirm"] = "confirm"
+
+
+Edit = Annotated[MoveNode | DeleteBranch | MergeBranch | Bridge | SplitBranch | SetRoot | SetRadius
+                 | ConfirmBranch, Field(discriminator="do")]
 EDITS = TypeAdapter(list[Edit])
 """Reads and writes edits as JSON."""
 
 
-def edited(skeleton: Skeleton, edits: Iterable[Edit]) -> Skeleton:
+def read_edits(path: Path) -> list[Edit]:
+    """Read a file of edits.
+
+    Raises:
+        InputError: it cannot be read, is no JSON, or an edit is none; says which.
+    """
+    try:
+        return EDITS.validate_json(Path(path).read_bytes())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).",
+                         "A JSON file of edits was expected.", "Check the path.") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = first["loc"]
+        where = f"edit {place[0] + 1}: " if place and isinstance(place[0], int) else ""
+        field = ".".join(str(part) for part in place[2:])
+        raise InputError(
+            f"{path}: {where}{field + ': ' if field else ''}{first['msg']}.",
+            'Edits are a JSON list of objects such as {"do": "delete", "at": [x, y, z]}; do is '
+            "move, delete, merge, bridge, split, root, radius or confirm.",
+            "Correct the file; places are in the scan file's coordinates.") from error
+
+
+def edits_text(edits: Sequence[Edit]) -> str:
+    """Return edits as the text of their file: one a line, always the same for the same edits."""
+    lines = [edit.model_dump_json(exclude_none=True) for edit in edits]
+    return "[" + ",\n ".join(lines) + "]\n"
+
+
+def edited(skeleton: Skeleton, edits: Iterable[Edit], misfits: list[str] | None = None,
+           ) -> Skeleton:
     """Apply edits, in their order.
 
     Args:
         skeleton: In the frame of the edits' places [m].
         edits: What to change.
+        misfits: Gets the message of each edit that does not fit, which is then left out; None
+            refuses it.
 
     Raises:
         InputError: a place is on no axis, or an edit would leave no tree.
     """
-    doing = {"move": _moved, "delete": _deleted, "bridge": _bridged, "root": _rooted,
-             "radius": _with_radius}
+    doing = {"move": _moved, "delete": _deleted, "merge": _merged, "bridge": _bridged,
+             "split": _split, "root": _rooted, "radius": _with_radius, "confirm": _confirmed}
     for number, edit in enumerate(edits, start=1):
         try:
             skeleton = doing[edit.do](skeleton, edit)
         except InputError as error:
-            raise InputError(f"Edit {number} ({edit.do}): {error.seen}", error.why, error.fix,
-                             ) from error
+            told = InputError(f"Edit {number} ({edit.do}): {error.seen}", error.why, error.fix)
+            if misfits is None:
+                raise told from error
+            misfits.append(str(told))
     return skeleton
 
 
@@ -87,15 +161,17 @@ def _nearest(skeleton: Skeleton, at: Place) -> int:
     node = int(np.argmin(distance))
     if distance[node] > _FAR * skeleton.radius[node]:
         raise InputError(
-            f"{at} is {1000 * distance[node]:.0f} mm from the nearest node.",
-            "It is on no branch.", "Give a place on an axis, in the skeleton file's coordinates.")
+            f"({', '.join(f'{value:.3f}' for value in at)}) m in the branch's frame is "
+            f"{1000 * distance[node]:.0f} mm from the nearest node.",
+            "It is on no branch.", "Give a place on an axis, in the scan file's coordinates, as "
+            "`limber skeleton` lists them.")
     return node
 
 
 def _moved(skeleton: Skeleton, edit: MoveNode) -> Skeleton:
     nodes = skeleton.nodes.copy()
     nodes[_nearest(skeleton, edit.at)] = edit.to
-    return skeleton.moved(nodes)
+    return _remade(skeleton, nodes=nodes)
 
 
 def _deleted(skeleton: Skeleton, edit: DeleteBranch) -> Skeleton:
@@ -109,19 +185,60 @@ def _deleted(skeleton: Skeleton, edit: DeleteBranch) -> Skeleton:
     return skeleton.subset(keep)
 
 
+def _merged(skeleton: Skeleton, edit: MergeBranch) -> Skeleton:
+    node, onto = _nearest(skeleton, edit.at), _nearest(skeleton, edit.to)
+    run, other = int(skeleton.branch[node]), int(skeleton.branch[onto])
+    if run == 0 or run == other:
+        raise InputError("The main branch cannot be merged into another, nor one into itself.",
+                         "A branch that is carried becomes part of another.",
+                         "Give the branch that is too many as `at`.")
+    members = skeleton.runs()[run][1:]
+    gone = np.zeros(skeleton.node_count, bool)
+    gone[members[members <= node]] = True
+    if gone[_way_down(skeleton, onto)].any():
+        raise _circle()
+    parent = skeleton.parent.copy()
+    hosts = np.flatnonzero(skeleton.branch == other)
+    for child in np.flatnonzero(~gone & gone[skeleton.parent] & (skeleton.parent >= 0)):
+        near = np.linalg.norm(skeleton.nodes[hosts] - skeleton.nodes[child], axis=1)
+        parent[child] = onto if skeleton.parent[child] == node else hosts[np.argmin(near)]
+    new_index = np.cumsum(~gone) - 1
+    moved = np.where(parent[~gone] < 0, -1, new_index[parent[~gone]])
+    return Skeleton.from_edges(skeleton.nodes[~gone], moved, skeleton.radius[~gone],
+                               **{name: values[~gone] for name, values in _data(skeleton).items()})
+
+
 def _bridged(skeleton: Skeleton, edit: Bridge) -> Skeleton:
     node, onto = _nearest(skeleton, edit.at), _nearest(skeleton, edit.to)
-    run = skeleton.runs()[int(skeleton.branch[node])]
-    start = int(run[1]) if skeleton.branch[node] else -1
-    way = onto
-    while way >= 0 and way != start:
-        way = int(skeleton.parent[way])
-    if start < 0 or way == start:
-        raise InputError("The branch carries what it should hang on.", "That makes a circle.",
-                         "Name the branch that is carried, and what carries it.")
+    if skeleton.branch[node] == 0:
+        raise _circle()
+    return _hung(skeleton, int(skeleton.runs()[int(skeleton.branch[node])][1]), onto)
+
+
+def _split(skeleton: Skeleton, edit: SplitBranch) -> Skeleton:
+    return _hung(skeleton, _nearest(skeleton, edit.at), _nearest(skeleton, edit.to))
+
+
+def _hung(skeleton: Skeleton, node: int, onto: int) -> Skeleton:
+    """Hang a node, with all that it carries, on another one; a way that is long is filled in."""
+    if node in _way_down(skeleton, onto):
+        raise _circle()
+    way = skeleton.nodes[node] - skeleton.nodes[onto]
+    thick = skeleton.radius[node]
+    count = int(np.linalg.norm(way) / (2 * max(thick, 1e-12)))
+    share = (np.arange(count) + 1)[:, None] / (count + 1)
     parent = skeleton.parent.copy()
-    parent[start] = onto
-    return _remade(skeleton, parent)
+    chain = skeleton.node_count + np.arange(count)
+    parent[node] = chain[-1] if count else onto
+    data = _data(skeleton)
+    filled = {"radius_sigma": data["radius_sigma"][node], "radius_state": BRIDGED,
+              "probability": data["probability"][node]}
+    return Skeleton.from_edges(
+        np.vstack([skeleton.nodes, skeleton.nodes[onto] + share * way]),
+        np.concatenate([parent, np.concatenate([[onto], chain[:-1]])[:count]]),
+        np.concatenate([skeleton.radius, np.full(count, thick)]),
+        **{name: np.concatenate([values, np.full(count, filled[name], values.dtype)])
+           for name, values in data.items()})
 
 
 def _rooted(skeleton: Skeleton, edit: SetRoot) -> Skeleton:
@@ -129,18 +246,54 @@ def _rooted(skeleton: Skeleton, edit: SetRoot) -> Skeleton:
     parent = skeleton.parent.copy()
     while node >= 0:
         parent[node], before, node = before, node, int(parent[node])
-    return _remade(skeleton, parent)
+    return _remade(skeleton, parent=parent)
 
 
 def _with_radius(skeleton: Skeleton, edit: SetRadius) -> Skeleton:
     node = _nearest(skeleton, edit.at)
+    chosen = [node]
+    if edit.to is not None:
+        one = _way_down(skeleton, node)
+        other = _way_down(skeleton, _nearest(skeleton, edit.to))
+        # The way between two nodes: what only one of their ways to the root has, and the fork.
+        fork = next(step for step in one if step in other)
+        chosen = [*one[:one.index(fork)], *other[:other.index(fork)], fork]
     radius, sigma, state = (values.copy() for values in (
         skeleton.radius, skeleton.radius_sigma, skeleton.radius_state))
-    radius[node], sigma[node], state[node] = edit.radius, 0.02 * edit.radius, MEASURED
+    radius[chosen], sigma[chosen], state[chosen] = edit.radius, _KNOWN * edit.radius, MEASURED
     return replace(skeleton, radius=radius, radius_sigma=sigma, radius_state=state)
 
 
-def _remade(skeleton: Skeleton, parent: np.ndarray) -> Skeleton:
+def _confirmed(skeleton: Skeleton, edit: ConfirmBranch) -> Skeleton:
+    node = _nearest(skeleton, edit.at)
+    probability = skeleton.probability.copy()
+    probability[skeleton.branch == skeleton.branch[node]] = 1.0
+    probability[_way_down(skeleton, node)] = 1.0
+    return replace(skeleton, probability=probability)
+
+
+def _way_down(skeleton: Skeleton, node: int) -> list[int]:
+    """Nodes from one to the root, both included."""
+    way = []
+    while node >= 0:
+        way.append(node)
+        node = int(skeleton.parent[node])
+    return way
+
+
+def _circle() -> InputError:
+    return InputError("The branch carries what it should hang on.", "That makes a circle.",
+                      "Name the branch that is carried, and what carries it.")
+
+
+def _data(skeleton: Skeleton) -> dict[str, np.ndarray]:
+    return {name: getattr(skeleton, name)
+            for name in ("radius_sigma", "radius_state", "probability")}
+
+
+def _remade(skeleton: Skeleton, *, nodes: np.ndarray | None = None,
+            parent: np.ndarray | None = None) -> Skeleton:
+    """Return the skeleton with other places or parents; runs and orders are found anew."""
     return Skeleton.from_edges(
-        skeleton.nodes, parent, skeleton.radius, radius_sigma=skeleton.radius_sigma,
-        radius_state=skeleton.radius_state, probability=skeleton.probability)
+        skeleton.nodes if nodes is None else nodes,
+        skeleton.parent if parent is None else parent, skeleton.radius, **_data(skeleton))

@@ -7,7 +7,7 @@ import numpy as np
 
 from limber.constants import UNIT_METRES
 from limber.errors import InputError
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeleton import STATES, Skeleton
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
@@ -47,7 +47,8 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
     """Read a cylinder model: columns id, parent, sx, sy, sz, ex, ey, ez, radius (any order).
 
     A cylinder's end becomes a node that hangs on the end of its parent; the root's start becomes
-    the root node.
+    the root node. What :func:`write_cylinders` adds (deviations, states, probabilities) is read
+    where it is there.
 
     Args:
         path: The CSV file.
@@ -75,19 +76,24 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
                          "A branch has exactly one root.", "Keep one tree in the file.")
     root = roots[0]
     nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
-    radius = np.concatenate([table[root, 8:9], table[:, 8]]) * scale
+    first = _number(path, rows[root].get("start_radius") or rows[root]["radius"])
+    radius = np.concatenate([[first], table[:, 8]]) * scale
     hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
+    fitted = _fitted_columns(path, rows, scale)
+    count = len(nodes)
     nodes, hang, radius = _without_repeats(nodes, hang, radius)
-    sigma = np.zeros(len(nodes))
-    return Skeleton.from_edges(nodes, hang, radius, radius_sigma=sigma)
+    # Where nodes at one place were merged it is not known what belongs to which.
+    fitted = fitted if len(nodes) == count else {}
+    return Skeleton.from_edges(nodes, hang, radius, **{
+        name: np.concatenate([values[root:root + 1], values]) for name, values in fitted.items()})
 
 
 def write_cylinders(skeleton: Skeleton, path: Path) -> None:
-    """Write one cylinder for each node but the root, as CSV in metres.
+    """Write one cylinder for each node but the root, as CSV in the skeleton's unit.
 
     Columns: id, parent, start and end points, radius, length, axis, branch, order, the radius's
     standard deviation, its state (0 measured, 1 limited, 2 interpolated, 3 unresolved,
-    4 bridged), and the probability that the node is there.
+    4 bridged), the probability that the node is there, and the radius at the start.
     """
     start, end = skeleton.nodes[skeleton.parent[1:]], skeleton.nodes[1:]
     length = np.linalg.norm(end - start, axis=1)
@@ -95,33 +101,55 @@ def write_cylinders(skeleton: Skeleton, path: Path) -> None:
     with open(path, "w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream)
         writer.writerow("id parent sx sy sz ex ey ez radius length ax ay az branch order "
-                        "radius_sigma radius_state probability".split())
+                        "radius_sigma radius_state probability start_radius".split())
         for i in range(len(end)):
             node = i + 1
             numbers = [*start[i], *end[i], skeleton.radius[node], length[i], *axis[i]]
             up = skeleton.parent[node] - 1
-            writer.writerow([i, up, *(f"{v:.9g}" for v in numbers), skeleton.branch[node],
+            writer.writerow([i, up, *(f"{v:.15g}" for v in numbers), skeleton.branch[node],
                              skeleton.order[node], f"{skeleton.radius_sigma[node]:.3g}",
                              skeleton.radius_state[node],
-                             f"{skeleton.probability[node]:.3f}"])
+                             f"{skeleton.probability[node]:.3f}",
+                             f"{skeleton.radius[skeleton.parent[node]]:.12g}"])
 
 
 def read_fitted(path: Path) -> Skeleton:
     """Read what :func:`write_cylinders` wrote, with deviations, states and probabilities."""
     skeleton = read_cylinders(path)
-    rows = list(csv.DictReader(_lines(path)))
-    if not rows or "probability" not in rows[0]:
+    if "probability" not in _lines(path)[0]:
         raise InputError(f"{path} has no radius_sigma, radius_state and probability.",
                          "It was written by another program or an older Limber.",
                          "Reconstruct the scan again.")
-    if len(rows) != skeleton.node_count - 1:
-        return skeleton  # nodes at one place were merged: what belongs to which is not known
-    columns = {name: np.array([float(row[name]) for row in rows]) for name in (
-        "radius_sigma", "radius_state", "probability")}
-    first = {name: np.concatenate([values[:1], values]) for name, values in columns.items()}
-    return Skeleton.from_edges(
-        skeleton.nodes, skeleton.parent, skeleton.radius, radius_sigma=first["radius_sigma"],
-        radius_state=first["radius_state"].astype(np.int8), probability=first["probability"])
+    return skeleton
+
+
+def _number(path: Path, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{path} has a field that is not a number ({error}).",
+                         "Radii are numbers.", "Correct the file.") from error
+
+
+def _fitted_columns(path: Path, rows: list[dict[str, str]], scale: float,
+                    ) -> dict[str, np.ndarray]:
+    names = ("radius_sigma", "radius_state", "probability")
+    if any(name not in rows[0] for name in names):
+        return {}
+    try:
+        sigma, state, probability = (np.array([float(row[name]) for row in rows])
+                                     for name in names)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path} has a field that is not a number ({error}).",
+                         f"{', '.join(names)} are numbers.", "Correct the file.") from error
+    if not ((sigma >= 0).all() and np.isin(state, list(STATES.values())).all()
+            and ((probability >= 0) & (probability <= 1)).all()):
+        raise InputError(
+            f"{path} has a deviation, state or probability out of its range.",
+            f"Deviations are not negative, states {min(STATES.values())} to "
+            f"{max(STATES.values())}, probabilities 0 to 1.", "Correct the file.")
+    return {"radius_sigma": sigma * scale, "radius_state": state.astype(np.int8),
+            "probability": probability}
 
 
 def _lines(path: Path) -> list[str]:

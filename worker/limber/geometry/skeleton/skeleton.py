@@ -5,11 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.alignment import Alignment
 from limber.errors import InputError
 
 MEASURED, LIMITED, INTERPOLATED, UNRESOLVED, BRIDGED = 0, 1, 2, 3, 4
 """Values of ``radius_state``: fitted to points, limited to the cloud's scale, filled in, too
 thin for the scan's points and noise, or in a gap."""
+STATES = {"measured": MEASURED, "limited": LIMITED, "interpolated": INTERPOLATED,
+          "unresolved": UNRESOLVED, "bridged": BRIDGED}
+"""Names of these values."""
 
 
 @dataclass(frozen=True)
@@ -154,14 +158,21 @@ class Skeleton:
             self.nodes[keep], parent, self.radius[keep], radius_sigma=self.radius_sigma[keep],
             radius_state=self.radius_state[keep], probability=self.probability[keep])
 
-    def write_swc(self, path: Path) -> None:
-        """Write an SWC file, in metres as its header says; type 5 is a fork, 6 a tip, 0 else."""
+    def in_file(self, alignment: Alignment) -> "Skeleton":
+        """Return it in the coordinates and the unit of the file that the branch was made from."""
+        return replace(self, nodes=alignment.undo(self.nodes),
+                       radius=self.radius / alignment.scale,
+                       radius_sigma=self.radius_sigma / alignment.scale)
+
+    def write_swc(self, path: Path, *, unit: str = "m") -> None:
+        """Write an SWC file, in the unit that its header says; type 5 is a fork, 6 a tip, 0 else.
+        """
         counts = self.child_counts()
         kind = np.select([self.parent < 0, counts > 1, counts == 0], [1, 5, 6], 0)
-        lines = ["# Limber skeleton, SWC", "# unit: m", "# id type x y z radius parent"]
+        lines = ["# Limber skeleton, SWC", f"# unit: {unit}", "# id type x y z radius parent"]
         for i, (p, r) in enumerate(zip(self.nodes, self.radius, strict=True)):
             up = self.parent[i] + 1 if self.parent[i] >= 0 else -1
-            lines.append(f"{i + 1} {kind[i]} {p[0]:.9g} {p[1]:.9g} {p[2]:.9g} {r:.6g} {up}")
+            lines.append(f"{i + 1} {kind[i]} {p[0]:.15g} {p[1]:.15g} {p[2]:.15g} {r:.9g} {up}")
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     @classmethod

@@ -1,0 +1,46 @@
+"""Doubtful parts: each kind is found where it was made, and a sound skeleton has none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.doubts import DoubtKind, doubtful_parts
+from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
+
+
+def test_a_sound_skeleton_has_no_doubtful_parts(y_skeleton) -> None:
+    """A fork of 37 degrees is no kink."""
+    assert doubtful_parts(y_skeleton) == []
+
+
+def test_each_doubt_is_found_with_its_place(y_skeleton) -> None:
+    """An unlikely twig, an unresolved stretch and a gap: length, radius and value."""
+    state = y_skeleton.radius_state.copy()
+    state[3:6], state[8:10] = BRIDGED, UNRESOLVED
+    sigma = np.where(state == UNRESOLVED, 0.4 * y_skeleton.radius, 0.0)
+    told = doubtful_parts(replace(
+        y_skeleton, radius_state=state, radius_sigma=sigma,
+        probability=np.where(y_skeleton.branch == 1, 0.3, 1.0)))
+    assert [doubt.kind for doubt in told] == [
+        DoubtKind.unlikely, DoubtKind.unresolved, DoubtKind.bridged]
+    unlikely, unresolved, bridged = told
+    assert unlikely.branch == 1 and unlikely.value == pytest.approx(0.3)
+    assert unresolved.length == pytest.approx(0.1) and unresolved.value == pytest.approx(0.4)
+    assert bridged.length == pytest.approx(0.15)
+    np.testing.assert_allclose(bridged.at, y_skeleton.nodes[4])
+
+
+def test_kinks_and_backward_starts_are_found() -> None:
+    """A stem that turns by 90 degrees, and a twig that starts down along it."""
+    z, x = np.linspace(0, 0.2, 21), np.linspace(0.01, 0.2, 20)
+    stem = np.vstack([np.stack([0 * z, 0 * z, z], axis=1), np.stack([x, 0 * x, 0 * x + 0.2], 1)])
+    down = np.stack([0 * z[1:6], 0.004 + 0 * z[1:6], 0.1 - z[1:6]], axis=1)
+    skeleton = Skeleton.from_edges(
+        np.vstack([stem, down]), np.concatenate([np.arange(41) - 1, [10], 41 + np.arange(4)]),
+        np.full(46, 0.006))
+    told = {doubt.kind: doubt for doubt in doubtful_parts(skeleton)}
+    assert set(told) == {DoubtKind.kink, DoubtKind.backwards}
+    np.testing.assert_allclose(told[DoubtKind.kink].at, [0, 0, 0.2], atol=1e-9)
+    assert told[DoubtKind.kink].value == pytest.approx(np.pi / 2, abs=0.01)
+    assert told[DoubtKind.backwards].value > np.deg2rad(150)

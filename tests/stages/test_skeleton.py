@@ -1,0 +1,113 @@
+"""`limber skeleton`, and the skeleton that reconstruct keeps in the scan's own coordinates."""
+
+import json
+
+import numpy as np
+import pytest
+
+from limber.cli import call
+from limber.errors import InputError, MeshingError
+from limber.geometry import reconstruct as reconstruction
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.generated import generate_branch
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.files import read_skeleton
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.progress import Progress
+from limber.stages.reconstruct import reconstruct
+from limber.stages.skeleton import review_skeleton
+from limber.store import Branch
+
+# Map coordinates in millimetres, its z along the file's y.
+OFFSET = np.array([4.5e8, 1.2e6, -3.0e6])
+SETTINGS = ReconstructSettings(unit="mm", up=(0.0, 1.0, 0.0), upright=True)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A scan in millimetres far from the origin, lying on its side, and its branch folder."""
+    folder = tmp_path_factory.mktemp("scan")
+    points = 1e3 * generate_branch(5, fork_count=1, length=0.4, point_spacing=0.0025).cloud.points
+    Cloud(points[:, [1, 2, 0]] + OFFSET).write_ply(folder / "cloud.ply")
+    result = reconstruct(folder / "cloud.ply", folder / "a.branch", SETTINGS)
+    return folder, result
+
+
+def test_a_kept_skeleton_given_back_is_used_as_it_is(made, tmp_path) -> None:
+    """In the file's coordinates; states, deviations and probabilities come back too."""
+    folder, result = made
+    kept = Skeleton.read_swc(folder / "a.branch" / "scan_skeleton.swc", scale=1.0)
+    assert np.abs(kept.nodes - OFFSET).max() < 1000 and kept.radius.max() > 3
+    again = reconstruct(folder / "cloud.ply", tmp_path / "b.branch", SETTINGS,
+                        skeleton_path=folder / "a.branch" / "scan_skeleton.csv")
+    one, other = (read_skeleton(place / "skeleton.csv")
+                  for place in (folder / "a.branch", tmp_path / "b.branch"))
+    np.testing.assert_allclose(other.nodes, one.nodes, atol=2e-8)
+    np.testing.assert_allclose(other.radius, one.radius, rtol=1e-6)
+    np.testing.assert_allclose(other.radius_sigma, one.radius_sigma, rtol=1e-2)
+    assert (other.radius_state == one.radius_state).all()
+    assert again["tet_count"] == result["tet_count"]
+    assert again["mesh_volume_m3"] == pytest.approx(result["mesh_volume_m3"], rel=1e-4)
+
+
+def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
+    """The mesh follows an edit; the folder keeps it; a misfit is told; an empty list undoes it."""
+    folder, result = made
+    scan, target = folder / "cloud.ply", tmp_path / "e.branch"
+    reconstruct(scan, target, SETTINGS)
+    alignment = Branch.open(target).manifest.alignment
+    before = read_skeleton(target / "skeleton.csv")
+    tip = alignment.undo(before.nodes[before.branch == 1][-3:-2])[0].tolist()
+    edits = tmp_path / "edits.json"
+    edits.write_text(json.dumps([{"do": "delete", "at": tip}]))
+    told = review_skeleton(target, edits_path=edits, output=tmp_path / "out.swc")
+    assert told["length_m"] < result["length_m"] and told["mesh"] == "current"
+    assert Branch.open(target, verify=True).manifest.stages["reconstruct"].result[
+        "mesh_volume_m3"] < result["mesh_volume_m3"]
+    written = Skeleton.read_swc(tmp_path / "out.swc")
+    assert written.length == pytest.approx(told["length_m"], rel=1e-4)
+    # The same reconstruct is current with its edits; one with other settings applies them anew.
+    assert reconstruct(scan, target, SETTINGS)["length_m"] == pytest.approx(told["length_m"])
+    other = reconstruct(scan, target, SETTINGS.model_copy(update={"young": 2e8}))
+    assert other["length_m"] == pytest.approx(told["length_m"], rel=1e-6)
+    far = (OFFSET + 2000).tolist()
+    edits.write_text(json.dumps([{"do": "delete", "at": far}]))
+    with pytest.raises(InputError, match=r"Edit 1 .*on no branch"):
+        review_skeleton(target, edits_path=edits)
+    assert len(review_skeleton(target)["edits"]) == 1
+    warned: list[str] = []
+    undone = reconstruct(scan, target, SETTINGS, edits_path=edits,
+                         progress=Progress(on_warning=warned.append))
+    assert undone["length_m"] == pytest.approx(result["length_m"])
+    assert any("Edit 1 (delete)" in text and "left out" in text for text in warned)
+    edits.write_text("[]")
+    assert review_skeleton(target, edits_path=edits)["edits"] == []
+    assert not (target / "edits.json").exists()
+
+
+def test_a_failed_mesh_leaves_the_skeleton(made, tmp_path, monkeypatch, capsys) -> None:
+    """The kept skeleton is there, listed, and said to be without a mesh; then it is mended."""
+    folder, result = made
+    target = tmp_path / "f.branch"
+
+    def fail(*_given, **_named):
+        raise MeshingError("No mesh.")
+    monkeypatch.setattr(reconstruction, "mesh_skeleton", fail)
+    warned: list[str] = []
+    with pytest.raises(MeshingError, match=r"^No mesh\.$"):
+        reconstruct(folder / "cloud.ply", target, SETTINGS,
+                    progress=Progress(on_warning=warned.append))
+    assert any("scan_skeleton.swc" in text for text in warned)
+    assert call(["skeleton", str(target), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["mesh"] == "missing" and told["unit"] == "mm"
+    assert told["length_m"] == pytest.approx(result["length_m"], rel=1e-6)
+    edits = tmp_path / "edits.json"
+    edits.write_text("[]")
+    with pytest.raises(InputError, match="scan is needed again"):
+        review_skeleton(target, edits_path=edits)
+    monkeypatch.undo()
+    again = reconstruct(folder / "cloud.ply", target, SETTINGS,
+                        skeleton_path=target / "scan_skeleton.csv")
+    assert again["tet_count"] == result["tet_count"]
+    assert review_skeleton(target)["mesh"] == "current"

@@ -1,0 +1,119 @@
+"""The parts of a skeleton that its user should look at: unlikely, vague, bridged, kinked."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
+
+_LIKELY = 0.8  # probability from which a branch is not listed
+_KINK = np.deg2rad(70.0)  # a turn within a branch that wood does not make
+_BACKWARDS = np.deg2rad(110.0)  # of a twig against its carrier, likewise
+_CHORD = 2.0  # radii on each side of a node that tell its turn
+
+
+class DoubtKind(StrEnum):
+    """What is doubtful about a part."""
+
+    unlikely = "unlikely branch"
+    unresolved = "unresolved radius"
+    bridged = "bridged gap"
+    kink = "kink"
+    backwards = "starts backwards"
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """One doubtful part.
+
+    Attributes:
+        kind: What is doubtful.
+        branch: Its run.
+        at: A place on it [m], shape [3].
+        length: Of the part [m]; 0 for a single node.
+        radius: There, the median [m].
+        value: Probability of an unlikely branch; standard deviation over radius of an unresolved
+            one; angle [rad] of a kink; NaN for a gap.
+    """
+
+    kind: DoubtKind
+    branch: int
+    at: np.ndarray
+    length: float
+    radius: float
+    value: float
+
+
+def doubtful_parts(skeleton: Skeleton) -> list[Doubt]:
+    """Return what to look at, the longest of each kind first."""
+    found: list[Doubt] = []
+    for run, members in enumerate(skeleton.runs()):
+        own = members if run == 0 else members[1:]
+        probability = float(skeleton.probability[own].min())
+        if probability < _LIKELY:
+            found.append(_part(skeleton, DoubtKind.unlikely, run, own, probability))
+        share = skeleton.radius_sigma / np.maximum(skeleton.radius, 1e-300)
+        for part in _stretches(own, skeleton.radius_state[own] == UNRESOLVED):
+            found.append(_part(skeleton, DoubtKind.unresolved, run, part, float(share[part].max())))
+        for part in _stretches(own, skeleton.radius_state[own] == BRIDGED):
+            found.append(_part(skeleton, DoubtKind.bridged, run, part, float("nan")))
+        turn = _turns(skeleton, members)
+        for part in _stretches(np.arange(len(members)), turn > _KINK):
+            worst = part[np.argmax(turn[part])]
+            found.append(_part(skeleton, DoubtKind.kink, run, members[worst:worst + 1],
+                               float(turn[worst])))
+        back = _against_carrier(skeleton, members) if run else 0.0
+        if back > _BACKWARDS:
+            found.append(_part(skeleton, DoubtKind.backwards, run, own[:1], back))
+    order = list(DoubtKind)
+    return sorted(found, key=lambda doubt: (order.index(doubt.kind), -doubt.length))
+
+
+def _part(skeleton: Skeleton, kind: DoubtKind, run: int, nodes: np.ndarray, value: float) -> Doubt:
+    step = np.linalg.norm(skeleton.nodes[nodes] - skeleton.nodes[skeleton.parent[nodes]], axis=1)
+    length = float(step[skeleton.parent[nodes] >= 0].sum()) if len(nodes) > 1 else 0.0
+    return Doubt(kind, run, skeleton.nodes[nodes[len(nodes) // 2]], length,
+                 float(np.median(skeleton.radius[nodes])), value)
+
+
+def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
+    """Consecutive nodes where ``chosen`` is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
+    return [nodes[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
+    """Angle [rad] between the axis before and after each node of a run, shape [k].
+
+    Over two radii to each side, so that the roughness of single nodes is no kink; nodes nearer
+    than that to an end do not turn.
+    """
+    nodes = skeleton.nodes[members]
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
+    chord = _CHORD * skeleton.radius[members]
+
+    def at(place: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(place, along, nodes[:, k]) for k in range(3)], axis=1)
+    before, after = nodes - at(along - chord), at(along + chord) - nodes
+    angle = _angles(before, after)
+    angle[(along < chord) | (along > along[-1] - chord)] = 0.0
+    return angle
+
+
+def _against_carrier(skeleton: Skeleton, members: np.ndarray) -> float:
+    """Angle [rad] between a side run's start and its carrier, which runs outwards."""
+    fork = int(members[0])
+    before = int(skeleton.parent[fork])
+    if before < 0:
+        return 0.0
+    along = np.linalg.norm(skeleton.nodes[members] - skeleton.nodes[fork], axis=1)
+    far = int(np.argmax(along > _CHORD * skeleton.radius[fork])) or len(members) - 1
+    return float(_angles((skeleton.nodes[fork] - skeleton.nodes[before])[None],
+                         (skeleton.nodes[members[far]] - skeleton.nodes[fork])[None])[0])
+
+
+def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    size = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    cosine = np.einsum("kj,kj->k", one, other) / np.maximum(size, 1e-300)
+    return np.where(size > 0, np.arccos(np.clip(cosine, -1, 1)), 0.0)
