@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.geometry_crowns import CROWNS, against_graph, crown_rows, explained
+from benchmarks.scan_scores import Dense, score
 from benchmarks.table import Row
 from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import GeneratedBranch, generate_branch
@@ -54,51 +55,6 @@ def generated(seed: int, **changes: object) -> GeneratedBranch:
     return generate_branch(seed, **(spec | changes))
 
 
-def score_skeleton(truth: Skeleton, found: Skeleton) -> dict[str, float]:
-    """Compare two skeletons: centreline distance both ways, radii, forks, lengths."""
-    true_points, true_radius = _dense(truth)
-    points, radius = _dense(found)
-    there, near = cKDTree(true_points).query(points)
-    back, _ = cKDTree(points).query(true_points)
-    error = radius / true_radius[near] - 1
-    hits, false = _fork_matches(truth, found)
-    return {
-        "centre_m": float(np.concatenate([there, back]).mean()),
-        "centre_radii": float(np.concatenate([there / true_radius[near],
-                                              back / true_radius]).mean()),
-        "radius_error": float(np.median(np.abs(error))), "radius_bias": float(np.median(error)),
-        "forks": len(truth.forks()), "forks_found": hits, "forks_false": false,
-        "length_error": found.length / truth.length - 1}
-
-
-def _dense(skeleton: Skeleton, step: float = 0.001) -> tuple[np.ndarray, np.ndarray]:
-    points, radii = [], []
-    for run, members in enumerate(skeleton.runs()):
-        nodes, radius = skeleton.nodes[members], skeleton.radius[members].copy()
-        if run > 0:
-            radius[0] = radius[1]
-        along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-        at = np.arange(0, along[-1], step)
-        points.append(np.stack([np.interp(at, along, nodes[:, k]) for k in range(3)], axis=1))
-        radii.append(np.interp(at, along, radius))
-    return np.vstack(points), np.concatenate(radii)
-
-
-def _fork_matches(truth: Skeleton, found: Skeleton) -> tuple[int, int]:
-    """Forks found, within three radii of the true one, each once; and forks that are none."""
-    wanted, got = truth.forks(), list(found.forks())
-    hits = 0
-    for fork in wanted:
-        if not got:
-            break
-        distance = np.linalg.norm(found.nodes[got] - truth.nodes[fork], axis=1)
-        best = int(np.argmin(distance))
-        if distance[best] < 3 * truth.radius[fork]:
-            hits += 1
-            got.pop(best)
-    return hits, len(got)
-
-
 def _generated(count: int, progress: Progress, out: Path | None) -> list[Row]:
     scores: dict[str, list[dict]] = {"round": [], "one-sided": []}
     valid, volumes, paper = 0, [], []
@@ -106,8 +62,7 @@ def _generated(count: int, progress: Progress, out: Path | None) -> list[Row]:
         for view, list_of_scores in scores.items():
             branch = generated(seed, view=view)
             result = skeletonise(branch.cloud.points, root=branch.skeleton.nodes[0])
-            score = score_skeleton(branch.skeleton, result.skeleton) | {"seed": seed}
-            list_of_scores.append(score)
+            list_of_scores.append(score(branch.skeleton, result.skeleton) | {"seed": seed})
             surface, check, _ = smooth_forks(branch_surface(result.skeleton), result.skeleton)
             valid += check.valid  # the surface that the user gets, with its fillets
             if view == "round":
@@ -126,7 +81,7 @@ def _generated(count: int, progress: Progress, out: Path | None) -> list[Row]:
 def _generated_rows(count: int, scores: dict[str, list[dict]], valid: int, volumes: np.ndarray,
                     paper: float) -> list[Row]:
     def column(view: str, key: str) -> np.ndarray:
-        return np.array([score[key] for score in scores[view]])
+        return np.array([one[key] for one in scores[view]])
 
     table = []
     for view in scores:
@@ -216,9 +171,9 @@ def renewed_contraction(points: np.ndarray) -> np.ndarray:
 
 def _contracted_error(skeleton: Skeleton, contracted: np.ndarray) -> float:
     """Mean distance of contracted points from the true axes, in local radii."""
-    points, radius = _dense(skeleton)
-    distance, near = cKDTree(points).query(contracted)
-    return float((distance / radius[near]).mean())
+    axes = Dense.of(skeleton)
+    distance, near = cKDTree(axes.points).query(contracted)
+    return float((distance / axes.radius[near]).mean())
 
 
 def _timed(function, *arguments):
@@ -325,11 +280,11 @@ def _against_qsm(folder: Path) -> list[Row]:
     end = np.array([[float(r[k]) for k in ("ex", "ey", "ez")] for r in table])
     radius = np.array([float(r["radius"]) for r in table])
     length = np.linalg.norm(end - start, axis=1)
-    points, own = _dense(back, 0.02)
+    axes = Dense.of(back, step=0.02)
     thick = radius > 0.005
-    distance, near = cKDTree(points).query((start + end)[thick] / 2)
+    distance, near = cKDTree(axes.points).query((start + end)[thick] / 2)
     close = distance < 2 * radius[thick]
-    ratio = own[near[close]] / radius[thick][close] - 1
+    ratio = axes.radius[near[close]] / radius[thick][close] - 1
     rows = [Row("aRchi_tree_1: total length, ours / TreeQSM", "report",
                 f"{ours.length:.0f} m / {length.sum():.0f} m", None),
             Row("aRchi_tree_1: radius over 5 mm, ours against TreeQSM", "report",

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.scan_scores import Dense
 from benchmarks.table import Row
 from limber.geometry.generated import BranchSpec, scan
 from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
@@ -46,20 +47,20 @@ def generated_crown(seed: int, height: float, radius: float, spacing: float, noi
     return skeleton, scan(skeleton, spec, rng).points
 
 
-def axis_scores(truth: Skeleton, found: Skeleton, spacing: float) -> dict[str, float]:
-    """Recall and precision of axis length, and radii.
+def axis_scores(truth: Skeleton, found: Skeleton, spacing: float, step: float = 0.02,
+                ) -> dict[str, float]:
+    """Recall and precision of axis length, compared every ``step`` [m], and radii.
 
     An axis is right where it lies within the true radius, or the points' spacing, of a true one.
     ``thin``: recall where the true radius is under 20 mm.
     """
-    there, there_radius = _dense(truth)
-    here, here_radius = _dense(found)
-    missed = cKDTree(here).query(there)[0] > np.maximum(there_radius, spacing)
-    distance, near = cKDTree(there).query(here)
-    right = distance <= np.maximum(there_radius[near], spacing)
-    ratio = here_radius[right] / there_radius[near][right] - 1
+    there, here = Dense.of(truth, step=step), Dense.of(found, step=step)
+    missed = cKDTree(here.points).query(there.points)[0] > np.maximum(there.radius, spacing)
+    distance, near = cKDTree(there.points).query(here.points)
+    right = distance <= np.maximum(there.radius[near], spacing)
+    ratio = here.radius[right] / there.radius[near][right] - 1
     return {"length": found.length / truth.length, "recall": float(1 - missed.mean()),
-            "thin": float(1 - missed[there_radius < 0.02].mean()),
+            "thin": float(1 - missed[there.radius < 0.02].mean()),
             "precision": float(right.mean()), "radius_bias": float(np.median(ratio)),
             "radius_error": float(np.median(np.abs(ratio)))}
 
@@ -148,17 +149,3 @@ def _axis(rng: np.random.Generator, start: np.ndarray, direction: np.ndarray, le
     turn = bend * share + 0.25 * bend * np.sin(2 * np.pi * share + rng.uniform(0, 2 * np.pi))
     steps = np.cos(turn)[:, None] * direction + np.sin(turn)[:, None] * side
     return np.vstack([start, start + np.cumsum(steps, axis=0) * length / count])
-
-
-def _dense(skeleton: Skeleton, step: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
-    """Points on the axes, each standing for as much length, and their radii."""
-    points, radii = [], []
-    for run, members in enumerate(skeleton.runs()):
-        nodes, radius = skeleton.nodes[members], skeleton.radius[members].copy()
-        if run > 0:
-            radius[0] = radius[1]
-        along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(nodes, axis=0), axis=1))])
-        at = np.arange(0, along[-1], step)
-        points.append(np.stack([np.interp(at, along, nodes[:, k]) for k in range(3)], axis=1))
-        radii.append(np.interp(at, along, radius))
-    return np.vstack(points), np.concatenate(radii)

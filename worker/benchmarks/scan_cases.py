@@ -3,7 +3,6 @@
 Seeds are fresh in each run of the bench; what is easy or hard about a case is drawn from its seed.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ class ScanCase:
         points: As the file has them [m], shape [n, 3].
         volume: Of the true branch [m^3]; None where it was not computed.
         settings: What the user would say beside the file's name.
+        leaf: Which points lie on leaves, shape [n]; None where there are none.
     """
 
     name: str
@@ -35,6 +35,7 @@ class ScanCase:
     points: np.ndarray
     volume: float | None = None
     settings: dict[str, Any] = field(default_factory=dict)
+    leaf: np.ndarray | None = None
 
     def write(self, folder: Path) -> Path:
         """Write the scan as a PLY file; returns its path."""
@@ -134,5 +135,3 @@ def _case(branch: GeneratedBranch, name: str) -> ScanCase:
     return ScanCase(name, branch.seed, branch.skeleton, branch.cloud.points,
                     branch.surface.volume)
 
-
-Make = Callable[[int], ScanCase]

@@ -92,6 +92,7 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     on_axis = away < 1.5 * there.radius[near]
     sigma = found.radius_sigma[here.high]
     covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
+    resolved = on_axis & (found.radius_state[here.high] == MEASURED)
     main_off = main_axis_error(truth, found)
     forks = found.forks()
     stated = [float(found.probability[(found.parent == fork)
@@ -108,17 +109,28 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
                                 / (2 * truth.radius[0])),
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
         "told_forks": [[p, bool(r)] for p, r in zip(stated, right, strict=True)],
+        "resolved_bias": float(np.median(error[resolved])) if resolved.any() else 0.0,
         "told_nodes": _told_nodes(found.probability[here.high], away < np.maximum(
-            there.radius[near], 0.001)),
+            there.radius[near], 0.001), found.branch[here.high]),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
         "right": float((away < np.maximum(there.radius[near], 0.001)).mean())}
 
 
-def _told_nodes(stated: np.ndarray, right: np.ndarray) -> list[list[float]]:
-    """Of each tenth of stated probabilities: how much length, their sum, and how much is right."""
+def _told_nodes(stated: np.ndarray, right: np.ndarray, branch: np.ndarray) -> list[list[float]]:
+    """Of each tenth of stated probabilities: length, sum stated, sum right, and branches."""
     place = np.minimum((10 * stated).astype(int), 9)
     return [[float(np.bincount(place, values, 10)[k]) for values in (
-        np.ones(len(place)), stated, right.astype(float))] for k in range(10)]
+        np.ones(len(place)), stated, right.astype(float))]
+        + [len(np.unique(branch[place == k]))] for k in range(10)]
+
+
+def points_on_axes(points: np.ndarray, truth: Skeleton, found: Skeleton) -> float:
+    """Share of points [m], shape [n, 3], that lie on a found axis and on no true one."""
+    there, here = Dense.of(truth), Dense.of(found)
+    distance, place = cKDTree(here.points).query(points)
+    away, near = cKDTree(there.points).query(points)
+    return float(((distance < 1.5 * here.radius[place])
+                  & (away > there.radius[near] + 0.002)).mean())
 
 
 def main_axis_error(truth: Skeleton, found: Skeleton) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.geometry import score_skeleton
+from benchmarks.scan_scores import score
 from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.files import read_points
@@ -98,9 +98,9 @@ def test_flying_pixels_grow_no_twigs(seed: int) -> None:
         root = camera.to_camera(branch.skeleton.nodes[:1])[0]
         found = skeletonise(prepared.cloud.points, root=root - prepared.origin,
                             up=np.array([0.0, 0.0, 1.0]) @ camera.rotation).skeleton
-        score = score_skeleton(branch.skeleton, found.moved(
+        scored = score(branch.skeleton, found.moved(
             camera.to_branch(found.nodes + prepared.origin)))
-        false.append(score["forks_false"])
+        false.append(scored["forks_false"])
         if angle > 0:
-            assert score["forks_found"] == score["forks"]
+            assert scored["forks_found"] == scored["forks"]
     assert false[0] == 0 < false[1]

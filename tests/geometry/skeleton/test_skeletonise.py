@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.geometry import score_skeleton
+from benchmarks.scan_scores import score
 from limber.errors import Cancelled, InputError
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import cloud_laplacian, contract
@@ -29,13 +29,13 @@ def test_generated_truth_is_found_again(view, radius_limit):
     """Axes, radii and forks of a noisy scan, as near as the issue asks."""
     branch = generate_branch(8, view=view, fork_count=3)
     result = skeletonise(branch.cloud.points, root=branch.skeleton.nodes[0])
-    score = score_skeleton(branch.skeleton, result.skeleton)
-    assert score["centre_radii"] < 0.25
-    assert score["radius_error"] < radius_limit
+    scored = score(branch.skeleton, result.skeleton)
+    assert scored["centre_radii"] < 0.25
+    assert scored["radius_error"] < radius_limit
     # From one side a fork can hide behind its carrier.
-    assert score["forks_found"] >= (3 if view == "round" else 2)
-    assert score["forks_false"] <= (0 if view == "round" else 1)
-    assert abs(score["length_error"]) < 0.05
+    assert scored["forks_found"] >= (3 if view == "round" else 2)
+    assert scored["forks_false"] <= (0 if view == "round" else 1)
+    assert abs(scored["length_error"]) < 0.05
     assert result.noise == pytest.approx(0.001, rel=0.25)
 
 

@@ -1,0 +1,133 @@
+"""Cases of the bench `scans` run as a user runs them, two at a time, and their scores by kind."""
+
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmarks.scan_cases import (
+    ScanCase,
+    gap_case,
+    one_sided_case,
+    round_case,
+    single_view_case,
+)
+from benchmarks.scan_plants import crown_case, leafy_case
+from benchmarks.scan_scores import points_on_axes, score, seen_part
+from limber.alignment import Alignment
+from limber.errors import LimberError
+from limber.geometry.reconstruct import ReconstructSettings
+from limber.geometry.skeleton.files import read_fitted
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.jobs.pool import Pool
+from limber.progress import Progress
+from limber.stages.reconstruct import reconstruct
+
+KINDS: dict[str, Callable[[int], ScanCase]] = {
+    "one-sided": one_sided_case, "2 mm": lambda seed: one_sided_case(seed, 0.002),
+    "3 mm": lambda seed: one_sided_case(seed, 0.003), "round": round_case, "gaps": gap_case,
+    "single-view": single_view_case, "crowns": crown_case, "leafy": leafy_case}
+_FAR = 4.0  # radii from an axis to the nearest node of the mesh, from which that leaves it out
+
+
+@dataclass
+class Outcomes:
+    """Scores of one kind of case; a case that could not be reconstructed is a failure."""
+
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+
+    @property
+    def count(self) -> int:
+        return len(self.scores) + len(self.failed)
+
+    def column(self, key: str) -> np.ndarray:
+        return np.array([score[key] for score in self.scores])
+
+    def forks(self) -> tuple[str, float, float]:
+        """As text, and the shares found and false."""
+        wanted, found, false = (int(self.column(key).sum()) for key in (
+            "forks", "forks_found", "forks_false"))
+        wanted = max(wanted, 1)
+        return (f"{found / wanted:.0%} ({found}/{wanted}) / {false / wanted:.0%}", found / wanted,
+                false / wanted)
+
+    def centre_failures(self) -> int:
+        off = (self.column("centre_radii") > 0.25) & (self.column("centre_m") > 0.0007)
+        return int(off.sum()) + len(self.failed)
+
+    def told(self) -> str:
+        return f"; {len(self.failed)} not reconstructed" if self.failed else ""
+
+
+def measure(wanted: dict[str, range], progress: Progress, out: Path | None,
+            ) -> dict[str, Outcomes]:
+    """Reconstruct and score the seeds of each kind, as many side by side as there are cores.
+
+    Args:
+        wanted: Seeds of each kind.
+        progress: Called as it goes.
+        out: Where pictures of every case go, or None.
+    """
+    tasks = [(kind, seed, out) for kind, seeds in wanted.items() for seed in seeds]
+    with Pool(name="scans") as pool:
+        results = pool.map(measured, tasks, progress=progress, message="scans")
+    done = {kind: Outcomes() for kind in wanted}
+    for (kind, _, _), result in zip(tasks, results, strict=True):
+        if isinstance(result, str):
+            done[kind].failed.append(result)
+        else:
+            done[kind].scores.append(result)
+    return done
+
+
+def measured(kind: str, seed: int, out: Path | None) -> dict[str, Any] | str:
+    """Scores of one case, or why it was not reconstructed; its picture goes to ``out``."""
+    case = KINDS[kind](seed)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            scored, found = run_case(case, Path(folder))
+        except LimberError as error:
+            return f"{case.name}: {error}"
+    if out is not None:
+        from benchmarks.scan_pictures import draw_case
+
+        draw_case(out / f"{case.name}.png", case, found, scored)
+    return scored
+
+
+def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
+    """Write a case's file, reconstruct it, score it in the file's frame.
+
+    Raises:
+        LimberError: it could not be reconstructed.
+    """
+    path, branch = case.write(folder), folder / f"{case.name}.branch"
+    result = reconstruct(path, branch, ReconstructSettings(**case.settings))
+    manifest = json.loads((branch / "branch.json").read_text())
+    aligned = read_fitted(branch / "skeleton.csv")
+    found = aligned.moved(Alignment.model_validate(manifest["alignment"]).undo(aligned.nodes))
+    scored = score(seen_part(case.truth, case.points), found)
+    scored |= {"seed": case.seed, "left_out": result["left_out_twigs"],
+               "unsaid_m": unsaid_length(aligned, branch),
+               "volume": result["mesh_volume_m3"] / case.volume - 1 if case.volume else 0.0}
+    if case.leaf is not None:
+        scored["leaf_points_on_stems"] = points_on_axes(case.points[case.leaf], case.truth, found)
+    return scored, found
+
+
+def unsaid_length(aligned: Skeleton, branch: Path) -> float:
+    """Length of axes [m] that is neither near the mesh nor on a branch named as left out."""
+    masses = branch / "point_masses.json"
+    named = {mass["branch"] for mass in json.loads(masses.read_text())} if (
+        masses.is_file()) else set()
+    distance, _ = cKDTree(TetMesh.read(branch / "mesh.vtu").nodes).query(aligned.nodes)
+    bare = (distance > _FAR * aligned.radius) & ~np.isin(aligned.branch, list(named))
+    step = np.linalg.norm(aligned.nodes - aligned.nodes[aligned.parent], axis=1)
+    return float(step[1:][bare[1:]].sum())
