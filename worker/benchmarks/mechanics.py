@@ -274,14 +274,14 @@ def _cube(cells: int) -> TetMesh:
     return TetMesh(nodes, np.array(tets)).oriented().quadratic()
 
 
-def _short_beam(slices: int = 16) -> tuple[TetMesh, Grasp]:
+def short_beam(slices: int = 16) -> tuple[TetMesh, Grasp]:
     mesh = straight_beam(0.2, 0.005, slice_count=slices)
     return mesh, Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "pinned")
 
 
 def time_rate_row() -> Row:
     """Halved steps of a large swing, undamped and viscous."""
-    mesh, tip = _short_beam(8)
+    mesh, tip = short_beam(8)
     rates, end = [], 0.24
     for damping in (_UNDAMPED, RayleighDamping(1.0, 0.01)):
         model = BranchModel(mesh, young=1e7, poisson=0.3, density=DENSITY, gravity=None,
@@ -333,7 +333,7 @@ def exactness_rows() -> list[Row]:
 
 def vibration_row() -> Row:
     """1,000 undamped steps of a bent beam let go."""
-    mesh, tip = _short_beam()
+    mesh, tip = short_beam()
     area, inertia = section(mesh)
     model = BranchModel(mesh, young=1e7, poisson=0.3, density=DENSITY, gravity=None,
                         damping=_UNDAMPED)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import truth_states
 from benchmarks.table import Row
 from benchmarks.truth_trials import Trial, trial
 from limber.progress import Progress
@@ -24,7 +25,8 @@ def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[R
                        "and 1 degree, camera 1 mm, density 10 %, nu 0.05, another form of the "
                        "field", singles, 0.12, quick),
             *cell_rows("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees", threes, 0.06,
-                       quick)]
+                       quick),
+            *truth_states.rows(quick, progress.part(0.95, 1.0), seed)]
 
 
 def _trials(count: int, progress: Progress, out: Path | None, seed: tuple[int, ...],

@@ -101,3 +101,42 @@ def check_poisson(poisson: np.ndarray) -> None:
                          f"It must lie above -1 and not above {MAX_POISSON}: at 0.5 the material"
                          " is incompressible and these elements lock.",
                          "Wood has 0.3 to 0.45.")
+
+
+def neo_hookean_energy(strain: np.ndarray, lame_lambda: np.ndarray,
+                       lame_mu: np.ndarray) -> np.ndarray:
+    """Return the energy density [J/m^3] of the stable neo-Hookean at a Green-Lagrange strain.
+
+    Args:
+        strain: Shape [..., 6] (00 11 22 01 02 12).
+        lame_lambda, lame_mu: [Pa], shapes that go with [...].
+    """
+    change = np.sqrt(_determinant(_right_cauchy_green(strain))) - 1
+    return (lame_mu * (strain[..., :3].sum(axis=-1) - change)
+            + 0.5 * (lame_lambda + lame_mu) * change**2)
+
+
+def neo_hookean_stress(strain: np.ndarray, lame_lambda: np.ndarray,
+                       lame_mu: np.ndarray) -> np.ndarray:
+    """Return its second Piola-Kirchhoff stress [Pa], shape [..., 6]; arguments as its energy."""
+    c = _right_cauchy_green(strain)
+    det = np.sqrt(_determinant(c))
+    pressure = ((lame_lambda + lame_mu) * (det - 1) - lame_mu) / det
+    stress = pressure[..., None] * _cofactor(c)
+    stress[..., :3] += lame_mu[..., None]
+    return stress
+
+
+def _right_cauchy_green(strain: np.ndarray) -> np.ndarray:
+    return 2 * strain + np.array([1.0, 1, 1, 0, 0, 0])
+
+
+def _cofactor(c: np.ndarray) -> np.ndarray:
+    """Return the cofactors of symmetric tensors [..., 6]: determinant times inverse."""
+    c00, c11, c22, c01, c02, c12 = np.moveaxis(c, -1, 0)
+    return np.stack([c11 * c22 - c12**2, c00 * c22 - c02**2, c00 * c11 - c01**2,
+                     c02 * c12 - c01 * c22, c01 * c12 - c02 * c11, c01 * c02 - c12 * c00], axis=-1)
+
+
+def _determinant(c: np.ndarray) -> np.ndarray:
+    return (c[..., [0, 3, 4]] * _cofactor(c)[..., [0, 3, 4]]).sum(axis=-1)

@@ -234,6 +234,12 @@ class BranchModel:
         other._set(young, poisson, self.density)
         return other
 
+    def with_material(self, material: Material) -> "BranchModel":
+        """Return the model with another law of the same Lamé coefficients."""
+        other = copy.copy(self)
+        other.material = material
+        return other
+
     def with_point_masses(self, masses: Iterable[PointMass]) -> "BranchModel":
         """Return the model with more masses hanging on it."""
         other = copy.copy(self)

@@ -21,9 +21,9 @@ class SimulateSettings(Settings):
             "mass_at"),
         "material": ("young", "material", "gravity", "rest_shape", "damping_mass",
             "damping_stiffness"),
-        "solver": ("step", "newmark_beta", "newmark_gamma", "lumped_mass"),
+        "solver": ("step", "scheme", "newmark_beta", "newmark_gamma", "lumped_mass"),
     }
-    experts = ("step", "newmark_beta", "newmark_gamma", "lumped_mass", "rest_shape")
+    experts = ("step", "scheme", "newmark_beta", "newmark_gamma", "lumped_mass", "rest_shape")
 
     name: str = Field("simulate", pattern=r"^[\w-]+$",
                       description="Name of the result: frames/NAME.pc2 and frames/NAME.json.")
@@ -55,10 +55,14 @@ class SimulateSettings(Settings):
     hold: float = Field(0.5, ge=0, description="Time at the end of the pull [s] (dynamic).")
     frame_rate: float = Field(60.0, gt=0, le=2000, description="Frames a second.")
     step: float = Field(1 / 60, gt=0, description="Longest time step [s] (dynamic).")
+    scheme: Literal["energy_momentum", "newmark"] = Field(
+        "energy_momentum", description="energy_momentum: gains no energy however far the branch "
+        "swings; newmark: the paper's (dynamic).")
     newmark_beta: float = Field(
-        0.25, gt=0, le=0.5, description="Newmark's beta (dynamic).")
+        0.25, gt=0, le=0.5, description="Newmark's beta (--scheme newmark).")
     newmark_gamma: float = Field(
-        0.5, ge=0.5, le=1, description="Newmark's gamma (dynamic); over 0.5 damps fast vibration.")
+        0.5, ge=0.5, le=1, description="Newmark's gamma (--scheme newmark); over 0.5 damps fast "
+        "vibration.")
     lumped_mass: bool = Field(
         False, description="Mass at the nodes alone instead of the consistent mass matrix.")
     young: float | None = Field(

@@ -10,7 +10,7 @@ from limber.mechanics.dynamics.load_case import (
     dynamic_motion,
     static_motion,
 )
-from limber.mechanics.dynamics.simulate import NewmarkSettings
+from limber.mechanics.dynamics.motion import EnergyMomentumSettings, NewmarkSettings
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel, PointMass
 from limber.mechanics.pose_table import PoseTable
@@ -98,8 +98,11 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
     """Pull, along equilibria or in time."""
     if settings.kind == "static":
         return static_motion(case, progress)
-    return dynamic_motion(case, NewmarkSettings(
-        settings.newmark_beta, settings.newmark_gamma, max_step=settings.step), progress)
+    scheme = EnergyMomentumSettings(max_step=settings.step)
+    if settings.scheme == "newmark":
+        scheme = NewmarkSettings(max_step=settings.step, beta=settings.newmark_beta,
+                                 gamma=settings.newmark_gamma)
+    return dynamic_motion(case, scheme, progress)
 
 
 def _ramp(settings: SimulateSettings, duration: float) -> tuple[np.ndarray, np.ndarray]:

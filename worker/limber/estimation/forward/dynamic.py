@@ -11,7 +11,7 @@ from limber.estimation.forward.forward import Forward, Simulated, under_its_weig
 from limber.estimation.forward.input_force import Response, nodal_loads
 from limber.estimation.forward.quasi_static import mechanics_names
 from limber.estimation.parameters import Values
-from limber.mechanics.dynamics.simulate import simulate_dynamics
+from limber.mechanics.dynamics.simulate import NewmarkSettings, simulate_dynamics
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
@@ -71,7 +71,9 @@ class DynamicForward(Forward):
                  else {"grasp_forces": self._forces})
         wanted = ParameterSet(mechanics_names(extra), shares=self.field.shares(values, extra))
         asked = {"sensitivities": wanted, "sensitivity_nodes": self._nodes} if sensitivities else {}
-        result = simulate_dynamics(model, grasp=self.grasp, times=frames.times, **drive, **asked)
+        # The same scheme with and without derivatives: one loss, one minimum.
+        result = simulate_dynamics(model, grasp=self.grasp, times=frames.times,
+                                   settings=NewmarkSettings(), **drive, **asked)
         if not result.converged:
             return None
         moved = (self._operator @ result.displacement.reshape(len(frames), -1).T).T

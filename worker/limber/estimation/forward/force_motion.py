@@ -8,7 +8,7 @@ of the undeformed branch: the change is small, and wanted as a weight, not as a 
 import numpy as np
 from scipy.linalg import eigh
 
-from limber.mechanics.dynamics.motion import DEFAULT_SETTINGS
+from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.model import BranchModel
 
 MODES = 16
@@ -81,7 +81,7 @@ def _swing(squares: np.ndarray, damping: np.ndarray, times: np.ndarray) -> np.nd
     swing[:, 0] = place
     for frame in range(1, count):
         gap = times[frame] - times[frame - 1]
-        steps = int(np.ceil(gap / DEFAULT_SETTINGS.max_step - 1e-9))
+        steps = int(np.ceil(gap / NewmarkSettings().max_step - 1e-9))
         dt = gap / steps
         for step in range(1, steps + 1):
             share = step / steps

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.mechanics.dynamics.simulate import NewmarkSettings, simulate_dynamics
+from limber.mechanics.dynamics.simulate import MotionSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.result import StaticResult
@@ -124,7 +124,7 @@ def static_motion(case: LoadCase, progress: Progress) -> SimulatedMotion:
         message=last.message, warnings=last.warnings)
 
 
-def dynamic_motion(case: LoadCase, settings: NewmarkSettings,
+def dynamic_motion(case: LoadCase, settings: MotionSettings,
                    progress: Progress) -> SimulatedMotion:
     """Follow a pull in time, with inertia and damping."""
     held, forces = case.held, case.nodal_forces()

@@ -10,38 +10,60 @@ from limber.mechanics.status import Status
 
 
 @dataclass(frozen=True)
-class NewmarkSettings:
-    """How motion is computed.
+class MotionSettings:
+    """How motion is computed, whatever the scheme.
 
     Attributes:
-        beta, gamma: Newmark's numbers; gamma over 1/2 damps high frequencies.
         max_step: Longest time step [s]; frames farther apart are divided evenly.
         min_step: Shortest step [s] that is tried before giving up.
         tolerance: Residual force relative to loads, reactions and inertia.
         max_iterations: Iterations a step.
-        keep_factor: Below this relative residual the last factor is used again, and for the
-            first solve of the next step; 0 factorises each time.
         stretch_limit: Principal stretch at which the branch is taken as torn.
     """
 
-    beta: float = 0.25
-    gamma: float = 0.5
     max_step: float = 1 / 60
     min_step: float = 1 / 60 / 256
     tolerance: float = 1e-5
     max_iterations: int = 20
-    keep_factor: float = 0.01
     stretch_limit: float = 2.0
 
     def __post_init__(self) -> None:
-        if not (0 < self.beta <= 0.5 and 0.5 <= self.gamma <= 1 and 0 < self.max_step):
+        if not self.max_step > 0:
+            raise InputError(f"A time step of {self.max_step} s.", "It must be positive.",
+                             "Take a hundredth of the slowest vibration's period, or less.")
+
+
+@dataclass(frozen=True)
+class EnergyMomentumSettings(MotionSettings):
+    """The energy-momentum scheme: no energy comes from nowhere, at any amplitude and step.
+
+    What a step leaves unbalanced does work, so the tolerance is stricter than Newmark's.
+    """
+
+    tolerance: float = 1e-6
+
+
+@dataclass(frozen=True)
+class NewmarkSettings(MotionSettings):
+    """The paper's scheme: exact in energy where motion is small; far swings can blow up.
+
+    Attributes:
+        beta, gamma: Newmark's numbers; gamma over 1/2 damps high frequencies.
+        keep_factor: Below this relative residual the last factor is used again, and for the
+            first solve of the next step; 0 factorises each time.
+    """
+
+    beta: float = 0.25
+    gamma: float = 0.5
+    keep_factor: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (0 < self.beta <= 0.5 and 0.5 <= self.gamma <= 1):
             raise InputError(
-                f"Newmark beta {self.beta}, gamma {self.gamma}, step {self.max_step} s.",
-                "beta must be in (0, 1/2], gamma in [1/2, 1], the step positive.",
+                f"Newmark beta {self.beta}, gamma {self.gamma}.",
+                "beta must be in (0, 1/2], gamma in [1/2, 1].",
                 "Keep 1/4 and 1/2 unless high frequencies are to be damped.")
-
-
-DEFAULT_SETTINGS = NewmarkSettings()
 
 
 @dataclass(frozen=True)

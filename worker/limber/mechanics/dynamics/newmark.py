@@ -45,7 +45,7 @@ class NewmarkStepper:
         ahead, now, before = old.rate_formula(dt)
         return Viscous(1 + factor * ahead, factor * (now * old.strain + before * old.strain_before))
 
-    def step(self, old: MotionState, dt: float, load: np.ndarray,
+    def step(self, old: MotionState, dt: float,
              viscous: Viscous | None) -> MotionState | None:
         """Return the state ``dt`` after ``old``, or None where it is not found.
 
@@ -54,6 +54,7 @@ class NewmarkStepper:
         service as in statics.
         """
         model, equations, settings = self.model, self.equations, self.settings
+        load = self.drive.load_at(old.time + dt)
         new = replace(old, time=old.time + dt, step_before=dt,
                       displacement=old.displacement.copy())
         moved, pins = self.drive.moves(new)

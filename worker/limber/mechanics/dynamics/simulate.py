@@ -1,8 +1,9 @@
-"""Motion in time: implicit Newmark steps, solved by Newton with kept factors.
+"""Motion in time: implicit steps of second order, energy-momentum or Newmark's.
 
 M a + alpha M v + f(u, v) = loads, where the internal force f has a Kelvin-Voigt part (stress from
-the rate of the Green-Lagrange strain). With beta 1/4 and gamma 1/2 (average acceleration) the
-method is of second order and, in linear problems, keeps the energy. A step that fails is halved.
+the rate of the Green-Lagrange strain). The energy-momentum step keeps the energy at any amplitude;
+Newmark's with beta 1/4 and gamma 1/2 (average acceleration) does in linear problems. A step that
+fails is halved.
 """
 
 import time
@@ -12,11 +13,14 @@ from typing import Literal
 
 import numpy as np
 
+from limber.errors import InputError
 from limber.mechanics.dynamics.drive import Drive
+from limber.mechanics.dynamics.energy_momentum import EnergyMomentumStepper
 from limber.mechanics.dynamics.motion import (
-    DEFAULT_SETTINGS,
     DynamicResult,
     DynamicSensitivities,
+    EnergyMomentumSettings,
+    MotionSettings,
     NewmarkSettings,
 )
 from limber.mechanics.dynamics.motion_tangents import MotionTangents
@@ -38,7 +42,7 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
                       nodal_forces: np.ndarray | None = None, times: np.ndarray,
                       start: StaticResult | MotionState | np.ndarray
                       | Literal["equilibrium", "rest"] = "equilibrium",
-                      settings: NewmarkSettings = DEFAULT_SETTINGS,
+                      settings: MotionSettings | None = None,
                       sensitivities: ParameterSet | None = None,
                       sensitivity_nodes: np.ndarray | None = None,
                       progress: Progress = SILENT) -> DynamicResult:
@@ -56,16 +60,23 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
         start: State at the first time: ``equilibrium`` under the loads and pose of that time,
             ``rest`` (undeformed), a static result, displacements, or the last state of another
             motion. At rest unless it is that last.
-        sensitivities: Which derivatives to accumulate.
+        settings: Their kind is the scheme; default energy-momentum, and Newmark where derivatives
+            are wanted.
+        sensitivities: Which derivatives to accumulate; by Newmark's scheme alone.
         sensitivity_nodes: Nodes that they are kept for; default all.
 
     Raises:
         InputError: arguments that do not fit each other. ConvergenceError: no equilibrium at
             the start.
     """
+    if settings is None:
+        settings = EnergyMomentumSettings() if sensitivities is None else NewmarkSettings()
     drive = Drive(model, grasp, poses, grasp_forces, nodal_forces, times)
     tangents = None
     if sensitivities is not None:
+        if not isinstance(settings, NewmarkSettings):
+            raise InputError("Derivatives along a motion by the energy-momentum scheme.",
+                             "They are made of Newmark's steps.", "Give NewmarkSettings.")
         tangents = MotionTangents(drive, settings, sensitivities, sensitivity_nodes)
     run = _Run(drive, settings, tangents)
     run.begin(start)
@@ -75,11 +86,13 @@ def simulate_dynamics(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | No
 class _Run:
     """A motion under way."""
 
-    def __init__(self, drive: Drive, settings: NewmarkSettings,
+    def __init__(self, drive: Drive, settings: MotionSettings,
                  tangents: MotionTangents | None):
         self.drive, self.settings, self.tangents = drive, settings, tangents
         self.model, self.equations = drive.model, drive.equations
-        self.stepper = NewmarkStepper(drive, settings)
+        self.is_newmark = isinstance(settings, NewmarkSettings)
+        self.stepper = (NewmarkStepper if self.is_newmark else EnergyMomentumStepper)(
+            drive, settings)
         self.step_count = 0
         self.factorisations_before = self.equations.factorisation_count
         self.viscous: Viscous | None = None
@@ -150,7 +163,7 @@ class _Run:
         """Take one step of ``dt``; False, and nothing changed, if it fails."""
         old, drive, stepper = self.state, self.drive, self.stepper
         viscous = stepper.viscous(old, dt)
-        new = stepper.step(old, dt, drive.load_at(old.time + dt), viscous)
+        new = stepper.step(old, dt, viscous)
         if new is None:
             stepper.forget_tangent()
             return False
@@ -178,8 +191,12 @@ class _Run:
         internal = model.internal(state.displacement, viscous=self.viscous)
         load = self.drive.load_at(state.time)
         momentum = model.mass_times(state.velocity)
-        out = (internal.force - load
-               + model.mass_times(state.acceleration) + model.damping.mass * momentum)
+        out = None if self.is_newmark else self.stepper.borne(state.time)
+        if out is None:
+            out = (internal.force - load
+                   + model.mass_times(state.acceleration) + model.damping.mass * momentum)
+            if not self.is_newmark:
+                self.stepper.begin(state, out)
         positions = model.mesh.nodes + state.displacement
         forces, torques = np.zeros((len(grasps), 3)), np.zeros((len(grasps), 3))
         if self.drive.path:

@@ -1,0 +1,201 @@
+"""One implicit step that keeps energy exactly, at any amplitude and step.
+
+With the mean u_m of two successive displacements and the mean velocity,
+
+    M (v_1 - v_0) / dt + alpha M (v_0 + v_1) / 2 + f = load,     (u_1 - u_0) / dt = (v_0 + v_1) / 2,
+
+where f is the integral of F(u_m) S grad N and S belongs to the mean of the strains E_0 and E_1, not
+to the strain of the mean (Simo and Tarnow 1992). F(u_m) times the change of F is exactly the change
+of E, so the work of f is the change of the energy: nothing is gained, and damping only takes.
+A rigid turn has no strain at either end, hence no stress between, however far it goes. Where the
+energy is not quadratic in E, S has a part along E_1 - E_0 that makes up the difference (Gonzalez
+2000).
+"""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from limber.mechanics.dynamics.drive import Drive
+from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.materials import Material, neo_hookean_energy, neo_hookean_stress
+from limber.mechanics.motion_state import MotionState
+from limber.mechanics.status import Status
+from limber.sparse import NotPositiveDefiniteError
+
+_STRAIN_CHANGE = 1e-6
+"""Under this change of the strain in a step its cube, which Gonzalez' part is of, is round-off."""
+_GOOD_TANGENT = 0.3
+"""Part of the residual that a solve may leave for its tangent to be used again."""
+_FRESH = 3
+"""Tangents made anew in one step, at most: later ones would be of nearly the same state. Both
+chosen, not measured."""
+
+
+class EnergyMomentumStepper:
+    """Takes steps, and keeps the tangent of the last.
+
+    Attributes:
+        iteration_count: So far.
+        status, trouble: Why the last step failed.
+        tangent: The last step was solved with; None before the first.
+    """
+
+    def __init__(self, drive: Drive, settings: NewmarkSettings):
+        self.drive, self.settings = drive, settings
+        self.model, self.equations = drive.model, drive.equations
+        self.iteration_count = 0
+        self.status, self.trouble = Status.converged, ""
+        self.tangent: Tangent | None = None
+        self._balances: deque[tuple[float, np.ndarray]] = deque(maxlen=2)
+        self._is_polynomial = self.model.material != Material.stable_neo_hookean
+        # Its stress is given through the strain that St. Venant-Kirchhoff would have it at.
+        self._bearing = (self.model if self._is_polynomial
+                         else self.model.with_material(Material.st_venant_kirchhoff))
+
+    def forget_tangent(self) -> None:
+        """Use the last tangent no more."""
+        self.tangent = None
+
+    def begin(self, start: MotionState, out: np.ndarray) -> None:
+        """Begin where the holds bear ``out`` [N] on each node, shape [node_count, 3]."""
+        self._balances.append((start.time, out))
+
+    def viscous(self, old: MotionState, dt: float) -> None:
+        """Return None: the step makes its own from the strains at its ends."""
+
+    def step(self, old: MotionState, dt: float, viscous: Viscous | None = None,
+             ) -> MotionState | None:
+        """Return the state ``dt`` after ``old``, or None where it is not found.
+
+        Newton's unknown is the mean displacement. Its tangent is F(u_m) C F(u_1), not symmetric;
+        the factor is of F(u_m) C F(u_m), so that what is left falls by about the turn in half a
+        step each time.
+        """
+        equations, settings = self.equations, self.settings
+        new = replace(old, time=old.time + dt, step_before=dt,
+                      displacement=old.displacement.copy())
+        load = self.drive.load_at(old.time + dt / 2)
+        moved, pins = self.drive.moves(new)
+        moved, pins = None if moved is None else moved / 2, pins / 2
+        before = self.model.strains(old.displacement)
+        increment, norms, made = None, [], 0
+        for _ in range(settings.max_iterations):
+            self._follow(old, new, dt)
+            middle = 0.5 * (old.displacement + new.displacement)
+            bearing = self._bearing_strain(before, self.model.strains(new.displacement), dt)
+            out, inertial = self._imbalance(old, new, dt, load, middle, bearing)
+            residual = equations.free_part(out)
+            norm = float(np.linalg.norm(residual))
+            if not np.isfinite(norm):
+                return self._failed("the motion grew without bound")
+            reference = float(np.linalg.norm(load) + np.linalg.norm(inertial)
+                              + np.linalg.norm(out - residual))
+            if (len(norms) > 6 and norm > 0.9 * min(norms)
+                    and norms[-1] > 0.9 * min(norms[:-1])):
+                return self._failed("the iteration does not converge")
+            if increment is not None and norm <= max(settings.tolerance * reference,
+                                                     self._floor()):
+                return self._accepted(new, old, out)
+            first = increment is None
+            if first or (norm > _GOOD_TANGENT * norms[-1] and made < _FRESH):
+                made += 1
+                if not self._make_tangent(middle, increment, bearing, dt):
+                    return self._failed("the stiffness has no positive pivots")
+            norms.append(norm)
+            self.iteration_count += 1
+            if first and moved is not None:
+                residual = equations.free_part(
+                    out - self._bearing.tangent_times(middle, moved))
+            increment = self.tangent.solve(residual, pins)
+            if moved is not None and equations.held.any():
+                increment = increment + moved
+            moved, pins = None, np.zeros_like(pins)
+            new.displacement = new.displacement + 2 * increment
+        return self._failed(f"no convergence in {settings.max_iterations} iterations")
+
+    def borne(self, instant: float) -> np.ndarray | None:
+        """Return what holds the branch bears on each node [N], shape [node_count, 3].
+
+        Extrapolated from the middles of the last two steps, where the forces balance; None
+        before there are two. At the ends of a step what the mesh cannot resolve rings.
+        """
+        if len(self._balances) < 2:
+            return None
+        (before, was), (last, now) = self._balances
+        return now + (now - was) * (instant - last) / (last - before)
+
+    def _bearing_strain(self, before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
+        """Return the strain whose linear elastic stress is that of the step, viscosity and all."""
+        mean, change = 0.5 * (before + after), after - before
+        if not self._is_polynomial:
+            mean = self._neo_hookean_bearing(before, after)
+        return mean + self.model.damping.stiffness / dt * change
+
+    def _neo_hookean_bearing(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        model = self.model
+        lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
+        change = after - before
+        stress = neo_hookean_stress(0.5 * (before + after), lam, mu)
+        size = _contracted(change, change)
+        left = (neo_hookean_energy(after, lam, mu) - neo_hookean_energy(before, lam, mu)
+                - _contracted(stress, change))
+        part = np.where(size > _STRAIN_CHANGE**2, left / np.maximum(size, _STRAIN_CHANGE**2), 0.0)
+        stress = stress + part[..., None] * change
+        trace = stress[..., :3].sum(axis=-1, keepdims=True)
+        spread = (lam / (3 * lam + 2 * mu))[..., None] * trace
+        return (stress - spread * np.array([1.0, 1, 1, 0, 0, 0])) / (2 * mu[..., None])
+
+    def _follow(self, old: MotionState, new: MotionState, dt: float) -> None:
+        new.velocity = 2 / dt * (new.displacement - old.displacement) - old.velocity
+        self.drive.hold(new)
+
+    def _imbalance(self, old: MotionState, new: MotionState, dt: float, load: np.ndarray,
+                   middle: np.ndarray, bearing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what forces are left over, and the inertial ones."""
+        force = self._bearing.internal(middle, viscous=Viscous(0.0, bearing)).force
+        inertial = self.model.mass_times(
+            (new.velocity - old.velocity) / dt
+            + 0.5 * self.model.damping.mass * (new.velocity + old.velocity))
+        return load - force - inertial, inertial
+
+    def _make_tangent(self, middle: np.ndarray, increment: np.ndarray | None,
+                      bearing: np.ndarray, dt: float) -> bool:
+        damping = self.model.damping
+        growth = 1 + 2 * damping.stiffness / dt
+        memory = bearing - growth * self._bearing.strains(middle)
+        # The mean strain is quadratic in the increment with twice the factor of the strain itself.
+        mixed = None if increment is None else np.sqrt(2) * increment
+        self.tangent = None
+        try:
+            self.tangent = self.equations.tangent(
+                self._bearing, middle, increment=mixed, viscous=Viscous(growth, memory),
+                mass_factor=4 / dt**2 + 2 * damping.mass / dt)
+        except NotPositiveDefiniteError:
+            return False
+        return True
+
+    def _floor(self) -> float:
+        # Differences of displacements in an element carry round-off of about one unit each.
+        return 8 * np.finfo(float).eps * self.tangent.diagonal_norm * self.model.mean_edge
+
+    def _failed(self, trouble: str) -> None:
+        self.trouble, self.status = trouble, Status.stalled
+
+    def _accepted(self, new: MotionState, old: MotionState,
+                  out: np.ndarray) -> MotionState | None:
+        if self.model.internal(new.displacement).min_det_f <= 0:
+            self.trouble, self.status = "an element would turn inside out", Status.inverted
+            return None
+        self.status = Status.converged
+        new.acceleration = (new.velocity - old.velocity) / new.step_before
+        self._balances.append((0.5 * (old.time + new.time), -out))
+        return new
+
+
+def _contracted(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Return the double contraction of symmetric tensors (00 11 22 01 02 12)."""
+    product = one * two
+    return product[..., :3].sum(axis=-1) + 2 * product[..., 3:].sum(axis=-1)
