@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from limber.errors import WorkError
-from limber.mechanics.dynamics.simulate import simulate_dynamics
+from limber.mechanics.dynamics.simulate import NewmarkSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
@@ -127,7 +127,7 @@ def _shaken(model: BranchModel, grasp: Grasp, wanted: MotionWanted, way: MotionM
     poses = CubicSpline(np.linspace(0.0, 1.0, len(way.poses)), way.poses)(along)
     held = _about_centre(grasp, wanted.point, poses)
     result = simulate_dynamics(model, grasp=grasp, poses=held, times=wanted.times,
-                               progress=progress)
+                               settings=NewmarkSettings(), progress=progress)
     _require(result)
     return _made(poses, held, result.reaction_force, result.reaction_torque,
                  list(result.displacement))
@@ -142,7 +142,7 @@ def _released(model: BranchModel, grasp: Grasp, wanted: MotionWanted,
     ramp = np.clip(share / 0.3, 0.0, 1.0)
     forces = (ramp**2 * (3 - 2 * ramp) * (share < 0.4))[:, None] * size * direction
     result = simulate_dynamics(model, grasp=grasp, grasp_forces=forces, times=wanted.times,
-                               progress=progress)
+                               settings=NewmarkSettings(), progress=progress)
     _require(result)
     displacements = list(result.displacement)
     poses, centres = _poses(model, grasp, wanted.point, displacements)
