@@ -1,6 +1,7 @@
 """Rules of the layout: the core never imports bpy, the add-on holds no mathematics."""
 
 import ast
+import functools
 import graphlib
 from pathlib import Path
 
@@ -93,6 +94,7 @@ PARTS = {"geometry": ("cloud", "skeleton", "surface", "tets"),
          "planning": ("field", "bound", "planners")}
 
 
+@functools.cache
 def core_imports() -> dict[str, set[str]]:
     """Return, for each module of the core (dotted, without ``limber``), those that it imports.
 
