@@ -186,6 +186,11 @@ def _circles(package: str) -> list[str]:
     return []
 
 
+def test_no_file_imports_itself_in_a_circle():
+    """No chain of imports, those inside functions with them, leads back to where it began."""
+    graphlib.TopologicalSorter(core_imports()).prepare()
+
+
 def test_numerical_packages_know_no_branch_folder():
     """They take and return values: only stages, and what stands above, open a branch folder."""
     wrong = {module for module, imported in core_imports().items()

@@ -7,7 +7,8 @@ from limber.errors import Cancelled, NoPathError
 from limber.planning.cost import CostWeights, measure_path
 from limber.planning.goals import GraspGoal, TipGoal, default_goal, goal_points
 from limber.planning.planners.ompl_engine import ompl_missing
-from limber.planning.planners.rrt_star import PathProblem, Search, plan_path
+from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.trees import plan_path
 from limber.progress import Progress
 
 START = np.array([-0.13, 0.0, 0.0])

@@ -12,7 +12,8 @@ from limber.planning.goals import Goal, allowed_points, goal_points
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
-from limber.planning.planners.rrt_star import FoundPath, PathProblem, Search, plan_path
+from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.trees import FoundPath, plan_path
 from limber.planning.problem import GentleProblem
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress

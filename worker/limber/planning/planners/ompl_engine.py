@@ -13,7 +13,7 @@ import numpy as np
 
 from limber.errors import MissingDependencyError
 from limber.planning.cost import edge_cost
-from limber.planning.planners.rrt_star import PathProblem, Search
+from limber.planning.planners.tree_search import PathProblem, Search
 from limber.progress import Progress
 
 _REWIRE_FACTOR = 0.05

@@ -1,138 +1,20 @@
-"""RRT* (Karaman and Frazzoli 2011) over grasp positions, in two engines behind one function.
-
-``own`` is compiled here: it runs wherever Limber runs, gives the same path on every system and
-holds no lock. ``ompl`` is the Open Motion Planning Library's, kept as the reference that others
-know; it has no wheel for Windows, and its ``solve`` keeps Python's interpreter lock, so call it
-in a worker process (each command is one). ``compare.chosen_engine`` says which is taken and why.
-
-Both stop after a number of iterations, never a time, so a seed gives the same path again. Both
-end with shortcuts that lower the cost; OMPL's other simplifiers ignore it.
-"""
+"""RRT* over grasp positions, compiled here."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from limber.compiled import compiled
-from limber.errors import NoPathError
-from limber.planning.cost import EdgeWeights, edge_cost, path_cost
-from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.planners.smoothing import polish, shortcut, slide_end
-from limber.progress import SILENT, Progress
+from limber.planning.cost import edge_cost
+from limber.planning.planners.tree_search import PathProblem, Search
+from limber.progress import Progress
 
 _CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
 
 
-@dataclass(frozen=True)
-class PathProblem:
-    """A start, goals and a cost.
-
-    Attributes:
-        start: Grasp position [m], shape [3].
-        goals: Allowed positions in the goal region, shape [g, 3].
-        in_goal: Whether positions [n, 3] are in the goal region, bool [n].
-        energy_field: The energy field.
-        limits: The same with limits on energy and force, for compiled loops.
-        weights: The cost of an edge.
-    """
-
-    start: np.ndarray
-    goals: np.ndarray
-    in_goal: Callable[[np.ndarray], np.ndarray]
-    energy_field: EnergyField
-    limits: FieldArrays
-    weights: EdgeWeights
-
-    @property
-    def low(self) -> np.ndarray:
-        """Lower corner of the box to search [m], shape [3]."""
-        return self.energy_field.region.low
-
-    @property
-    def high(self) -> np.ndarray:
-        """Upper corner of the box to search [m], shape [3]."""
-        return self.energy_field.region.high
-
-    @property
-    def diagonal(self) -> float:
-        """Diagonal of that box [m]."""
-        return float(np.linalg.norm(self.high - self.low))
-
-
-@dataclass(frozen=True)
-class Search:
-    """How long and how wide to search.
-
-    Attributes:
-        iterations: Samples drawn.
-        reach: Longest edge, as a fraction of the box's diagonal.
-        goal_bias: Share of samples that are drawn from the goal region.
-        shortcuts: Attempts to shorten the found path.
-        seed: Of all that is random.
-    """
-
-    iterations: int = 5000
-    reach: float = 0.25
-    goal_bias: float = 0.05
-    shortcuts: int = 400
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class FoundPath:
-    """A path and how it was found.
-
-    Attributes:
-        points: Polyline of grasp positions [m], evenly spaced, shape [n, 3].
-        cost: Its cost by the problem's weights.
-        tree_cost: Cost before shortcuts.
-        history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
-        node_count: Size of the tree.
-        engine: Which engine found it.
-        raw: The tree's polyline before shortcuts, shape [k, 3]; None from a search without trees.
-    """
-
-    points: np.ndarray
-    cost: float
-    tree_cost: float
-    history: list[dict[str, float]] = field(default_factory=list)
-    node_count: int = 0
-    engine: str = "own"
-    raw: np.ndarray | None = None
-
-
-def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
-              progress: Progress = SILENT) -> FoundPath:
-    """Search for the path of least cost with ``engine`` ``own`` or ``ompl``.
-
-    Raises:
-        NoPathError: no path was found within the iterations.
-        MissingDependencyError: ``ompl`` was asked for and is not installed.
-    """
-    if engine == "ompl":
-        from limber.planning.planners.ompl_engine import search_with_ompl
-
-        raw, history, node_count = search_with_ompl(problem, search, progress)
-    else:
-        raw, history, node_count = _search(problem, search, progress)
-    if raw is None:
-        raise NoPathError(
-            f"{search.iterations} iterations found no allowed path to the goal region.",
-            f"{node_count} poses were reached from the start; the limits, or poses that the "
-            "branch model refused, may separate it from the goal.",
-            "Allow more --iterations, or raise --max-energy or --max-force.")
-    tree_cost = float(path_cost(raw, problem.limits, problem.weights))
-    points = shortcut(raw, problem.limits, problem.weights, attempts=search.shortcuts,
-                      seed=search.seed)
-    points = slide_end(points, problem.goals, problem.limits, problem.weights)
-    points = polish(points, problem.energy_field, problem.limits, problem.weights)
-    return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
-                     history, node_count, engine, raw)
-
-
-def _search(problem: PathProblem, search: Search, progress: Progress,
-            ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
+def search_tree(problem: PathProblem, search: Search, progress: Progress,
+                ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
+    """Return the best polyline [k, 3] or None, its cost as the tree grew, the number of nodes."""
     generator = np.random.default_rng([search.seed, 0])
     dimension = len(problem.start)
     tree = _Tree(search.iterations + 1, dimension)
