@@ -13,7 +13,7 @@ from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import generate_branch
 from limber.geometry.mesh_surface import MeshSurfaceSettings
 from limber.geometry.reconstruct import ReconstructSettings
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.files import read_swc
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static
 from limber.mechanics.simulate import SimulateSettings
@@ -55,8 +55,8 @@ def test_truth_is_carried_in_the_branch_frame(generated):
     """The true skeleton lies on the reconstructed one after alignment, and Young's modulus too."""
     folder, branch, _ = generated
     opened = Branch.open(folder / "g.branch")
-    truth = Skeleton.read_swc(opened.path("truth/skeleton.swc"))
-    found = Skeleton.read_swc(opened.path("skeleton.swc"))
+    truth = read_swc(opened.path("truth/skeleton.swc"))
+    found = read_swc(opened.path("skeleton.swc"))
     distance, _ = cKDTree(found.nodes).query(truth.nodes)
     assert np.median(distance) < 0.004
     told = json.loads(opened.path("truth/truth.json").read_text())

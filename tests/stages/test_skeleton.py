@@ -11,8 +11,7 @@ from limber.geometry import reconstruct as reconstruction
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import ReconstructSettings
-from limber.geometry.skeleton.files import read_skeleton
-from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.files import read_skeleton, read_swc
 from limber.progress import Progress
 from limber.stages.reconstruct import reconstruct
 from limber.stages.skeleton import review_skeleton
@@ -36,7 +35,7 @@ def made(tmp_path_factory):
 def test_a_kept_skeleton_given_back_is_used_as_it_is(made, tmp_path) -> None:
     """In the file's coordinates; states, deviations and probabilities come back too."""
     folder, result = made
-    kept = Skeleton.read_swc(folder / "a.branch" / "scan_skeleton.swc", scale=1.0)
+    kept = read_swc(folder / "a.branch" / "scan_skeleton.swc", scale=1.0)
     assert np.abs(kept.nodes - OFFSET).max() < 1000 and kept.radius.max() > 3
     again = reconstruct(folder / "cloud.ply", tmp_path / "b.branch", SETTINGS,
                         skeleton_path=folder / "a.branch" / "scan_skeleton.csv")
@@ -64,7 +63,7 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     assert told["length_m"] < result["length_m"] and told["mesh"] == "current"
     assert Branch.open(target, verify=True).manifest.stages["reconstruct"].result[
         "mesh_volume_m3"] < result["mesh_volume_m3"]
-    written = Skeleton.read_swc(tmp_path / "out.swc")
+    written = read_swc(tmp_path / "out.swc")
     assert written.length == pytest.approx(told["length_m"], rel=1e-4)
     # The same reconstruct is current with its edits; one with other settings applies them anew.
     assert reconstruct(scan, target, SETTINGS)["length_m"] == pytest.approx(told["length_m"])

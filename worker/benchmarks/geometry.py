@@ -17,7 +17,7 @@ from benchmarks.table import Row
 from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
-from limber.geometry.skeleton.files import read_cylinders
+from limber.geometry.skeleton.files import read_cylinders, read_swc
 from limber.geometry.skeleton.radii.axis_fit import median_radii
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -245,7 +245,7 @@ def _scans(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
                 valid += good
                 if out is not None:
                     draw_folder(folder, out / f"{path.stem}.png")
-                ours = Skeleton.read_swc(folder / "skeleton.swc")
+                ours = read_swc(folder / "skeleton.swc")
                 share = explained(read_points(folder / "cloud.ply").points, ours)
                 shares.append(f"{path.stem} {share:.0%}")
                 if path.stem == "Tree_1":
@@ -272,7 +272,7 @@ def _against_qsm(folder: Path) -> list[Row]:
     """Compare with TreeQSM's cylinders of the same tree: a reference, not truth."""
     path = DATA / "aRchi_tree_1" / "Tree_1_cylinders_TreeQSM.csv"
     theirs = read_cylinders(path) if _is_tree(path) else None
-    ours = Skeleton.read_swc(folder / "skeleton.swc")
+    ours = read_swc(folder / "skeleton.swc")
     back = _in_file_frame(folder, ours)
     with open(path, newline="", encoding="utf-8") as stream:
         table = list(csv.DictReader(stream))
@@ -325,7 +325,7 @@ def draw_folder(folder: Path, path: Path) -> None:
     from benchmarks.geometry_pictures import draw_reconstruction
 
     draw_reconstruction(path, read_points(folder / "cloud.ply").points,
-                        Skeleton.read_swc(folder / "skeleton.swc"),
+                        read_swc(folder / "skeleton.swc"),
                         Surface.read(folder / "surface.ply"), folder.name)
 
 

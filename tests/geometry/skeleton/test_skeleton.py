@@ -6,7 +6,6 @@ import pytest
 from limber.errors import InputError
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.files import read_cylinders, read_swc, write_cylinders
-from limber.geometry.skeleton.skeleton import Skeleton
 
 
 def test_runs_orders_and_main_path(y_skeleton):
@@ -28,7 +27,7 @@ def test_swc_round_trip(y_skeleton, tmp_path):
     """What is written is read again, radii and topology too."""
     path = tmp_path / "s.swc"
     y_skeleton.write_swc(path)
-    again = Skeleton.read_swc(path)
+    again = read_swc(path)
     np.testing.assert_allclose(again.nodes, y_skeleton.nodes, atol=1e-9)
     np.testing.assert_allclose(again.radius, y_skeleton.radius, rtol=1e-5)
     np.testing.assert_array_equal(again.parent, y_skeleton.parent)

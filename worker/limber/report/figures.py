@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from limber.geometry.skeleton.files import read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.store import Branch
@@ -20,7 +21,7 @@ _SHOWN_POINTS = 30_000
 
 def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "Figure":
     """Cloud, centreline tree, control points and targets, from the front and from the side."""
-    skeleton = Skeleton.read_swc(branch.path("skeleton.swc"))
+    skeleton = read_swc(branch.path("skeleton.swc"))
     points = _cloud_points(branch)
     mesh = TetMesh.read(branch.path("mesh.vtu")) if branch.has("mesh.vtu") else None
     figure, axes = _two_views(points)
@@ -46,7 +47,7 @@ def radii(branch: Branch) -> "Figure":
     """Radius and its uncertainty over the distance from the root, one colour an order."""
     import matplotlib.pyplot as plt
 
-    skeleton = Skeleton.read_swc(branch.path("skeleton.swc"))
+    skeleton = read_swc(branch.path("skeleton.swc"))
     figure, axis = plt.subplots(figsize=(9, 3.6))
     distance = skeleton.arc_length
     for run in skeleton.runs():

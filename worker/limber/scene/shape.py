@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.cloud.files import read_cloud
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
+from limber.geometry.skeleton.files import read_swc
+from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import SceneData
@@ -49,7 +50,7 @@ def add_skeleton(data: SceneData, branch: Branch) -> None:
     """Add the centreline: nodes, parents, radii with their standard deviation, and flags."""
     if not branch.has("skeleton.swc"):
         return
-    skeleton = Skeleton.read_swc(branch.path("skeleton.swc"))
+    skeleton = read_swc(branch.path("skeleton.swc"))
     children = skeleton.child_counts()
     sigma, state = _radius_table(branch, skeleton.node_count)
     data.arrays |= {

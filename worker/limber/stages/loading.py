@@ -12,6 +12,7 @@ from typing import Any
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
+from limber.geometry.skeleton.files import read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
@@ -41,7 +42,7 @@ def load_skeleton(branch: Branch) -> Skeleton:
     Raises:
         BranchFolderError: there is no skeleton.
     """
-    return Skeleton.read_swc(branch.require("skeleton.swc", "reconstruct"))
+    return read_swc(branch.require("skeleton.swc", "reconstruct"))
 
 
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:

@@ -239,7 +239,7 @@ def _eye(camera_path: Path | None) -> np.ndarray | None:
 
 def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
-    from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.geometry.skeleton.files import read_swc
     from limber.geometry.surface.surface import Surface
 
     source = cloud_path.parent / "truth.json"
@@ -249,7 +249,7 @@ def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     truth = json.loads(source.read_text(encoding="utf-8"))
     if truth.get("cloud_sha256") != file_digest(cloud_path):
         return False
-    skeleton = Skeleton.read_swc(skeleton_path)
+    skeleton = read_swc(skeleton_path)
     skeleton.moved(alignment.apply(skeleton.nodes)).write_swc(stage.path("truth/skeleton.swc"))
     truth["control_points_m"] = alignment.apply(np.array(truth["control_points_m"])).tolist()
     stage.path("truth/truth.json").write_text(json.dumps(truth, indent=1) + "\n")

@@ -75,7 +75,7 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     """The truth of a branch folder: its generator's, the body that was meshed, or its skeleton's.
     """
     from limber.estimation.virtual_pull import true_branch
-    from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.geometry.skeleton.files import read_swc
     from limber.stages.loading import load_mesh
 
     known: dict[str, Any] = {}
@@ -85,7 +85,7 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
         known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
         where = "truth/skeleton.swc"
     body = load_mesh(branch) if _is_meshed_body(branch) else None
-    return true_branch(Skeleton.read_swc(branch.path(where)), settings, gravity=branch.gravity,
+    return true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,
                        body=body, **known)
 
 

@@ -19,7 +19,15 @@ def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
 
 
 def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read an SWC file; see :meth:`limber.geometry.skeleton.skeleton.Skeleton.read_swc`."""
+    """Read an SWC file.
+
+    Args:
+        path: The file.
+        scale: Metres per unit; None takes the header's ``# unit:``, or metres.
+
+    Raises:
+        InputError: not an SWC tree; see :meth:`Skeleton.from_edges`.
+    """
     rows, header_scale = [], 1.0
     for number, line in enumerate(_lines(path), start=1):
         if line.startswith("#"):

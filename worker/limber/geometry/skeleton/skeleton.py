@@ -175,21 +175,6 @@ class Skeleton:
             lines.append(f"{i + 1} {kind[i]} {p[0]:.15g} {p[1]:.15g} {p[2]:.15g} {r:.9g} {up}")
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
-    @classmethod
-    def read_swc(cls, path: Path, *, scale: float | None = None) -> "Skeleton":
-        """Read an SWC file.
-
-        Args:
-            path: The file.
-            scale: Metres per unit; None takes the header's ``# unit:``, or metres.
-
-        Raises:
-            InputError: not an SWC tree; see :meth:`from_edges`.
-        """
-        from limber.geometry.skeleton.files import read_swc
-
-        return read_swc(path, scale=scale)
-
     def _edge_lengths(self) -> np.ndarray:
         step = np.linalg.norm(self.nodes - self.nodes[self.parent], axis=1)
         step[self.parent < 0] = 0.0
