@@ -163,6 +163,8 @@ def _add_skeleton(shown: ShownBranch, data: SceneData) -> None:
                             np.column_stack([parents[nodes], nodes]))
     meshes.set_scalars(mesh, "radius", data.arrays["skeleton_radius"])
     meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
+    if "skeleton_probability" in data.arrays:
+        meshes.set_scalars(mesh, "probability", data.arrays["skeleton_probability"])
     meshes.set_integers(mesh, "flags", data.arrays["skeleton_flags"])
     thing = add_object(shown.collection, "Skeleton", mesh)
     thing.hide_viewport = thing.hide_render = True

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from limber.errors import BranchFolderError, InputError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.skeleton.files import write_cylinders
+from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
 from limber.stages.report import write_report
@@ -91,3 +94,34 @@ def test_named_targets_stand_in_figure_and_table(tmp_path):
     write_report(folder)
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert "Named targets" in html and ">flower<" in html and f"{tip[2]:.3f}" in html
+
+
+def test_cylinder_model_stands_beside_calipers(tmp_path):
+    """Orders, diameters, how radii are known, doubt; a caliper's value, and one off the branch."""
+    tree = Skeleton.from_edges(
+        np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.1, 0, 0.3]], float),
+        np.array([-1, 0, 1, 1]), np.array([0.012, 0.01, 0.008, 0.004]),
+        radius_sigma=np.array([0, 2e-4, 2e-4, 1e-3]), radius_state=np.array([0, 0, 0, UNRESOLVED]),
+        probability=np.array([1, 1, 1, 0.4]))
+    branch = Branch.create(tmp_path / "a.branch")
+    with branch.stage("reconstruct") as stage:
+        tree.write_swc(stage.path("skeleton.swc"))
+        write_cylinders(tree, stage.path("skeleton.csv"))
+        Cloud(tree.nodes).write_ply(stage.path("cloud.ply"))
+        stage.result["length_shares"] = {"measured": 0.74, "unresolved": 0.26}
+    path = tmp_path / "calipers.csv"
+    path.write_text("along_m,diameter_mm\n0.2,21.0\n")
+    result = write_report(branch.folder, caliper_path=path)
+    assert "Cylinder model" in result["sections"]
+    (row,) = result["calipers"]
+    assert row["difference"] == pytest.approx(20 / 21 - 1)
+    assert row["sigmas"] == pytest.approx(-0.001 / 4e-4)
+    html = (branch.folder / "report.html").read_text(encoding="utf-8")
+    for text in ("74.0 %", "26.0 %", "probability 0.40", "sigma 25% of it", "-4.8 %", "-2.5",
+                 "By branching order", "taper [mm of radius a m]"):
+        assert text in html, text
+    for content, told in (("along_m,diameter_mm\n0.5,21\n", "0.5 m; the main path is 0.4 m"),
+                          ("along_m,diameter_mm\n0.1,-3\n", "line 2: -3 mm"), ("", "no values")):
+        path.write_text(content)
+        with pytest.raises(InputError, match=told):
+            write_report(branch.folder, caliper_path=path)

@@ -216,12 +216,13 @@ def test_scan_skeleton_and_path_energy(tmp_path, mesh):
     """The cloud with linear colours, the centreline with radii and flags, energy along paths."""
     from limber.geometry.cloud.cloud import Cloud
     from limber.geometry.skeleton.files import write_cylinders
-    from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
+    from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 
     nodes = np.array([[0, 0, 0], [0, 0, 0.2], [0, 0, 0.5], [0.1, 0, 0.3]], float)
     skeleton = Skeleton.from_edges(nodes, np.array([-1, 0, 1, 1]), np.array([.01, .01, .005, .004]),
                                    radius_sigma=np.array([0, 1e-4, 2e-4, 3e-4]),
-                                   radius_state=np.array([0, 0, LIMITED, 0]))
+                                   radius_state=np.array([0, 0, LIMITED, UNRESOLVED]),
+                                   probability=np.array([1, 1, 1, 0.4]))
     branch = Branch.create(tmp_path / "a.branch")
     points = np.random.default_rng(0).random((7, 3))
     colour = np.array([[255, 0, 0]] * 6 + [[188, 188, 188]])
@@ -244,6 +245,8 @@ def test_scan_skeleton_and_path_energy(tmp_path, mesh):
     fork, tip, root = by_place[0, 0, 0.2], by_place[0, 0, 0.5], by_place[0, 0, 0]
     flags = arrays["skeleton_flags"]
     assert (flags[root], flags[fork], flags[tip]) == (1, 2, 4 + 8)
+    assert flags[by_place[0.1, 0, 0.3]] == 4 + 32
+    np.testing.assert_allclose(sorted(arrays["skeleton_probability"]), [0.4, 1, 1, 1])
     assert arrays["skeleton_radius_sigma"][tip] == pytest.approx(2e-4)
     np.testing.assert_allclose(arrays["path_energy:plan"], [0, 0.5])
     np.testing.assert_allclose(arrays["path_pose:plan"][1], [0.1, 0, 0.3, 0, 1, 0])

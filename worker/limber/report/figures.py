@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from limber.geometry.skeleton.files import read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.stages.loading import load_skeleton
 from limber.store import Branch
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ _SHOWN_POINTS = 30_000
 
 def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "Figure":
     """Cloud, centreline tree, control points and targets, from the front and from the side."""
-    skeleton = read_swc(branch.path("skeleton.swc"))
+    skeleton = load_skeleton(branch)
     points = _cloud_points(branch)
     mesh = TetMesh.read(branch.path("mesh.vtu")) if branch.has("mesh.vtu") else None
     figure, axes = _two_views(points)
@@ -43,11 +43,36 @@ def scan_and_skeleton(branch: Branch, targets: Sequence[Mapping[str, Any]]) -> "
     return figure
 
 
+def diameters(skeleton: Skeleton, compared: Sequence[Mapping[str, Any]]) -> "Figure":
+    """Diameter along the main path with its interval, and what calipers found."""
+    import matplotlib.pyplot as plt
+
+    from limber.geometry.skeleton.qsm import diameters as along_path
+
+    figure, axis = plt.subplots(figsize=(9, 3.2))
+    path = skeleton.main_path()
+    along = skeleton.arc_length[path]
+    thick, sigma = 1e3 * along_path(skeleton, along).T
+    colour = _order_colour(0)
+    axis.plot(along, thick, color=colour, linewidth=1.4, label="scan")
+    axis.fill_between(along, thick - 2 * sigma, thick + 2 * sigma, color=colour, alpha=0.15,
+                      linewidth=0)
+    if compared:
+        axis.plot([row["along_m"] for row in compared],
+                  [1e3 * row["measured_m"] for row in compared], "o", color="#b0126b",
+                  markersize=6, label="calipers")
+        axis.legend(frameon=False)
+    axis.set(xlabel="distance from the root along the main path [m]", ylabel="diameter [mm]")
+    axis.set_ylim(bottom=0)
+    axis.grid(alpha=0.25)
+    return figure
+
+
 def radii(branch: Branch) -> "Figure":
     """Radius and its uncertainty over the distance from the root, one colour an order."""
     import matplotlib.pyplot as plt
 
-    skeleton = read_swc(branch.path("skeleton.swc"))
+    skeleton = load_skeleton(branch)
     figure, axis = plt.subplots(figsize=(9, 3.6))
     distance = skeleton.arc_length
     for run in skeleton.runs():

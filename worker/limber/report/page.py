@@ -3,24 +3,40 @@
 import base64
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from limber.errors import InputError
+from limber.geometry.skeleton import qsm
+from limber.geometry.skeleton.doubts import Doubt, doubtful_parts
+from limber.geometry.skeleton.qsm import Caliper
 from limber.optional import require_extra
 from limber.progress import SILENT, Progress
 from limber.report import figures
-from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
+from limber.report.tables import (
+    caliper_rows,
+    comparison_rows,
+    deviation_rows,
+    diameter_rows,
+    doubt_rows,
+    held_out_rows,
+    modulus_rows,
+    order_rows,
+    share_rows,
+)
+from limber.stages.loading import load_skeleton
 from limber.store import Branch
 from limber.version import VERSION
 
 _SOURCE_LABELS = {"file": "made from", "unit": "its unit", "sha256": "its sha256",
                   "truth": "known truth"}
+_DOUBTS_SHOWN = 12
 _QUALITY_LABELS = {
     "volume_ratio": "mesh over surface volume",
     "min_dihedral_deg": "smallest angle between faces [degrees]",
@@ -48,21 +64,23 @@ class Section:
         self.pictures.append((_inline_png(_png(figure)), caption))
 
 
-def draw_page(branch: Branch, *, picture: Path | None = None, progress: Progress = SILENT,
-              ) -> tuple[str, list[Section]]:
+def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence[Caliper] = (),
+              progress: Progress = SILENT) -> tuple[str, list[Section]]:
     """Return the page of whatever stages a branch has, as HTML, and its sections.
 
     Args:
         picture: A render of the scene to put at the top, PNG.
+        calipers: Diameters that somebody measured, to hold beside the scan's.
 
     Raises:
+        InputError: the picture is none, or a diameter stands beyond the branch.
         MissingDependencyError: what the extra ``report`` brings is not installed.
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
     page = [_summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
-        _scan, _mesh, *_pulls(branch), _estimate, *_simulations(branch), _energy,
-        *_plans(branch), _provenance]
+        _scan, partial(_cylinders, calipers=calipers), _mesh, *_pulls(branch), _estimate,
+        *_simulations(branch), _energy, *_plans(branch), _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
@@ -109,9 +127,42 @@ def _scan(branch: Branch) -> Section:
                                         "it is known, one colour an order.")
     result = _reconstruction(branch)
     section.text += result.get("warnings") or []
+    doubtful = doubtful_parts(load_skeleton(branch))
+    if doubtful:
+        section.tables.append(_doubt_table(doubtful))
     if result.get("clamped_radius_count"):
         section.text.append(f"{result['clamped_radius_count']} radii were limited to the cloud's "
                             "scale.")
+    return section
+
+
+def _doubt_table(doubtful: list[Doubt]) -> tuple[str, list[list[str]]]:
+    rows = doubt_rows([{"kind": doubt.kind, "branch": doubt.branch, "at": np.round(doubt.at, 4),
+                        "length_m": doubt.length, "radius_m": doubt.radius, "value": doubt.value}
+                       for doubt in doubtful[:_DOUBTS_SHOWN]])
+    rest = len(doubtful) - _DOUBTS_SHOWN
+    more = f"; {rest} more: limber skeleton" if rest > 0 else ""
+    return f"Doubtful parts of the skeleton, places in the branch's frame [m]{more}", rows
+
+
+def _cylinders(branch: Branch, calipers: Sequence[Caliper]) -> Section:
+    section = Section("Cylinder model")
+    if not branch.has("skeleton.swc"):
+        section.missing = "limber reconstruct CLOUD -o NAME.branch"
+        return section
+    skeleton = load_skeleton(branch)
+    compared = qsm.against_calipers(skeleton, list(calipers))
+    shares = _reconstruction(branch).get("length_shares")
+    if shares:
+        section.tables.append(("How the radii are known", share_rows(shares)))
+    section.tables.append(("By branching order (0 is the main axis)",
+                           order_rows(qsm.by_order(skeleton))))
+    section.tables.append(("Diameters along the main path",
+                           diameter_rows(qsm.diameters_at_heights(skeleton))))
+    if compared:
+        section.tables.append(("Against calipers", caliper_rows(compared)))
+    section.draw(figures.diameters(skeleton, compared),
+                 "Diameter along the main path; the band is two standard deviations to each side.")
     return section
 
 

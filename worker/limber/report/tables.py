@@ -81,6 +81,43 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
+def share_rows(shares: Mapping[str, float]) -> list[list[str]]:
+    """Return which share of the axes' length each state of the radius has."""
+    return [["radius", "share of the axes' length"],
+            *([name, f"{100 * share:.1f} %"] for name, share in shares.items())]
+
+
+def order_rows(orders: Sequence[Mapping[str, float]]) -> list[list[str]]:
+    """Return branches, length, volume and taper of each branching order, and of all."""
+    def row(name: str, part: Mapping[str, float]) -> list[str]:
+        return [name, f"{part['branch_count']:.0f}", f"{part['length_m']:.3f}",
+                f"{1e6 * part['volume_m3']:.1f}", f"{1e3 * part['taper']:.2f}"]
+    whole = {name: sum(part[name] for part in orders)
+             for name in ("branch_count", "length_m", "volume_m3")}
+    whole["taper"] = sum(part["taper"] * part["length_m"] for part in orders) / max(
+        whole["length_m"], 1e-300)
+    return [["order", "branches", "length [m]", "volume [cm3]", "taper [mm of radius a m]"],
+            *(row(str(part["order"]), part) for part in orders), row("all", whole)]
+
+
+def diameter_rows(diameters: Sequence[Mapping[str, float]]) -> list[list[str]]:
+    """Return diameters at shares of the main path's length."""
+    return [["share of the main path", "from the root [m]", "diameter [mm]",
+             "standard deviation [mm]"],
+            *([f"{100 * row['share']:.0f} %", f"{row['along_m']:.3f}",
+               f"{1e3 * row['diameter_m']:.2f}", _known(row["sigma_m"] or None, "{:.2f}", 1e3)]
+              for row in diameters)]
+
+
+def caliper_rows(compared: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return the scan's diameters beside those that calipers found."""
+    return [["from the root [m]", "calipers [mm]", "scan [mm]", "difference",
+             "in standard deviations"],
+            *([f"{row['along_m']:.3f}", f"{1e3 * row['measured_m']:.2f}",
+               f"{1e3 * row['diameter_m']:.2f}", f"{100 * row['difference']:+.1f} %",
+               _known(row["sigmas"], "{:+.1f}")] for row in compared)]
+
+
 def doubt_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the doubtful parts of a skeleton.
 

@@ -1,21 +1,21 @@
 """What stands still in a scene: surface values, the scan, the skeleton, marks and the view."""
 
-import csv
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from limber.geometry.cloud.files import read_cloud
-from limber.geometry.skeleton.files import read_swc
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED
+from limber.geometry.skeleton.skeleton import BRIDGED, INTERPOLATED, LIMITED, UNRESOLVED
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of, linear_of
+from limber.stages.loading import load_skeleton
 from limber.store import Branch
 
 ROOT, FORK, TIP, RADIUS_LIMITED, RADIUS_INTERPOLATED = 1, 2, 4, 8, 16
+RADIUS_UNRESOLVED, BRIDGE = 32, 64
 """Bits of ``skeleton_flags``."""
 CLOUD_LIMIT = 2_000_000
 """Most points of a scan that are handed on; of more, evenly chosen ones."""
@@ -47,35 +47,21 @@ def add_cloud(data: SceneData, branch: Branch) -> None:
 
 
 def add_skeleton(data: SceneData, branch: Branch) -> None:
-    """Add the centreline: nodes, parents, radii with their standard deviation, and flags."""
+    """Add the centreline: nodes, parents, radii with their standard deviation, doubt and flags."""
     if not branch.has("skeleton.swc"):
         return
-    skeleton = read_swc(branch.path("skeleton.swc"))
-    children = skeleton.child_counts()
-    sigma, state = _radius_table(branch, skeleton.node_count)
+    skeleton = load_skeleton(branch)
+    children, state = skeleton.child_counts(), skeleton.radius_state
     data.arrays |= {
         "skeleton": skeleton.nodes, "skeleton_parent": skeleton.parent,
-        "skeleton_radius": skeleton.radius, "skeleton_radius_sigma": sigma,
+        "skeleton_radius": skeleton.radius, "skeleton_radius_sigma": skeleton.radius_sigma,
+        "skeleton_probability": skeleton.probability,
         "skeleton_order": skeleton.order,
         "skeleton_flags": (ROOT * (skeleton.parent < 0) + FORK * (children > 1)
                            + TIP * (children == 0) + RADIUS_LIMITED * (state == LIMITED)
-                           + RADIUS_INTERPOLATED * (state == INTERPOLATED)).astype(np.int32)}
-
-
-def _radius_table(branch: Branch, node_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return standard deviations [m] and states of the radii, shape [node_count] each.
-
-    They stand in skeleton.csv, a row for each node but the root; 0 where there is none.
-    """
-    sigma, state = np.zeros(node_count), np.zeros(node_count, int)
-    if not branch.has("skeleton.csv"):
-        return sigma, state
-    with open(branch.path("skeleton.csv"), encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    if len(rows) == node_count - 1 and rows and "radius_state" in rows[0]:
-        sigma[1:] = [float(row["radius_sigma"]) for row in rows]
-        state[1:] = [int(row["radius_state"]) for row in rows]
-    return sigma, state
+                           + RADIUS_INTERPOLATED * (state == INTERPOLATED)
+                           + RADIUS_UNRESOLVED * (state == UNRESOLVED)
+                           + BRIDGE * (state == BRIDGED)).astype(np.int32)}
 
 
 def add_marks(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:

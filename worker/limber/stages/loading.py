@@ -12,7 +12,7 @@ from typing import Any
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.skeleton.files import read_swc
+from limber.geometry.skeleton.files import read_cylinders, read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
@@ -37,11 +37,13 @@ def load_mesh(branch: Branch) -> TetMesh:
 
 
 def load_skeleton(branch: Branch) -> Skeleton:
-    """Return the branch's axes.
+    """Return the branch's axes, with what is known of how sure they are.
 
     Raises:
         BranchFolderError: there is no skeleton.
     """
+    if branch.has("skeleton.csv"):
+        return read_cylinders(branch.path("skeleton.csv"))
     return read_swc(branch.require("skeleton.swc", "reconstruct"))
 
 

@@ -15,33 +15,46 @@ from limber.store import Branch
 class ReportInputs(BranchInputs):
     """A branch folder, and a picture of it."""
 
-    groups: ClassVar[Groups] = {"input": ("picture",)}
+    groups: ClassVar[Groups] = {"input": ("picture", "caliper")}
 
     picture: Path | None = Field(
         None, description="A PNG to open the page with, such as the render of `limber scene`.")
+    caliper: Path | None = Field(
+        None, description="Diameters that you measured, to hold beside the scan's: a CSV with the "
+        "columns along_m (from the root along the main path) and diameter_mm.")
 
 
-def write_report(folder: Path, *, picture: Path | None = None, progress: Progress = SILENT,
-                 ) -> dict[str, Any]:
+def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Path | None = None,
+                 progress: Progress = SILENT) -> dict[str, Any]:
     """Write ``report.html`` into a branch folder from whatever stages have been run.
 
     Args:
         folder: The branch folder.
         picture: A render of the scene to put at the top, PNG.
+        caliper_path: Measured diameters, see :func:`limber.geometry.skeleton.qsm.read_calipers`.
 
     Returns:
-        ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``.
+        ``report`` (its path), ``figure_count``, ``sections`` and those ``missing``; ``calipers``,
+        the scan's diameters against the measured ones.
+
+    Raises:
+        InputError: the picture or the measured diameters cannot be used.
     """
+    from limber.geometry.skeleton.qsm import against_calipers, read_calipers
     from limber.report.page import draw_page
+    from limber.stages.loading import load_skeleton
 
     branch = Branch.open(folder)
-    html, page = draw_page(branch, picture=picture, progress=progress)
+    calipers = [] if caliper_path is None else read_calipers(caliper_path)
+    html, page = draw_page(branch, picture=picture, calipers=calipers, progress=progress)
     with branch.stage("report", {"picture": bool(picture)}) as stage:
         stage.path("report.html").write_text(html, encoding="utf-8")
         stage.result.update(
             figure_count=sum(len(section.pictures) for section in page),
             sections=[section.title for section in page if not section.missing],
             missing=[section.title for section in page if section.missing])
+        if calipers:
+            stage.result["calipers"] = against_calipers(load_skeleton(branch), calipers)
     progress(1.0, "written")
     return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
 
@@ -49,7 +62,8 @@ def write_report(folder: Path, *, picture: Path | None = None, progress: Progres
 def run(inputs: ReportInputs, _settings: NoSettings, _options: NoOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
-    return write_report(inputs.branch_folder, picture=inputs.picture, progress=progress)
+    return write_report(inputs.branch_folder, picture=inputs.picture, caliper_path=inputs.caliper,
+                        progress=progress)
 
 
 STAGE = StageDescription(

@@ -64,26 +64,31 @@ def diameters_at_heights(skeleton: Skeleton, shares: tuple[float, ...] = HEIGHTS
 
 
 def against_calipers(skeleton: Skeleton, measured: list[Caliper]) -> list[dict[str, Any]]:
-    """Ours beside each measured diameter, with the difference in standard deviations.
+    """Ours beside each measured diameter: the difference over it, and in standard deviations.
+
+    ``sigmas`` is None where the skeleton's deviation is not known.
 
     Raises:
         InputError: a place lies beyond the main path.
     """
     total = float(skeleton.arc_length[skeleton.main_path()[-1]])
     along = np.array([one.along for one in measured])
-    if len(along) and (along.min() < 0 or along.max() > total):
+    outside = along[(along < 0) | (along > total)]
+    if len(outside):
         raise InputError(
-            f"A caliper value stands at {along.max():.3g} m; the main path is {total:.3g} m long.",
-            "It is counted from the root along the main path.", "Correct along_m.")
+            f"A caliper value stands at {outside[0]:.3g} m; the main path is {total:.3g} m long.",
+            "It is counted from the root along the main path, in metres.", "Correct along_m.")
     ours = diameters(skeleton, along)
     return [{"along_m": one.along, "measured_m": one.diameter, "diameter_m": float(row[0]),
              "sigma_m": float(row[1]), "difference": float(row[0] / one.diameter - 1),
-             "sigmas": float((row[0] - one.diameter) / max(row[1], 1e-12))}
+             "sigmas": float((row[0] - one.diameter) / row[1]) if row[1] > 0 else None}
             for one, row in zip(measured, ours, strict=True)]
 
 
 def read_calipers(path: Path) -> list[Caliper]:
-    """Read caliper values: columns ``along_m`` and ``diameter_mm``.
+    """Read caliper values: a CSV file with the columns ``along_m`` and ``diameter_mm``.
+
+    ``along_m`` is counted from the root along the main path; further columns are passed over.
 
     Raises:
         InputError: a column is missing, or a value is no positive number.
@@ -93,7 +98,10 @@ def read_calipers(path: Path) -> list[Caliper]:
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read ({error}).", "A CSV file was expected.",
                          "Check the path.") from error
-    missing = [name for name in ("along_m", "diameter_mm") if not rows or name not in rows[0]]
+    if not rows:
+        raise InputError(f"{path} has no values.", "A header and one line a diameter were "
+                         "expected.", "Give a CSV file with the columns along_m and diameter_mm.")
+    missing = [name for name in ("along_m", "diameter_mm") if name not in rows[0]]
     if missing:
         raise InputError(f"{path} lacks the columns {', '.join(missing)}.",
                          "Caliper values have along_m and diameter_mm.", "Name its columns so.")
@@ -102,6 +110,9 @@ def read_calipers(path: Path) -> list[Caliper]:
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
                          "Both columns are numbers.", "Correct the file.") from error
-    if any(not (one.diameter > 0 and np.isfinite(one.along)) for one in values):
-        raise InputError(f"{path} has a diameter that is not above 0.", "", "Correct the file.")
+    for number, one in enumerate(values, start=2):
+        if not (0 < one.diameter < np.inf and np.isfinite(one.along)):
+            raise InputError(
+                f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} m.",
+                "A diameter is above 0, and both are finite.", "Correct that line.")
     return values
