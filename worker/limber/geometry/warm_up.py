@@ -1,7 +1,8 @@
-"""Compiles the loops over surfaces once, so that no user waits for a compiler."""
+"""Compiles the loops over points and surfaces once, so that no user waits for a compiler."""
 
 import numpy as np
 
+from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.forks import smooth_forks
@@ -10,11 +11,12 @@ from limber.progress import SILENT, Progress
 
 
 def warm_up(progress: Progress = SILENT) -> None:
-    """Make the surface of one fork; about 5 s where nothing is compiled yet."""
+    """Fit and surface one fork; about 10 s where nothing is compiled yet."""
     skeleton = Skeleton.from_edges(
         np.array([[0, 0, 0], [0, 0, 0.1], [0, 0, 0.2], [0.05, 0, 0.15]]),
         np.array([-1, 0, 1, 1]), np.array([0.01, 0.01, 0.01, 0.005]))
     progress(0.1, "compiling the surface's loops")
     surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
     distance_to_surface(skeleton.nodes, surface)
+    fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
     progress(1.0, "compiling the surface's loops")

@@ -14,12 +14,14 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
+from limber.geometry.skeleton.radii.fit_kernels import nearest_of, normal_blocks
 from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
 _CANDIDATES = 6
+_MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
 _PROBE = 128  # nodes between two whose radii are taken as independent of each other
@@ -64,8 +66,13 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
     spread = 0.35 * float(np.median(radius))
     floor = 0.05 * float(np.median(radius))
+    near, found_at = None, nodes
     for number in range(rounds):
-        match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
+        # The cylinders around a point are looked up anew once axes have moved.
+        moved = np.linalg.norm(nodes - found_at, axis=1)
+        if near is None or (moved > _MOVED * radius).any():
+            near, found_at = _around(skeleton.parent, nodes, points), nodes
+        match = _match(skeleton.parent, skeleton.order, nodes, radius, points, near)
         # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
         noise = max(_robust_sigma(match.residual, radius[match.segment]), 1e-4 * floor)
         spread = noise if settled else max(noise, 0.6 * spread)
@@ -295,27 +302,27 @@ class _Match:
 
 
 def _match(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.ndarray,
-           points: np.ndarray) -> _Match:
-    """Find for each point the cylinder to whose surface it is nearest."""
+           points: np.ndarray, near: np.ndarray | None = None) -> _Match:
+    """Find for each point the cylinder to whose surface it is nearest.
+
+    Args:
+        near: Upper nodes of the cylinders that may be, shape [m, k]; None: those around.
+    """
+    near = _around(parent, nodes, points) if near is None else near
+    # The first cylinder of a side run has the twig's radius all along, not its carrier's.
+    own = order > order[parent]
+    segment, share, normal, residual, thick = nearest_of(
+        np.ascontiguousarray(points, np.float64), np.ascontiguousarray(near), parent, own,
+        np.ascontiguousarray(nodes, np.float64), np.ascontiguousarray(radius, np.float64))
+    return _Match(segment, share, normal, residual, thick, own[segment])
+
+
+def _around(parent: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Upper nodes of the cylinders whose middles are nearest to each point, shape [m, k]."""
     ends = np.arange(1, len(nodes))
     tree = cKDTree((nodes[ends] + nodes[parent[ends]]) / 2)
     _, near = tree.query(points, k=min(_CANDIDATES, len(ends)))
-    near = ends[near.reshape(len(points), -1)]
-    start, end = nodes[parent[near]], nodes[near]
-    axis = end - start
-    square = np.maximum(np.einsum("mkj,mkj->mk", axis, axis), 1e-300)
-    share = np.clip(np.einsum("mkj,mkj->mk", points[:, None] - start, axis) / square, 0, 1)
-    offset = points[:, None] - start - share[..., None] * axis
-    distance = np.linalg.norm(offset, axis=2)
-    # The first cylinder of a side run has the twig's radius all along, not its carrier's.
-    own = order[near] > order[parent[near]]
-    thick = np.where(own, radius[near], (1 - share) * radius[parent[near]] + share * radius[near])
-    best = np.argmin(distance - thick, axis=1)
-    rows = np.arange(len(points))
-    chosen = distance[rows, best]
-    normal = offset[rows, best] / np.maximum(chosen, 1e-300)[:, None]
-    return _Match(near[rows, best], share[rows, best], normal, chosen - thick[rows, best],
-                  thick[rows, best], own[rows, best])
+    return ends[near.reshape(len(points), -1)]
 
 
 def _robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
@@ -368,21 +375,13 @@ def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: _Match, weight: np
     place = match.normal if place is None else place
     low = np.where(match.own_radius, 0.0, 1 - match.share)
     high = np.where(match.own_radius, 1.0, match.share)
-    jacobian = np.column_stack([
-        -(1 - match.share)[:, None] * match.normal, -low,
-        -match.share[:, None] * match.normal, -high])
     distance = match.residual + match.thick
     pull = distance[:, None] * match.normal - match.thick[:, None] * place
     grow = distance * np.einsum("mj,mj->m", match.normal, place) - match.thick
     gradient = np.column_stack([
         (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
-    block = np.empty((count, 8, 8))
-    right = np.empty((count, 8))
-    for i in range(8):
-        right[:, i] = np.bincount(match.segment, weight * gradient[:, i], count)
-        for j in range(i, 8):
-            block[:, i, j] = block[:, j, i] = np.bincount(
-                match.segment, weight * jacobian[:, i] * jacobian[:, j], count)
+    block, right = normal_blocks(match.segment, match.share, low, high, match.normal, gradient,
+                                 weight, count)
     ends = np.arange(1, count)
     index = (4 * np.stack([parent[ends], ends], axis=1)[:, :, None] + np.arange(4)).reshape(-1, 8)
     rows = np.repeat(index, 8, axis=1).ravel()

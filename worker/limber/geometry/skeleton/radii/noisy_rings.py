@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle
+
 _PLACES = 48  # on the circle, of which each is weighed
 _SHARP = 150.0  # square of radius over noise from which places are known to within 5 degrees
 _CLEAR = 12.0  # concentration from which a point tells which sides were seen
@@ -99,20 +101,11 @@ def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout:
     # By the radius alone: chosen by their distance too, near points would count otherwise than far.
     blurred = np.flatnonzero(stout < _SHARP)
     side, cross = _sides(axis[blurred], seen.view)
-    angle = np.arctan2(np.einsum("mj,mj->m", out[blurred], cross),
-                       np.einsum("mj,mj->m", out[blurred], side))
-    place = _posterior(angle, sharpness[blurred], seen.share)
-    mean[blurred] = ((place @ np.cos(_ANGLE))[:, None] * side
-                     + (place @ np.sin(_ANGLE))[:, None] * cross)
+    cosine, sine = (np.einsum("mj,mj->m", out[blurred], way) for way in (side, cross))
+    size = np.maximum(np.hypot(cosine, sine), 1e-300)
+    place = mean_on_circle(cosine / size, sine / size, sharpness[blurred], seen.share)
+    mean[blurred] = place[:, :1] * side + place[:, 1:] * cross
     return mean
-
-
-def _posterior(angle: np.ndarray, sharpness: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Weight of each place on the circle for each point, shape [m, places], rows sum to 1."""
-    power = sharpness[:, None] * (np.cos(_ANGLE - angle[:, None]) - 1) + np.log(density)
-    power -= power.max(axis=1, keepdims=True)
-    weight = np.exp(power)
-    return weight / weight.sum(axis=1, keepdims=True)
 
 
 def _sides(axis: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

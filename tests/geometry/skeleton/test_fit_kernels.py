@@ -1,0 +1,53 @@
+"""Loops of the axis fit against the plain formulas."""
+
+import numpy as np
+
+from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle, nearest_of, normal_blocks
+
+
+def test_nearest_cylinder_is_the_one_that_a_search_along_all_finds() -> None:
+    """A point's distance from a tapered tree is the least over finely sampled axes."""
+    rng = np.random.default_rng(3)
+    nodes = np.array([[0, 0, 0], [0, 0, 1], [0, 0, 2], [0.8, 0, 1.5]])
+    parent, radius = np.array([-1, 0, 1, 1]), np.array([0.2, 0.15, 0.1, 0.05])
+    own = np.array([False, False, False, True])
+    points = rng.uniform([-1, -1, -0.5], [1.5, 1, 2.5], (200, 3))
+    near = np.tile([1, 2, 3], (len(points), 1))
+    segment, share, normal, residual, thick = nearest_of(points, near, parent, own, nodes, radius)
+    t = np.linspace(0, 1, 2001)[:, None]
+    least = np.full(len(points), np.inf)
+    for end in (1, 2, 3):
+        axis = (1 - t) * nodes[parent[end]] + t * nodes[end]
+        here = np.full(len(t), radius[end]) if own[end] else (
+            (1 - t) * radius[parent[end]] + t * radius[end])[:, 0]
+        foot = np.linalg.norm(points[:, None] - axis, axis=2).argmin(axis=1)
+        least = np.minimum(least, np.linalg.norm(points - axis[foot], axis=1) - here[foot])
+    np.testing.assert_allclose(residual, least, atol=1e-3)
+    foot = (1 - share)[:, None] * nodes[parent[segment]] + share[:, None] * nodes[segment]
+    np.testing.assert_allclose(foot + (residual + thick)[:, None] * normal, points, atol=1e-12)
+
+
+def test_blocks_are_the_sums_of_outer_products() -> None:
+    rng = np.random.default_rng(4)
+    count = 50
+    segment, share, weight = rng.integers(0, 3, count), rng.uniform(size=count), rng.uniform(
+        size=count)
+    normal, gradient = rng.normal(size=(count, 3)), rng.normal(size=(count, 8))
+    low, high = rng.uniform(size=count), rng.uniform(size=count)
+    block, right = normal_blocks(segment, share, low, high, normal, gradient, weight, 3)
+    row = np.column_stack([-(1 - share)[:, None] * normal, -low, -share[:, None] * normal, -high])
+    for s in range(3):
+        own = segment == s
+        np.testing.assert_allclose(block[s], (row[own] * weight[own, None]).T @ row[own])
+        np.testing.assert_allclose(right[s], weight[own] @ gradient[own])
+
+
+def test_mean_on_a_circle_is_von_mises() -> None:
+    """All places seen alike: the mean points at the point, as long as I1(k) / I0(k)."""
+    from scipy.special import ive
+
+    angle, sharpness = np.array([0.3, 2.0, -2.5]), np.array([0.5, 3.0, 40.0])
+    mean = mean_on_circle(np.cos(angle), np.sin(angle), sharpness, np.ones(48))
+    np.testing.assert_allclose(np.arctan2(mean[:, 1], mean[:, 0]), angle, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(mean, axis=1),
+                               ive(1, sharpness) / ive(0, sharpness), rtol=1e-9)

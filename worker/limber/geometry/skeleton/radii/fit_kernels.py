@@ -1,0 +1,124 @@
+"""Loops of the axis fit over points: which cylinder each is nearest to, and what it asks of it."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_radius: np.ndarray,
+               nodes: np.ndarray, radius: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Find for each point the cylinder to whose surface it is nearest, of some candidates.
+
+    Args:
+        points: Positions [m], shape [m, 3].
+        near: Upper nodes of the candidates, shape [m, k].
+        parent: Lower node of each node's cylinder, shape [n].
+        own_radius: Whether a cylinder has its upper node's radius all along, shape [n].
+        nodes: Positions [m], shape [n, 3].
+        radius: Radii [m], shape [n].
+
+    Returns:
+        The upper node, the share of the way up to it, the unit vector from the axis to the point,
+        shape [m, 3], the distance from the surface [m], positive outside, and the radius [m].
+    """
+    count = len(points)
+    segment, share = np.empty(count, np.int64), np.empty(count)
+    normal = np.empty((count, 3))
+    residual, thick = np.empty(count), np.empty(count)
+    for i in range(count):
+        best, chosen = np.inf, 0.0
+        for k in range(near.shape[1]):
+            end = near[i, k]
+            start = parent[end]
+            ax, ay, az = (nodes[end, 0] - nodes[start, 0], nodes[end, 1] - nodes[start, 1],
+                          nodes[end, 2] - nodes[start, 2])
+            px, py, pz = (points[i, 0] - nodes[start, 0], points[i, 1] - nodes[start, 1],
+                          points[i, 2] - nodes[start, 2])
+            square = max(ax * ax + ay * ay + az * az, 1e-300)
+            t = min(max((px * ax + py * ay + pz * az) / square, 0.0), 1.0)
+            dx, dy, dz = px - t * ax, py - t * ay, pz - t * az
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            here = radius[end] if own_radius[end] else (1 - t) * radius[start] + t * radius[end]
+            if distance - here < best:
+                best, chosen = distance - here, max(distance, 1e-300)
+                segment[i], share[i], thick[i], residual[i] = end, t, here, best
+                normal[i, 0], normal[i, 1], normal[i, 2] = dx / chosen, dy / chosen, dz / chosen
+    return segment, share, normal, residual, thick
+
+
+@njit(cache=True)
+def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high: np.ndarray,
+                  normal: np.ndarray, gradient: np.ndarray, weight: np.ndarray, count: int,
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Sums over each cylinder's points of the normal equations in (x, y, z, r) of both ends.
+
+    Args:
+        segment: Cylinder of each point, shape [m].
+        share: Share of the way up it, shape [m].
+        low: Derivative of the radius there in the lower node's, shape [m].
+        high: In the upper node's, shape [m].
+        normal: Unit vector from the axis to the point, shape [m, 3].
+        gradient: What each asks of both ends, shape [m, 8].
+        weight: How far it counts, shape [m].
+        count: Number of cylinders.
+
+    Returns:
+        Matrices, shape [count, 8, 8], and right sides, shape [count, 8].
+    """
+    block, right = np.zeros((count, 8, 8)), np.zeros((count, 8))
+    row = np.empty(8)
+    for i in range(len(segment)):
+        w, s = weight[i], segment[i]
+        if w == 0.0:
+            continue
+        for k in range(3):
+            row[k] = -(1 - share[i]) * normal[i, k]
+            row[4 + k] = -share[i] * normal[i, k]
+        row[3], row[7] = -low[i], -high[i]
+        for a in range(8):
+            right[s, a] += w * gradient[i, a]
+            for b in range(a, 8):
+                block[s, a, b] += w * row[a] * row[b]
+    for s in range(count):
+        for a in range(8):
+            for b in range(a):
+                block[s, a, b] = block[s, b, a]
+    return block, right
+
+
+@njit(cache=True)
+def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
+                   density: np.ndarray) -> np.ndarray:
+    """Mean of (cos, sin) over places on a circle, each weighted by how likely it is a point's.
+
+    The weight is density times exp(sharpness (cos(place - angle) - 1)), as von Mises has it.
+
+    Args:
+        cosine: Of each point's own angle, shape [m].
+        sine: Of it, shape [m].
+        sharpness: Shape [m].
+        density: Of evenly spaced places around the circle, each in the middle of its part, shape
+            [places].
+
+    Returns:
+        Shape [m, 2].
+    """
+    places = len(density)
+    angle = 2 * np.pi * (np.arange(places) + 0.5) / places
+    across, up, log = np.cos(angle), np.sin(angle), np.log(density)
+    power = np.empty(places)
+    mean = np.empty((len(cosine), 2))
+    for i in range(len(cosine)):
+        most = -np.inf
+        for k in range(places):
+            power[k] = sharpness[i] * (cosine[i] * across[k] + sine[i] * up[k] - 1) + log[k]
+            most = max(most, power[k])
+        total, x, y = 0.0, 0.0, 0.0
+        for k in range(places):
+            weight = np.exp(power[k] - most)
+            total += weight
+            x += weight * across[k]
+            y += weight * up[k]
+        mean[i, 0], mean[i, 1] = x / total, y / total
+    return mean
