@@ -4,17 +4,17 @@ Each trial is a fit of one pull or of three with fresh noise on points and force
 it tells error, interval and whether the truth lies inside.
 """
 
-import hashlib
-import json
 import time
 from collections.abc import Iterator
 from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tests.subjects import paper_branches
 from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
 
+from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.table import Row
 from limber.estimation.settings import EstimateSettings
 from limber.jobs import Pool
@@ -88,16 +88,15 @@ def noise_rows(seeds: int, progress: Progress, kept: Path | None, workers: int =
 def run_trials(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Trial]:
     """All trials, those that ``kept`` has from the same estimator included."""
     source = _source_digest()
-    known = {(t.branch, t.seed, t.pulls): t for t in _read(kept) if t.source == source}
+    known = {(t.branch, t.seed, t.pulls): t for t in read_trials(Trial, kept)
+             if t.source == source}
     wanted = [(branch, seed) for seed in range(seeds) for branch in range(len(BRANCHES))]
     missing = [task for task in wanted
                if any((*task, count) not in known for count in PULL_COUNTS)]
     done = len(wanted) - len(missing)
     for trial in _computed(missing, workers):
         known[trial.branch, trial.seed, trial.pulls] = trial
-        if kept is not None:
-            with open(kept, "a", encoding="utf-8") as stream:
-                stream.write(json.dumps(asdict(trial)) + "\n")
+        keep(trial, kept)
         if trial.pulls == PULL_COUNTS[-1]:
             done += 1
             progress(done / len(wanted), "noise over seeds")
@@ -144,26 +143,4 @@ def _exact_pulls(number: int) -> list:
 
 
 def _source_digest() -> str:
-    """What an estimate depends on: the estimator's own files and this campaign's."""
-    from tests.subjects import paper_branches
-
-    import limber.estimation
-
-    files = [*sorted(Path(limber.estimation.__file__).parent.rglob("*.py")),
-             Path(paper_branches.__file__)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
-
-
-def _read(kept: Path | None) -> list[Trial]:
-    if kept is None or not kept.is_file():
-        return []
-    trials = []
-    for line in kept.read_text(encoding="utf-8").splitlines():
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError:
-            # The line that was being written when the run was stopped.
-            continue
-        trials.append(Trial(**{key: tuple(value) if isinstance(value, list) else value
-                               for key, value in record.items()}))
-    return trials
+    return source_digest(("estimation",), paper_branches.__file__)

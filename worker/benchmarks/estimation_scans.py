@@ -4,17 +4,17 @@ Each trial is what a user does, from start to end: a branch is generated and sca
 reconstructed, the true branch pulled, and the moduli estimated on the reconstructed mesh.
 """
 
-import hashlib
 import json
 import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.table import Row
 from limber.errors import LimberError
 from limber.estimation.settings import EstimateSettings
@@ -113,15 +113,13 @@ def size_row(trials: list[Trial]) -> Row:
 def run_trials(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Trial]:
     """All trials, those that ``kept`` has from the same sources included."""
     source = _source_digest()
-    known = {(trial.seed, trial.view): trial for trial in read_trials(kept)
+    known = {(trial.seed, trial.view): trial for trial in read_trials(Trial, kept)
              if trial.source == source}
     wanted = [(FIRST_SEED + number, view) for number in range(seeds) for view in VIEWS]
     done = sum(task in known for task in wanted)
     for trial in _computed([task for task in wanted if task not in known], workers):
         known[trial.seed, trial.view] = trial
-        if kept is not None:
-            with open(kept, "a", encoding="utf-8") as stream:
-                stream.write(json.dumps(asdict(trial)) + "\n")
+        keep(trial, kept)
         done += 1
         progress(done / len(wanted), "from scans to moduli")
     return [known[task] for task in wanted]
@@ -164,22 +162,6 @@ def from_scan(folder: Path, seed: int, view: str) -> dict:
     return json.loads(Branch.open(branch).path("estimate.json").read_text(encoding="utf-8"))
 
 
-def read_trials(kept: Path | None) -> list[Trial]:
-    """Read the trials of a file; a line that was cut off is left out."""
-    if kept is None or not kept.is_file():
-        return []
-    trials = []
-    for line in kept.read_text(encoding="utf-8").splitlines():
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError:
-            # The line that was being written when the run was stopped.
-            continue
-        trials.append(Trial(**{key: tuple(value) if isinstance(value, list) else value
-                               for key, value in record.items()}))
-    return trials
-
-
 def _computed(tasks: list[tuple[int, str]], workers: int) -> Iterator[Trial]:
     if workers < 2:
         yield from map(trial_of, tasks)
@@ -194,11 +176,4 @@ def _told(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _source_digest() -> str:
-    """What a trial depends on: geometry, mechanics, the estimator and this campaign."""
-    import limber
-
-    here = Path(limber.__file__).parent
-    files = [file for name in ("geometry", "mechanics", "estimation")
-             for file in sorted((here / name).rglob("*.py"))]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in [*files, Path(__file__)])
-                          ).hexdigest()[:16]
+    return source_digest(("geometry", "mechanics", "estimation"), __file__)
