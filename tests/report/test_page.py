@@ -1,5 +1,7 @@
 """The report on folders that are not finished, and its refusals; a finished one: test_pipeline."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,13 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.skeleton.files import write_cylinders
 from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
 from limber.geometry.tets.cylinder_mesh import straight_beam
-from limber.report.tables import comparison_rows, deviation_rows, held_out_rows, modulus_rows
+from limber.report.tables import (
+    cause_rows,
+    comparison_rows,
+    deviation_rows,
+    held_out_rows,
+    modulus_rows,
+)
 from limber.stages.report import write_report
 from limber.store import Branch
 
@@ -77,6 +85,29 @@ def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():
         ["a", "1.20", "2.1 %", "0.034", "4.0 %", "the other pulls"],
         ["b", "3.00", "10.0 %", "-", "-", "this estimate"]]
     assert held_out_rows({"held_out": {}}) == []
+
+
+def test_what_holds_an_estimate_back_is_read_first(meshed: Branch):
+    """Causes with what would shrink each open the page; without an estimate nothing does."""
+    estimate = {"causes": [
+        {"cause": "gripper frame", "share": 0.6, "deviation": 0.12, "advice": "calibrate it"},
+        {"cause": "force gain", "share": 0.3, "deviation": 0.08, "advice": "hang a known weight"}]}
+    assert cause_rows(estimate)[1:] == [
+        ["gripper frame", "60 %", "up to 12.0 %", "calibrate it"],
+        ["force gain", "30 %", "up to 8.0 %", "hang a known weight"]]
+    assert cause_rows({"causes": []}) == [] == cause_rows({})
+    full = estimate | {
+        "young_pa": [1e9], "young_interval_pa": [[8e8, 1.2e9]], "fractions": [0.5],
+        "young_deviation": {"sensor": [0.14], "geometry": None, "mesh": None, "total": [0.14]},
+        "method": "gauss-newton", "forward_count": 1, "loss_m2": 1e-6, "converged": True,
+        "warnings": [], "history": [], "pulls": [], "groups": [0], "parameters": ["E1"],
+        "covariance": [[0.02]], "deviations_before_fit": [0.2]}
+    with meshed.stage("estimate") as stage:
+        stage.path("estimate.json").write_text(json.dumps(full), encoding="utf-8")
+    result = write_report(meshed.folder)
+    assert result["sections"][:2] == ["What holds the estimate back", "Summary"]
+    html = (meshed.folder / "report.html").read_text(encoding="utf-8")
+    assert html.index("calibrate it") < html.index("Summary</h2>") and "14.0 %" in html
 
 
 def test_named_targets_stand_in_figure_and_table(tmp_path):

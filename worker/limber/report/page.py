@@ -21,6 +21,7 @@ from limber.progress import SILENT, Progress
 from limber.report import figures
 from limber.report.tables import (
     caliper_rows,
+    cause_rows,
     comparison_rows,
     deviation_rows,
     diameter_rows,
@@ -77,7 +78,7 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
         MissingDependencyError: what the extra ``report`` brings is not installed.
     """
     require_extra("report", ("matplotlib", "jinja2"), "The report")
-    page = [_summary(branch, picture)]
+    page = [*_held_back(branch), _summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
         _scan, partial(_cylinders, calipers=calipers), _mesh, *_pulls(branch), _estimate,
         *_simulations(branch), _energy, *_plans(branch), _provenance]
@@ -85,6 +86,21 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
         progress(number / len(builders), "drawing")
         page.append(build(branch))
     return _render(branch, page), page
+
+
+def _held_back(branch: Branch) -> list[Section]:
+    """What makes the estimate unsure, and what would help: before anything else is read."""
+    if not branch.has("estimate.json"):
+        return []
+    estimate = json.loads(branch.path("estimate.json").read_text(encoding="utf-8"))
+    rows = cause_rows(estimate)
+    if not rows:
+        return []
+    total = max((estimate.get("young_deviation") or {}).get("total") or [float("nan")])
+    return [Section("What holds the estimate back", text=[
+        f"Young's modulus is known to a standard deviation of {100 * total:.1f} % where it is "
+        "known least. Most of that comes from the following, largest first."],
+        tables=[("", rows)])]
 
 
 def _summary(branch: Branch, picture: Path | None) -> Section:

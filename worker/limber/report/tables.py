@@ -60,6 +60,22 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
+def cause_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
+    """Return what makes the moduli unsure, largest first, and what would shrink each.
+
+    Args:
+        estimate: ``causes``, each with ``cause``, ``share``, ``deviation`` and ``advice``
+            (:func:`limber.estimation.doubt.causes.largest`).
+    """
+    causes = estimate.get("causes") or []
+    if not causes:
+        return []
+    rows = [["cause", "part of the variance", "deviation of E by it", "what would shrink it"]]
+    return rows + [[each["cause"], f"{100 * each['share']:.0f} %",
+                    f"up to {100 * min(each['deviation'], 99.0):.1f} %", each["advice"]]
+                   for each in causes]
+
+
 def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     """Return how well each pull is foretold by a fit that did not see it.
 

@@ -221,9 +221,11 @@ def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptio
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
-    from limber.report.tables import held_out_rows, modulus_rows
+    from limber.report.tables import cause_rows, held_out_rows, modulus_rows
 
     tables = [("Young's modulus", modulus_rows(result, None))]
+    if causes := cause_rows(result):
+        tables.append(("What makes it unsure, largest first", causes))
     if held_out := held_out_rows(result):
         tables.append(("Pulls foretold by a fit that did not see them: RMS errors", held_out))
     return tables
