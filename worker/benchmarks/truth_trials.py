@@ -21,9 +21,11 @@ from benchmarks.truth_branch import (
     exact_pull,
     recorded,
 )
+from limber.errors import LimberError
 from limber.estimation.doubt.causes import variance_parts
+from limber.estimation.doubt.model_error import total_interval
 from limber.estimation.field_form import open_field
-from limber.estimation.fit import fit_pulls
+from limber.estimation.fit import Estimate, fit_pulls, judge_model, require_result
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject, forwards_of, parameter_space
@@ -52,6 +54,7 @@ class Trial:
         converged: Of the optimiser.
         seconds: Of the fit.
         message: Why there is no result; empty: there is one.
+        source: Digest of the sources; another one's trials are not taken over.
     """
 
     seed: tuple[int, ...]
@@ -64,10 +67,11 @@ class Trial:
     converged: bool = False
     seconds: float = 0.0
     message: str = ""
+    source: str = ""
 
 
 def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
-          settings: EstimateSettings = SETTINGS) -> Trial:
+          settings: EstimateSettings = SETTINGS, source: str = "") -> Trial:
     """Draw a branch and a cell, pull, fit, and compare with the truth."""
     rng = np.random.default_rng(seed)
     truth = drawn_truth(rng)
@@ -77,23 +81,35 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
              for number in range(pull_count)]
     started = time.perf_counter()
     subject = fitting_subject(truth)
-    objective = _objective(pulls, subject, settings)
-    found = fit_pulls(objective, subject.start, settings)
+    try:
+        found = _estimated(pulls, subject, settings)
+    except LimberError as error:
+        return Trial(seed, truth.form, seconds=time.perf_counter() - started, message=str(error),
+                     source=source)
     seconds = time.perf_counter() - started
     log_truth = np.log(truth.young)
-    low, high = np.log(found.uncertainty.young_interval).T
+    low, high = np.log(total_interval(found.values.young, found.uncertainty.young_interval,
+                                      found.model_error)).T
     return Trial(
-        seed, truth.form, tuple((found.values.young / truth.young - 1).tolist()),
+        seed, truth.form, tuple((found.young / truth.young - 1).tolist()),
         tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
         tuple(((high - low) / 2).tolist()),
         tuple((1.96 * bound(truth, found.objective)).tolist()),
-        found.uncertainty.variance_factor, found.fit.converged, seconds)
+        found.uncertainty.variance_factor, found.fit.converged, seconds, source=source)
+
+
+def _estimated(pulls: list[Pull], subject: Subject, settings: EstimateSettings) -> Estimate:
+    """What `limber estimate` finds, its mesh's stiffness corrected, or its refusal."""
+    found = fit_pulls(_objective(pulls, subject, settings), subject.start, settings)
+    require_result(found)
+    judge_model(found, subject, pulls[0].entry.grasp, settings, axes=None, cloud=None)
+    return found
 
 
 def fitting_subject(truth: Truth) -> Subject:
     """The branch as a user has it: a coarser mesh, a book's density and Poisson's ratio."""
     branch = truth.branch
-    return _subject(branch.mesh(slice_length=2.1, sides=8), truth, POISSON, DENSITY)
+    return _subject(branch.mesh(slice_length=3.0, sides=8), truth, POISSON, DENSITY)
 
 
 def bound(truth: Truth, objective: Objective) -> np.ndarray:

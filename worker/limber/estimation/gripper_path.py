@@ -225,7 +225,8 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
     probe = 1e-6
     while (found := pulled(probe, None))[0] < 1e-4 * travel and probe < 1e6:
         probe *= 10
-    size = probe * min(travel / max(found[0], 1e-12), 50.0)
+    ratio = travel / max(found[0], 1e-12)
+    size = probe * min(ratio, max(50.0, 0.1 * ratio))
     low, high = 0.0, np.inf
     result = None
     for _ in range(14):
@@ -237,7 +238,8 @@ def force_for_travel(model: BranchModel, grasp: Grasp, direction: np.ndarray, tr
         else:
             high = size
         if np.isinf(high):
-            size *= min(max(travel / distance, 1.2), 3.0)
+            # Up to a tenth of the way the branch answers as it began, farther out it stiffens.
+            size *= min(max(travel / distance, 1.2), max(3.0, 0.1 * travel / distance))
         elif np.isfinite(distance):
             size = np.clip(size * travel / distance, low + 0.1 * (high - low),
                            high - 0.1 * (high - low))

@@ -13,6 +13,8 @@ from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 PARTS = (0.25, 0.45, 0.7)
 """Of a fast pull's frames, how many are fitted before all of them are: over a quarter a branch
 cannot be a whole swing off. The parts between are chosen, not measured."""
+ROUGH_KEYS = 5
+"""Simulated frames of a first fit by force alone: chosen, it only has to lead near."""
 FEWEST_FRAMES = 6
 """Fewer frames say nothing of a motion."""
 
@@ -39,17 +41,22 @@ def led_start(objective: Objective, values: Values) -> Values:
         return values
     space = objective.space
     likely = space.linked(tuple((k, k - 1) for k in range(1, space.group_count)))
-    for forward in watched:
+    counts = [forward.key_count for forward in watched]
+    for forward, count in zip(watched, counts, strict=True):
         forward.is_watching = False
+        forward.set_key_count(min(ROUGH_KEYS, count))
     try:
         rough = objective.with_forwards(objective.forwards).with_space(likely)
         fit = gauss_newton(rough, likely.pack(values), evaluation_limit=12, tolerance=3e-2,
                            force_rounds=1)
+        for forward in watched:
+            forward.keep()
     except WorkError:
         return values
     finally:
-        for forward in watched:
+        for forward, count in zip(watched, counts, strict=True):
             forward.is_watching = True
+            forward.set_key_count(count)
     objective.forward_count = rough.forward_count
     return likely.unpack(fit.evaluation.free)
 
