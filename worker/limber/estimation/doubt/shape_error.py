@@ -17,7 +17,6 @@ from limber.estimation.preparation import Subject
 from limber.geometry.likely_shapes import likely_skeletons, reshaped
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
-from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
 
 KEY_FRAMES = 4
@@ -36,7 +35,7 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     the shapes, times Student's quantile over the normal one since they are few.
 
     Args:
-        evaluation: At the fit's end, with its Jacobian.
+        evaluation: At the fit's end.
         objective: What was minimised.
         subject: The branch that was fitted.
         points: Its scan [m], shape [m, 3].
@@ -50,7 +49,8 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     """
     if count < FEWEST or any(f.entry.motion == "dynamic" for f in objective.forwards):
         return None
-    base = _pulled(evaluation, objective, subject, subject.mesh, None)
+    # With its own derivatives: of these few key frames, as the changes are.
+    base = _pulled(evaluation, objective, subject, subject.mesh, None, jacobian=True)
     if base is None:
         return None
     expected, hints = base
@@ -62,41 +62,44 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
         found = None if mesh.volumes.min() <= 0 else _pulled(
             evaluation, objective, subject, mesh, hints)
         if found is not None:
-            changes.append(found[0] - expected)
+            changes.append(found[0].residual - expected.residual)
     if len(changes) < FEWEST:
         return None
-    steps = np.linalg.lstsq(evaluation.jacobian, np.array(changes).T, rcond=1e-9)[0]
+    steps = np.linalg.lstsq(expected.jacobian, np.array(changes).T, rcond=1e-9)[0]
     groups = list(objective.space.groups)
     spread = np.sqrt(np.mean(steps[groups]**2, axis=1))
     return np.minimum(spread * stats.t.ppf(0.975, len(changes)) / stats.norm.ppf(0.975), 35.0)
 
 
 def _pulled(evaluation: Evaluation, objective: Objective, subject: Subject, mesh: TetMesh,
-            hints: list[list[np.ndarray]] | None,
-            ) -> tuple[np.ndarray, list[list[np.ndarray]]] | None:
-    """Residuals of all pulls on a mesh, and the states of their key frames; None: no equilibrium.
-    """
+            hints: list[list[np.ndarray]] | None, *, jacobian: bool = False,
+            ) -> tuple[Evaluation, list[list[np.ndarray]]] | None:
+    """All pulls on a mesh, and the states of their key frames; None: no equilibrium."""
     start = subject.model
     model = BranchModel(mesh, young=start.young, poisson=start.poisson, density=start.density,
                         gravity=start.gravity, point_masses=start.point_masses)
     model = model if start.hanging is None else model.as_scanned()
-    weights = young_weights(mesh, subject.control_points)
-    forwards = [_forward(forward, model, weights) for forward in objective.forwards]
+    forwards = [_forward(forward, model) for forward in objective.forwards]
     for forward, hint in zip(forwards, hints or [], strict=False):
         forward.hint(hint)
     alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
-    # Forces with errors of their own are eliminated from residuals by their derivatives.
-    linearised = any(forward.has_force_unknowns for forward in forwards)
+    # Forces with errors of their own are eliminated from residuals by their derivatives, which a
+    # watched path brings by itself.
+    linearised = any(forward.has_force_unknowns and not forward.watches_pose
+                     for forward in forwards)
     try:
-        found = alone.evaluate(evaluation.free, jacobian=linearised)
+        found = alone.evaluate(evaluation.free, jacobian=jacobian or linearised)
     except WorkError:
         return None
     if found is None:
         return None
-    return found.residual, [forward.displacements() for forward in forwards]
+    return found, [forward.displacements() for forward in forwards]
 
 
-def _forward(forward: Forward, model: BranchModel, weights: np.ndarray) -> QuasiStaticForward:
-    forward = forward.full
-    return QuasiStaticForward(forward.name, model, weights, forward.entry, forward.frames,
-                              forward.rest_points, key_count=KEY_FRAMES)
+def _forward(forward: Forward, model: BranchModel) -> QuasiStaticForward:
+    """The same pull of another shape; its material stays what it is in each tetrahedron."""
+    fitted = forward.full
+    made = type(fitted)(fitted.name, model, fitted.weights, fitted.entry, fitted.frames,
+                        fitted.rest_points, key_count=KEY_FRAMES, field=fitted.field)
+    made.begin_at(fitted)
+    return made

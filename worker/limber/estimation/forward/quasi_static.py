@@ -80,11 +80,14 @@ class QuasiStaticForward(Forward):
         self.grasp = grasp_on(model.mesh, entry.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
         self._zero = np.zeros(6)
+        self.spread = np.empty((len(frames), 0))
+        self._memory: list[_Memory | None] = []
         self.set_key_count(key_count)
 
     def set_key_count(self, count: int) -> None:
         """Simulate at most ``count`` frames from now on; more where the force asks for it."""
-        frames = self.frames
+        frames, earlier = self.frames, self.spread
+        states = [memory.displacement for memory in self._memory if memory is not None]
         self._course: Course | None = None
         self.response = None
         if self.drive == "pose":
@@ -98,9 +101,11 @@ class QuasiStaticForward(Forward):
             self._measured = self._course.values
             self._drives = list(self._measured)
             self._loads = [self._loads_at(key) for key in self.keys]
-        self._memory: list[_Memory | None] = [None] * len(self.keys)
+        self._memory = [None] * len(self.keys)
         self._values: Values | None = None
-        self._hints: list[np.ndarray] | None = None
+        # Between the states that are known lie those that are wanted.
+        self._hints: list[np.ndarray] | None = list(np.tensordot(
+            earlier[self.keys], states, axes=1)) if states else None
 
     def refine(self) -> None:
         self.set_key_count(2 * self.key_count)
@@ -221,6 +226,15 @@ class QuasiStaticForward(Forward):
         sensor = self.entry.sensor
         each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
         return np.array(each, float) / np.sqrt(np.maximum(self.frames.wrench_counts, 1))[:, None]
+
+    def begin_at(self, other: "QuasiStaticForward") -> None:
+        """Start from states and force that another simulation of the same pull, on as many nodes,
+        has found."""
+        if self.has_force_unknowns:
+            self._drives = list((other.spread @ np.array(other._drives))[self.keys])
+        states = other.displacements()
+        if len(states) == other.key_count:
+            self.hint(list(np.tensordot(other.spread[self.keys], states, axes=1)))
 
     def hint(self, displacements: list[np.ndarray]) -> None:
         """Start the next simulation from these displacements [m] of the key frames."""

@@ -47,6 +47,7 @@ class WatchedForward(QuasiStaticForward):
         return self.is_watching
 
     def set_key_count(self, count: int) -> None:
+        """As of the base class; a force that was kept is kept on the new key frames."""
         known = None if self._good is None else self.spread @ np.array(self._good[0])
         super().set_key_count(count)
         self._good = None
@@ -68,6 +69,12 @@ class WatchedForward(QuasiStaticForward):
             self.response = None
         self._drives_for = values
         return super().simulate(values, extra, sensitivities)
+
+    def begin_at(self, other: QuasiStaticForward) -> None:
+        """As of the base class, and for the values that the force was found for."""
+        super().begin_at(other)
+        if isinstance(other, WatchedForward):
+            self._drives_for = other._drives_for
 
     def keep(self) -> None:
         """Remember force and states; :meth:`step_back` returns to them."""
