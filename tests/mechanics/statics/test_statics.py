@@ -328,6 +328,39 @@ def test_symmetric_column_says_that_its_side_is_chance(column):
     assert result.snapped_at and any("buckled" in warning for warning in result.warnings)
 
 
+def test_a_saddle_is_not_passed_off_as_an_equilibrium(column):
+    """Started straight under more than Euler's load, where all forces balance: it does not stay."""
+    mesh, top = column
+    model = BranchModel(mesh, young=YOUNG, poisson=0.0, density=900, gravity=None)
+    euler = np.pi**2 * YOUNG * 0.012**4 / 12 / 4 / 0.6**2
+    load = np.zeros_like(mesh.nodes)
+    grasp = Grasp.of_nodes(mesh, top, "pinned")
+    load[top, 2] = -1.3 * euler * grasp.weights
+    straight = np.zeros_like(mesh.nodes)
+    straight[:, 2] = -1.3 * euler / (YOUNG * 0.012**2) * mesh.nodes[:, 2]
+    result = solve_static(model, nodal_forces=load, start=straight)
+    assert not result.converged or np.abs(result.displacement[:, :2]).max() > 0.1
+
+
+def test_a_bow_that_turned_over_is_said_to_have_another_state(column):
+    """A bow pushed through by a force stays so when let go; a column that buckled comes back."""
+    mesh, top = column
+    model = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    end = Grasp.of_nodes(mesh, top, "clamped")
+    pressed = end.rest_pose - [0, 0, 0.012, 0, 0, 0]
+    middle = np.abs(mesh.nodes[:, 2] - 0.3) < 0.02
+    push = np.where(middle[:, None], [1.0 / middle.sum(), 0.0, 0.0], 0.0)
+    aside = solve_static(model, grasp=end, pose=pressed, nodal_forces=0.3 * push).require()
+    bow = solve_static(model, grasp=end, pose=pressed, start=aside).require()
+    assert bow.displacement[middle, 0].mean() > 0.02 and not bow.doubt
+    over = solve_static(model, grasp=end, pose=pressed, nodal_forces=-2 * push,
+                        start=bow).require()
+    assert over.displacement[middle, 0].mean() < -0.02
+    assert "another stable state" in over.doubt and over.doubt[1:] in "".join(over.warnings)
+    buckled = solve_static(model, grasp=end, pose=end.rest_pose - [0, 0, 0.01, 0, 0, 0])
+    assert buckled.snapped_at and not buckled.doubt
+
+
 def test_dead_load_beyond_buckling(column):
     """1.1 times Euler's load bends a cantilever sideways as the elastica of that load does."""
     mesh, top = column

@@ -59,6 +59,8 @@ class StaticResult:
             snapped to another one.
         message: What happened, where.
         warnings: What a user should know.
+        doubt: Why it may not be the only stable state of its hold, empty where nothing speaks for
+            that; found by walking the way back where the branch snapped.
     """
 
     status: Status
@@ -78,6 +80,7 @@ class StaticResult:
     message: str = ""
     warnings: list[str] = field(default_factory=list)
     snapped_at: list[float] = field(default_factory=list)
+    doubt: str = ""
 
     @property
     def converged(self) -> bool:

@@ -17,6 +17,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.path import Path
 from limber.mechanics.statics.problem import StaticProblem, Target
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
+from limber.mechanics.statics.way_back import doubt_of
 from limber.mechanics.status import Status
 from limber.progress import SILENT, Progress
 
@@ -43,7 +44,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
     problem = StaticProblem(model, grasp, pose is not None, settings)
     goal = problem.target(pose, grasp_force, nodal_forces)
     begin = problem.displacement_of(start)
-    result = Path(problem, begin, goal, pose).run(progress)
+    result = _walked(Path(problem, begin, goal, pose), progress)
     if settings.verify and result.converged and start is not None:
         return _verified(problem, result, goal, pose, progress)
     return result
@@ -64,7 +65,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
     for number, pose in enumerate(poses):
         progress(number / len(poses), "following poses", pose=number)
         goal = problem.target(pose, None, nodal_forces)
-        result = Path(problem, displacement, goal, pose).run(SILENT)
+        result = _walked(Path(problem, displacement, goal, pose), SILENT)
         if settings.verify and result.converged:
             result = _verified(problem, result, goal, pose, SILENT)
         if result.converged:
@@ -87,7 +88,20 @@ def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
     goal = problem.target(None, None, nodal_forces)
     held = np.where(model.fixed[:, None], displacement, 0.0)
     begin = np.zeros_like(held)
-    return Path(problem, begin, replace(goal, held=held), None).run(SILENT)
+    return _walked(Path(problem, begin, replace(goal, held=held), None), SILENT)
+
+
+def _walked(path: Path, progress: Progress) -> StaticResult:
+    """Return where a way leads, with what is doubtful about it."""
+    result = path.run(progress)
+    doubt = doubt_of(path, result) if result.converged else ""
+    if not doubt:
+        return result
+    return replace(result, doubt=doubt, warnings=[*result.warnings, f"{_capital(doubt)}."])
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _verified(problem: StaticProblem, result: StaticResult, goal: Target, pose: np.ndarray | None,
