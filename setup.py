@@ -18,7 +18,8 @@ class BuildWithAddon(build_py):
         super().run()
         if self.editable_mode:
             return
-        sources = sorted(p for p in (ROOT / "addon").rglob("*") if p.suffix in (".py", ".toml"))
+        kinds = (".py", ".toml", ".json")
+        sources = sorted(p for p in (ROOT / "addon").rglob("*") if p.suffix in kinds)
         if not sources:
             raise FileNotFoundError("The folder addon/ is not beside setup.py; the wheel needs it.")
         for source in sources:

@@ -8,6 +8,9 @@ import bpy
 IS_MODULE = bool(getattr(bpy.app, "module", False))
 """Whether this is the ``bpy`` package in a plain Python, not Blender's program."""
 
+PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (5, 0, 0) else set()
+"""Options of a property that holds a path: it may begin with ``//``, and Blender keeps it right."""
+
 
 def can_denoise() -> bool:
     """Whether Cycles has OpenImageDenoise; Debian's build has not, and renders nothing with it."""

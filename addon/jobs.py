@@ -111,8 +111,10 @@ class Job:
                 self._process.wait(5.0)
 
     def _read(self, name: str, stream) -> None:
-        for line in stream:
-            self._lines.put((name, line.rstrip("\n")))
+        # Closed at its end, whoever else has had it open.
+        with stream:
+            for line in stream:
+                self._lines.put((name, line.rstrip("\n")))
 
     def _take_lines(self) -> None:
         while not self._lines.empty():

@@ -1,10 +1,16 @@
 """The add-on's preferences: which Python has the worker."""
 
 import sys
+import time
 
 import bpy
 
 from . import compat, worker
+
+KEY = __package__
+"""The add-on's name among Blender's."""
+_LOOK_AGAIN_SECONDS = 5.0
+_looked: dict[str, float | bool] = {}
 
 
 class LimberPreferences(bpy.types.AddonPreferences):
@@ -13,7 +19,7 @@ class LimberPreferences(bpy.types.AddonPreferences):
     bl_idname = __package__
 
     python_path: bpy.props.StringProperty(
-        name="Python with Limber", subtype="FILE_PATH",
+        name="Python with Limber", subtype="FILE_PATH", options=compat.PATH_OPTIONS,
         description="The Python in which Limber's worker is installed, for example "
                     ".venv/bin/python of a checkout. Empty: LIMBER_PYTHON, then `limber` "
                     "on the PATH")
@@ -43,7 +49,20 @@ def worker_command() -> list[str]:
     return worker.worker_command(chosen.python_path if chosen else "", fallback)
 
 
+def has_worker() -> bool:
+    """Whether there is a worker, looked up every few seconds only: panels ask at every redraw."""
+    now = time.monotonic()
+    if now - _looked.get("at", -_LOOK_AGAIN_SECONDS) >= _LOOK_AGAIN_SECONDS:
+        _looked["at"] = now
+        try:
+            _looked["found"] = bool(worker_command())
+        except worker.WorkerNotFound:
+            _looked["found"] = False
+    return bool(_looked["found"])
+
+
 def register() -> None:
+    _looked.clear()
     bpy.utils.register_class(LimberPreferences)
 
 

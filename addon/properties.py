@@ -1,28 +1,195 @@
-"""What the user chooses in the sidebar, kept in the scene."""
+"""What the user chooses in the sidebar, kept in the scene: made from the stages' schema."""
+
+import json
+from typing import Any
 
 import bpy
+import numpy as np
+
+from . import compat
+from .stages import Field, Stage, stages
+
+OPEN = "use_"
+"""Before the name of a field that may be left open: whether it is given."""
+_LARGEST_INTEGER = 2**31 - 1
+
+_registered: list[type] = []
 
 
 class LimberSettings(bpy.types.PropertyGroup):
-    """Choices of one scene."""
+    """Choices of one scene; the settings of each stage stand below its name."""
 
-    cloud_path: bpy.props.StringProperty(
-        name="Scan", subtype="FILE_PATH", description="Point cloud of one branch")
-    cloud_unit: bpy.props.EnumProperty(
-        name="Unit", description="Unit of the scan's coordinates", default="m",
-        items=[("m", "Metres", ""), ("cm", "Centimetres", ""), ("mm", "Millimetres", "")])
     branch_folder: bpy.props.StringProperty(
-        name="Branch folder", subtype="DIR_PATH",
+        name="Branch folder", subtype="DIR_PATH", options=compat.PATH_OPTIONS,
         description="NAME.branch: where the worker keeps everything about one branch")
-    plan: bpy.props.StringProperty(
-        name="Plan", description="Name of the path to show; empty: the newest")
+    show_expert: bpy.props.BoolProperty(
+        name="Expert settings", description="Show also the settings that few need")
+
+
+def attribute_name(stage: str) -> str:
+    """Return the name of a stage as Python has it."""
+    return stage.replace("-", "_")
+
+
+def group_of(scene: bpy.types.Scene, stage: Stage) -> bpy.types.PropertyGroup:
+    """Return the settings of a stage in ``scene``."""
+    return getattr(scene.limber, attribute_name(stage.name))
+
+
+def values_of(group: Any, stage: Stage, only: set[str] | None = None) -> dict[str, Any]:
+    """Return what is set for a stage, by field: None where it is left open.
+
+    Args:
+        group: Whatever has the properties of :func:`stage_properties`.
+        stage: Whose they are.
+        only: Names of the fields to return; all by default.
+    """
+    found: dict[str, Any] = {}
+    for name, field in stage.fields.items():
+        if only is not None and name not in only:
+            continue
+        if field.is_optional and has_switch(field) and not getattr(group, OPEN + name):
+            found[name] = None
+            continue
+        value = getattr(group, name)
+        if field.kind == "path" and value:
+            value = bpy.path.abspath(value)
+        found[name] = tuple(value) if field.kind == "vector" else value
+    return found
+
+
+def take_over(group: bpy.types.PropertyGroup, stage: Stage, settings: dict[str, Any]) -> None:
+    """Set the settings of a stage to those with which a branch was made."""
+    for name in stage.settings & settings.keys():
+        field, value = stage.fields[name], settings[name]
+        if field.is_optional and has_switch(field):
+            setattr(group, OPEN + name, value is not None)
+        if value is None:
+            group.property_unset(name)
+            continue
+        try:
+            setattr(group, name, field.shown(value))
+        except (TypeError, ValueError):
+            # The branch is of a version that knew other choices: the default stays.
+            group.property_unset(name)
+
+
+def differs(group: Any, stage: Stage, settings: dict[str, Any]) -> bool:
+    """Whether the stage would now run with other settings than ``settings``, as JSON has them."""
+    now = values_of(group, stage)
+    for name in stage.settings & settings.keys():
+        value, before = now[name], settings[name]
+        if value is None or before is None:
+            if value != before and (value or before):
+                return True
+        elif stage.fields[name].kind in ("number", "vector"):
+            if not np.array_equal(np.asarray(value, np.float32), np.asarray(before, np.float32)):
+                return True
+        elif value != stage.fields[name].shown(before):
+            return True
+    return False
+
+
+def has_switch(field: Field) -> bool:
+    """Whether a property of its own says if the field is given; an empty text says so itself."""
+    return field.kind not in ("string", "path")
+
+
+def stage_properties(stage: Stage, options: set[str] = frozenset()) -> dict[str, Any]:
+    """Return the properties of a stage's fields, by name, with these options of properties."""
+    found: dict[str, Any] = {}
+    for name, field in stage.fields.items():
+        found[name] = _property(field, set(options))
+        if field.is_optional and has_switch(field):
+            found[OPEN + name] = bpy.props.BoolProperty(
+                name=field.title, description=f"{field.description} Off: left to the worker",
+                options=set(options))
+    return found
+
+
+def _property(field: Field, options: set[str]) -> Any:
+    if field.kind == "path":
+        options |= compat.PATH_OPTIONS
+    about: dict[str, Any] = {"name": field.label, "description": field.description,
+                             "options": options}
+    if field.kind == "boolean":
+        return bpy.props.BoolProperty(default=bool(field.default), **about)
+    if field.kind == "choice":
+        items = [(choice, choice.replace("_", " ").capitalize() if len(choice) > 2 else choice, "")
+                 for choice in field.choices]
+        return bpy.props.EnumProperty(items=items, default=field.default or items[0][0], **about)
+    if field.kind == "integer":
+        least = -_LARGEST_INTEGER if field.least is None else int(field.least) + field.is_open
+        most = _LARGEST_INTEGER if field.most is None else int(field.most)
+        return bpy.props.IntProperty(default=field.default or max(least, 0), min=least, max=most,
+                                     **about)
+    if field.kind == "number":
+        limits = _limits(field)
+        default = max(limits.get("min", 0.0), 0.0) if field.default is None else field.default
+        return bpy.props.FloatProperty(default=default, precision=_digits(field), **limits,
+                                       **about)
+    if field.kind == "vector":
+        return bpy.props.FloatVectorProperty(
+            size=field.length, default=field.default or (0.0,) * field.length, precision=4,
+            **about)
+    subtype = "FILE_PATH" if field.kind == "path" else "NONE"
+    default = "" if field.default is None else field.shown(field.default)
+    return bpy.props.StringProperty(default=default, subtype=subtype, **about)
+
+
+def _limits(field: Field) -> dict[str, float]:
+    limits = {}
+    if field.least is not None:
+        least = np.float32(field.least)
+        # The number above it: what is more than 0 may be as small as one likes.
+        limits["min"] = float(np.nextafter(least, np.float32(np.inf)) if field.is_open else least)
+    if field.most is not None:
+        limits["max"] = float(np.float32(field.most))
+    return limits
+
+
+def _digits(field: Field) -> int:
+    if field.unit in ("Pa", "MB") or (field.default or 0.0) >= 1000.0:
+        return 0
+    return 6 if field.unit == "m" or 0.0 < (field.default or 1.0) < 0.01 else 3
+
+
+def outcome_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> dict[str, Any]:
+    """Return how the stage last ended for the branch in ``folder``: error, warnings, status."""
+    try:
+        outcome = json.loads(group_of(scene, stage).outcome or "{}")
+    except ValueError:
+        return {}
+    return outcome if outcome.get("folder") == folder else {}
+
+
+def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dict[str, Any],
+                 ) -> None:
+    """Keep what the user shall still read when the message is gone."""
+    kept = {name: outcome[name] for name in ("status", "error", "warnings", "seconds")
+            if name in outcome}
+    group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})
+
+
+def _class(name: str, base: type, annotations: dict[str, Any]) -> type:
+    return type(name, (base,), {"__annotations__": annotations, "__module__": __name__})
 
 
 def register() -> None:
+    for stage in stages().values():
+        own = stage_properties(stage) | {"outcome": bpy.props.StringProperty(options={"HIDDEN"})}
+        group = _class(f"LIMBER_PG_{attribute_name(stage.name)}", bpy.types.PropertyGroup, own)
+        bpy.utils.register_class(group)
+        _registered.append(group)
+        LimberSettings.__annotations__[attribute_name(stage.name)] = bpy.props.PointerProperty(
+            type=group)
     bpy.utils.register_class(LimberSettings)
+    _registered.append(LimberSettings)
     bpy.types.Scene.limber = bpy.props.PointerProperty(type=LimberSettings)
 
 
 def unregister() -> None:
-    del bpy.types.Scene.limber
-    bpy.utils.unregister_class(LimberSettings)
+    if hasattr(bpy.types.Scene, "limber"):
+        del bpy.types.Scene.limber
+    while _registered:
+        bpy.utils.unregister_class(_registered.pop())

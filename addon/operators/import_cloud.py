@@ -1,16 +1,16 @@
-"""Import a scan, to look at it."""
+"""Import a scan, to look at it: from the tab, from File > Import, or dropped into a view."""
 
-import hashlib
 from pathlib import Path
 
 import bpy
 
-from .. import clouds
+from .. import branch_folder, clouds
 from ..bridge import meshes
 from ..scene import SCAN_KEY, add_object
 from .viewing import look_at
 
-_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_KINDS = (".ply", ".xyz", ".txt", ".csv")
 
 
 class LIMBER_OT_import_cloud(bpy.types.Operator):
@@ -20,10 +20,10 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
     bl_label = "Import Scan"
 
     filepath: bpy.props.StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: bpy.props.StringProperty(default="*.ply;*.xyz;*.txt;*.csv", options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(default=";".join(f"*{kind}" for kind in _KINDS),
+                                          options={"HIDDEN"})
 
     def invoke(self, context, event):
-        self.filepath = self.filepath or context.scene.limber.cloud_path
         if not self.filepath:
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}
@@ -31,27 +31,56 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
 
     def execute(self, context):
         settings = context.scene.limber
-        path = Path(bpy.path.abspath(self.filepath or settings.cloud_path))
+        path = Path(bpy.path.abspath(self.filepath or settings.reconstruct.cloud))
         try:
             points = clouds.read_points(path)
             mesh = meshes.new_mesh(path.stem, points)
+            folder = self._folder(context, path)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         cloud = add_object(context.scene.collection, f"{path.stem} scan", mesh)
-        cloud[SCAN_KEY] = hashlib.sha256(path.read_bytes()).hexdigest()
-        cloud.scale = [_METRES[settings.cloud_unit]] * 3
-        settings.cloud_path = str(path)
-        if not settings.branch_folder:
-            settings.branch_folder = str(path.with_suffix(".branch"))
+        cloud[SCAN_KEY] = branch_folder.file_sha256(path)
+        cloud.scale = [_METRES[settings.reconstruct.unit]] * 3
+        settings.reconstruct.cloud = str(path)
+        settings.branch_folder = str(folder)
         look_at(context, cloud)
         self.report({"INFO"}, f"{len(points)} points")
         return {"FINISHED"}
 
+    def _folder(self, context, path: Path) -> Path:
+        """Return the branch folder of the scan: the one that is set if it is its own."""
+        chosen = context.scene.limber.branch_folder
+        if chosen and branch_folder.is_of(Path(bpy.path.abspath(chosen)),
+                                          branch_folder.file_sha256(path)):
+            return Path(chosen)
+        return branch_folder.folder_for(path)
+
+
+class LIMBER_FH_cloud(bpy.types.FileHandler):
+    """Scans may be dropped into a 3D view."""
+
+    bl_idname = "LIMBER_FH_cloud"
+    bl_label = "Limber scan"
+    bl_import_operator = "limber.import_cloud"
+    bl_file_extensions = ";".join(_KINDS)
+
+    @classmethod
+    def poll_drop(cls, context):
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def _draw_menu(menu: bpy.types.Menu, _context) -> None:
+    menu.layout.operator("limber.import_cloud", text="Plant Scan for Limber (.ply, .xyz)")
+
 
 def register() -> None:
     bpy.utils.register_class(LIMBER_OT_import_cloud)
+    bpy.utils.register_class(LIMBER_FH_cloud)
+    bpy.types.TOPBAR_MT_file_import.append(_draw_menu)
 
 
 def unregister() -> None:
+    bpy.types.TOPBAR_MT_file_import.remove(_draw_menu)
+    bpy.utils.unregister_class(LIMBER_FH_cloud)
     bpy.utils.unregister_class(LIMBER_OT_import_cloud)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import bpy
 
-from .. import scene, scene_data
+from .. import branch_folder, properties, scene, scene_data
+from ..stages import stages
 from .viewing import look_at
 from .worker_operator import WorkerOperator
 
@@ -28,16 +29,29 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         if folder is None or not (folder / "branch.json").is_file():
             raise ValueError("Choose a branch folder: one that holds a file branch.json.")
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-open-")
-        plan = ["--plan", settings.plan] if settings.plan else []
-        return ["scene", str(folder), "--data", str(self._data_path), *plan]
+        stage = stages()["scene"]
+        values = properties.values_of(properties.group_of(context.scene, stage), stage,
+                                      {"plan", "motion"})
+        return stage.arguments({**values, "branch_folder": str(folder),
+                                "data": str(self._data_path)})
 
     def finish(self, context, result):
         with self._temporary:
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
         scene.place_scans(context.scene, data)
+        self._take_over_settings(context, data.folder)
         look_at(context, shown.surface)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")
+
+    def _take_over_settings(self, context, folder: Path) -> None:
+        """Set the panels to what the branch was made with: running again then changes nothing."""
+        record = branch_folder.read_record(folder)
+        for stage in stages().values() if record else ():
+            group = properties.group_of(context.scene, stage)
+            entry = record.of(stage, properties.values_of(group, stage, {"name"}))
+            if entry is not None:
+                properties.take_over(group, stage, entry.settings)
 
     @property
     def _data_path(self) -> Path:

@@ -26,7 +26,7 @@ class WorkerOperator:
         return True
 
     def arguments(self, context: bpy.types.Context) -> list[str]:
-        """Return the worker's arguments, without --json; ValueError says what is missing."""
+        """Return the command and its arguments, without --json; ValueError says what is missing."""
         raise NotImplementedError
 
     def finish(self, context: bpy.types.Context, result: dict) -> None:
@@ -65,10 +65,13 @@ class WorkerOperator:
             self._job.stop_now()
             self._job.poll()
 
+    def ended(self, context: bpy.types.Context, outcome: dict) -> None:
+        """Keep how it ended: ``status``, ``error``, ``warnings``, ``seconds``."""
+
     def _start(self, context) -> bool:
         try:
-            command = [*preferences.worker_command(), *self.arguments(context),
-                       "--json", "--progress", "json"]
+            stage, *rest = self.arguments(context)
+            command = [*preferences.worker_command(), stage, "--json", "--progress", "json", *rest]
             self._job = jobs.start(self.title, command)
         except (ValueError, RuntimeError, OSError, WorkerNotFound) as error:
             self.report({"ERROR"}, str(error))
@@ -77,6 +80,7 @@ class WorkerOperator:
 
     def _end(self, context):
         job = self._job
+        self.ended(context, {**job.result, "status": job.state.value, "error": job.error})
         for warning in job.result.get("warnings", []):
             self.report({"WARNING"}, warning)
         if job.state is jobs.JobState.CANCELLED:
@@ -101,5 +105,8 @@ class WorkerOperator:
 def _redraw_sidebars(context: bpy.types.Context) -> None:
     for window in context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PREFERENCES"}:
+            if area.type == "PREFERENCES":
                 area.tag_redraw()
+            elif area.type == "VIEW_3D":
+                # Not the view itself: drawing a million points takes its time.
+                next(region for region in area.regions if region.type == "UI").tag_redraw()

@@ -1,4 +1,4 @@
-"""Step 4: the motion along the path, with its energy."""
+"""The motion along the path, with its energy."""
 
 import bpy
 from bpy.app.handlers import persistent
@@ -10,8 +10,8 @@ from .sidebar import SidebarPanel
 
 class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
     bl_idname = "LIMBER_PT_play"
-    bl_label = "4  Play"
-    bl_order = 4
+    bl_label = "Play"
+    bl_order = 20
 
     @classmethod
     def poll(cls, context):

@@ -1,23 +1,31 @@
-"""Step 3: what a branch folder holds, and what its colours mean."""
+"""The branch: its folder, what it holds, and what its colours mean."""
 
 import json
 
 import bpy
 
-from .. import scene
+from .. import preferences, scene
 from .sidebar import SidebarPanel
 
 
 class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
     bl_idname = "LIMBER_PT_result"
-    bl_label = "3  Result"
-    bl_order = 3
+    bl_label = "Branch"
+    bl_order = 1
 
     def draw(self, context):
         settings = context.scene.limber
         self.layout.prop(settings, "branch_folder")
-        self.layout.prop(settings, "plan")
+        self.layout.prop(settings.scene, "plan")
+        self.layout.prop(settings.scene, "motion")
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
+        self.layout.prop(settings, "show_expert")
+        if not preferences.has_worker():
+            column = self.layout.column(align=True)
+            column.label(text="No worker was found.", icon="ERROR")
+            column.label(text="Name the Python that has limber:")
+            column.operator("preferences.addon_show", text="Preferences",
+                            icon="PREFERENCES").module = preferences.KEY
         surface = scene.find_surface(context.scene)
         if surface is not None:
             _draw_legend(self.layout, json.loads(surface[scene.INFO_KEY]))

@@ -55,7 +55,7 @@ def open_tab():
     sidebar.active_panel_category = "Limber"
     area.tag_redraw()
     seen["category"] = sidebar.active_panel_category
-    bpy.context.scene.limber.cloud_path = str(FOLDER / "scan.ply")
+    bpy.context.scene.limber.reconstruct.cloud = str(FOLDER / "scan.ply")
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
     return True
@@ -173,7 +173,7 @@ def played():
     return bpy.context.scene.frame_current > 1
 
 
-STEPS = [open_sidebar, open_tab, picture("tab"), click(100), imported, click(188), reconstructed,
+STEPS = [open_sidebar, open_tab, picture("tab"), click(270), imported, click(365), reconstructed,
          start_slow_job, slow_job_reports, picture("job"), click(124), job_cancelled,
          open_result, opened, picture("opened"), play, played, picture("playing"),
          start_slow_job, slow_job_left_running]

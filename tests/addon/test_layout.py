@@ -50,5 +50,7 @@ def test_every_icon_exists(bpy):
     used = {icon for path in FILES
             for call in re.findall(r"icon=([^)\n]+)", path.read_text())
             for icon in re.findall(r'"([A-Z_0-9]+)"', call)}
-    assert "MESH_DATA" in used
+    assert "FILE_FOLDER" in used
+    used |= set(re.findall(r'= \("[^"]+", "([A-Z_]+)"\)', (ADDON / "steps.py").read_text()))
+    assert "RADIOBUT_OFF" in used
     assert used <= known

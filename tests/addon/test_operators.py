@@ -7,6 +7,9 @@ import struct
 import numpy as np
 import pytest
 
+from limber.files import file_digest
+from limber.store import Branch
+
 POINTS = np.random.default_rng(7).random((40, 3)) * 300
 
 
@@ -41,7 +44,7 @@ def test_import_cloud(bpy, registered, tmp_path, name, write):
     meshes = importlib.import_module("limber_addon.bridge.meshes")
     write(tmp_path / name)
     settings = bpy.context.scene.limber
-    settings.cloud_unit = "mm"
+    settings.reconstruct.unit = "mm"
     assert bpy.ops.limber.import_cloud(filepath=str(tmp_path / name)) == {"FINISHED"}
     cloud = bpy.data.objects[f"{name[0]} scan"]
     np.testing.assert_allclose(meshes.positions(cloud.data), POINTS, rtol=1e-5)
@@ -78,12 +81,12 @@ def test_reconstruct_hands_the_worker_what_the_user_chose(bpy, registered, tmp_p
                                   "raise SystemExit(2)"]))
     (tmp_path / "scan.xyz").write_text("0 0 0\n")
     settings = bpy.context.scene.limber
-    settings.cloud_path, settings.cloud_unit = str(tmp_path / "scan.xyz"), "mm"
+    settings.reconstruct.cloud, settings.reconstruct.unit = str(tmp_path / "scan.xyz"), "mm"
     with pytest.raises(RuntimeError, match="Too few"):
         bpy.ops.limber.reconstruct()
-    assert seen[0][1:] == ["-m", "limber", "reconstruct", str(tmp_path / "scan.xyz"), "-o",
-                           str(tmp_path / "scan.branch"), "--unit", "mm", "--json", "--progress",
-                           "json"]
+    assert seen[0][1:] == ["-m", "limber", "reconstruct", "--json", "--progress", "json",
+                           "--output", str(tmp_path / "scan.branch"), "--unit", "mm", "--",
+                           str(tmp_path / "scan.xyz")]
 
 
 def test_open_result_and_play(bpy, registered, beam):
@@ -140,3 +143,106 @@ def test_no_worker(bpy, registered, monkeypatch):
     monkeypatch.setenv("LIMBER_PYTHON", "/nowhere/python")
     with pytest.raises(RuntimeError, match="does not bring along yet"):
         bpy.ops.limber.check_worker()
+
+
+def _scan(path, shift):
+    path.write_text("".join(f"{x} {shift} 0\n" for x in range(5)))
+    return path
+
+
+def _branch_of(scan, folder):
+    """Write a branch folder that says it was made of ``scan``."""
+    branch = Branch.create(folder)
+    with branch.stage("reconstruct") as stage:
+        stage.manifest.source = {"file": scan.name, "sha256": file_digest(scan)}
+        stage.path("skeleton.swc").write_text("")
+    return branch
+
+
+def test_a_folder_belongs_to_its_scan(bpy, registered, tmp_path):
+    """Another scan gets another folder; the first one again gets its own back."""
+    (tmp_path / "other").mkdir()
+    one, two = _scan(tmp_path / "a.xyz", 1), _scan(tmp_path / "b.xyz", 2)
+    settings = bpy.context.scene.limber
+    bpy.ops.limber.import_cloud(filepath=str(one))
+    _branch_of(one, tmp_path / "a.branch")
+    bpy.ops.limber.import_cloud(filepath=str(two))
+    assert settings.branch_folder == str(tmp_path / "b.branch")
+    bpy.ops.limber.import_cloud(filepath=str(one))
+    assert settings.branch_folder == str(tmp_path / "a.branch")
+    # The same name with other points: a new scan, whose results must not fall into the old folder.
+    _scan(one, 3)
+    bpy.ops.limber.import_cloud(filepath=str(one))
+    assert settings.branch_folder == str(tmp_path / "a-2.branch")
+    # A folder that the user chose, made of this scan, stays.
+    _branch_of(one, tmp_path / "mine.branch")
+    settings.branch_folder = str(tmp_path / "mine.branch")
+    bpy.ops.limber.import_cloud(filepath=str(one))
+    assert settings.branch_folder == str(tmp_path / "mine.branch")
+
+
+def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatch):
+    """Reconstructing into the folder of another scan is refused unless it is asked for."""
+    jobs = importlib.import_module("limber_addon.jobs")
+    started = []
+    monkeypatch.setattr(jobs, "start", lambda title, command: started.append(command) or 1 / 0)
+    one, two = _scan(tmp_path / "a.xyz", 1), _scan(tmp_path / "b.xyz", 2)
+    _branch_of(one, tmp_path / "a.branch")
+    given = {"cloud": str(two), "output": str(tmp_path / "a.branch")}
+    with pytest.raises(RuntimeError, match=r"was not made of b\.xyz"):
+        bpy.ops.limber.reconstruct(**given)
+    assert not started
+    with pytest.raises(RuntimeError, match="division"):
+        bpy.ops.limber.reconstruct(**given, replace=True)
+    assert started[0][-1] == str(two)
+
+
+def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
+    """What a script gives a stage is what the panels show, and what the worker gets."""
+    jobs = importlib.import_module("limber_addon.jobs")
+    started = []
+    monkeypatch.setattr(jobs, "start", lambda title, command: started.append(command) or 1 / 0)
+    with pytest.raises(RuntimeError, match="division"):
+        bpy.ops.limber.plan(branch_folder=str(beam.folder), name="to-light", goal=(0.1, -0.2, 0.3),
+                            max_force=2.5)
+    assert started[0][3:] == [
+        "plan", "--json", "--progress", "json", "--name", "to-light", "--goal", "0.1", "-0.2",
+        "0.3", "--max-force", "2.5", "--", str(beam.folder)]
+    assert bpy.context.scene.limber.plan.use_goal
+    with pytest.raises(RuntimeError, match="Source is missing"):
+        bpy.ops.limber.import_pull(name="one")
+
+
+def test_a_stage_runs_and_its_outcome_stays(bpy, registered, branch_folder):
+    """The worker makes a report; its state is done; a failure and a warning are kept to be read."""
+    steps = importlib.import_module("limber_addon.panels.steps")
+    scene = bpy.context.scene
+    assert bpy.ops.limber.report(branch_folder=str(branch_folder)) == {"FINISHED"}
+    assert (branch_folder / "report.html").is_file()
+    assert steps.state_of(scene, "report")[0] is steps.StepState.DONE
+    with pytest.raises(RuntimeError, match="no estimate"):
+        bpy.ops.limber.predict(weight=1.0)
+    state, _ = steps.state_of(scene, "predict")
+    assert state is steps.StepState.FAILED
+    with pytest.raises(RuntimeError, match="Choose a branch folder"):
+        bpy.ops.limber.estimate(branch_folder=str(branch_folder.parent))
+    assert steps.state_of(scene, "predict")[0] is steps.StepState.NOT_RUN, "of another branch"
+
+
+def test_places_come_from_the_cursor(bpy, registered):
+    """A place field takes the 3D cursor; what is no place is refused."""
+    scene = bpy.context.scene
+    scene.cursor.location = (0.1, 0.2, 0.3)
+    assert bpy.ops.limber.from_cursor(stage="plan", field="goal") == {"FINISHED"}
+    assert list(scene.limber.plan.goal) == pytest.approx([0.1, 0.2, 0.3])
+    assert scene.limber.plan.use_goal
+    with pytest.raises(RuntimeError, match="no place 'seed'"):
+        bpy.ops.limber.from_cursor(stage="plan", field="seed")
+
+
+def test_import_stands_in_the_file_menu(bpy, registered):
+    """File > Import has the scan, so that F3 finds it; and it goes with the add-on."""
+    menu = bpy.types.TOPBAR_MT_file_import
+    imports = importlib.import_module("limber_addon.operators.import_cloud")
+    assert imports._draw_menu in menu._dyn_ui_initialize()
+    assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"

@@ -7,27 +7,43 @@ from types import SimpleNamespace
 
 import pytest
 
+from limber.store import Branch
+
 
 class Layout:
-    """Stands for UILayout: keeps every call, and every text that a user would read."""
+    """Stands for UILayout: keeps every call, and every text that a user would read.
+
+    Parts that open are open. What Blender's own layout would not take is an error here too.
+    """
 
     def __init__(self, calls=None):
         self.calls = [] if calls is None else calls
 
-    def row(self, **_):
+    def row(self, heading="", **_):
+        if heading:
+            self.calls.append(("label", heading, None))
         return Layout(self.calls)
 
     column = row
 
-    def operator(self, name, **options):
+    def panel(self, name, default_closed=False):
+        self.calls.append(("panel", name, None))
+        return Layout(self.calls), Layout(self.calls)
+
+    def operator(self, name, icon="NONE", **options):
+        group, action = name.split(".")
+        assert icon in ICONS
+        if group == "limber":
+            assert action in dir(bpy_module().ops.limber), name
         self.calls.append(("operator", name, options.get("text")))
         return SimpleNamespace()
 
     def prop(self, owner, name, **_):
-        assert hasattr(owner, name)
+        assert hasattr(owner, name), name
         self.calls.append(("prop", name, None))
 
-    def label(self, text="", **_):
+    def label(self, text="", icon="NONE", **_):
+        assert icon in ICONS
         self.calls.append(("label", text, None))
 
     def progress(self, factor, text, **_):
@@ -35,6 +51,19 @@ class Layout:
 
     def names(self, kind):
         return [call[1] for call in self.calls if call[0] == kind]
+
+
+def bpy_module():
+    return sys.modules["bpy"]
+
+
+class _Icons:
+    def __contains__(self, name):
+        function = bpy_module().types.UILayout.bl_rna.functions["prop"]
+        return name in function.parameters["icon"].enum_items
+
+
+ICONS = _Icons()
 
 
 def _draw(panel, context):
@@ -51,21 +80,105 @@ def panels(registered):
     return panel
 
 
+STEPS = ("scan", "skeleton", "mesh", "material", "pulls", "estimate", "goal", "plan", "robot",
+         "report")
+
+
+def _step(bpy, name):
+    return getattr(bpy.types, f"LIMBER_PT_{name}")
+
+
+def _draw_step(bpy, name):
+    panel = _step(bpy, name)
+    drawn = Layout()
+    panel.draw(SimpleNamespace(layout=drawn, step=panel.step), bpy.context)
+    return drawn
+
+
 def test_every_panel_is_in_the_tab(bpy, panels):
-    """All steps stand in the sidebar tab Limber, in order."""
-    names = ("job", "import_cloud", "reconstruct", "result", "play")
-    assert {panels(name).bl_category for name in names} == {"Limber"}
-    assert [panels(name).bl_order for name in names] == [0, 1, 2, 3, 4]
+    """All steps stand in the sidebar tab Limber, in order; each can be drawn."""
+    kinds = [panels("job"), panels("result"), *(_step(bpy, name) for name in STEPS),
+             panels("play")]
+    assert {kind.bl_category for kind in kinds} == {"Limber"}
+    orders = [kind.bl_order for kind in kinds]
+    assert orders == sorted(set(orders))
+
+
+@pytest.mark.parametrize(("name", "operators"), [
+    ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct"]),
+    ("mesh", ["limber.reconstruct", "limber.mesh"]),
+    ("material", ["limber.color_by", "limber.simulate"]),
+    ("pulls", ["limber.import_pull", "limber.virtual_pull"]),
+    ("estimate", ["limber.estimate", "limber.predict"]),
+    ("goal", ["limber.energy", "limber.target"]), ("plan", ["limber.plan"]),
+    ("robot", ["limber.execute"]), ("report", ["limber.report", "limber.open_report"])])
+def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, operators):
+    """Its stages' buttons in order, and every setting of the schema that is not for experts."""
+    stages = importlib.import_module("limber_addon.stages").stages()
+    steps = importlib.import_module("limber_addon.steps")
+    drawn = _draw_step(bpy, name)
+    shown = [call for call in drawn.names("operator") if call != "limber.from_cursor"]
+    assert shown == operators
+    step = _step(bpy, name).step
+    for view in (step.view, *step.others):
+        for field in stages[view.stage].fields.values():
+            hidden = steps.FROM_SCENE | steps.NOT_FROM_HERE.get(view.stage, frozenset())
+            wanted = view.groups is None and not field.is_expert and field.name not in hidden
+            assert not wanted or field.name in drawn.names("prop"), (view.stage, field.name)
+    assert "arm" not in drawn.names("prop"), "no button moves a robot"
+
+
+def test_the_expert_settings_are_shown_on_demand(bpy, panels):
+    """Few need them: a switch shows them."""
+    assert "contraction_points" not in _draw_step(bpy, "skeleton").names("prop")
+    bpy.context.scene.limber.show_expert = True
+    assert "contraction_points" in _draw_step(bpy, "skeleton").names("prop")
+
+
+def test_a_step_says_how_far_it_is(bpy, panels, branch_folder):
+    """Not run, done, out of date by its input or its settings, failed; and what comes next."""
+    module = importlib.import_module("limber_addon.panels.steps")
+    scene = bpy.context.scene
+
+    def state(name):
+        return module.state_of(scene, name)[0]
+    assert state("virtual-pull") is module.StepState.NOT_RUN
+    scene.limber.branch_folder = str(branch_folder)
+    # The panels still have defaults, the pull was made with others.
+    assert state("virtual-pull") is module.StepState.CHANGED
+    opening = bpy.ops.limber.open_result(directory=str(branch_folder))
+    assert opening == {"FINISHED"}
+    assert scene.limber.virtual_pull.seed == 4, "the branch's own settings"
+    assert state("virtual-pull") is module.StepState.DONE
+    assert module.step_state(scene, _step(bpy, "pulls").step) is module.StepState.DONE
+    texts = _draw_step(bpy, "pulls").names("label")
+    assert any(text.endswith(" N") for text in texts), texts
+    scene.limber.virtual_pull.reach = 0.5
+    assert state("virtual-pull") is module.StepState.CHANGED
+    scene.limber.virtual_pull.reach = 0.35
+    with Branch.open(branch_folder).stage("reconstruct") as stage:
+        stage.path("skeleton.swc").write_text(
+            (branch_folder / "skeleton.swc").read_text() + "# edited\n")
+    assert state("virtual-pull") is module.StepState.STALE
+    properties = importlib.import_module("limber_addon.properties")
+    stages = importlib.import_module("limber_addon.stages").stages()
+    properties.keep_outcome(scene, stages["virtual-pull"], str(branch_folder),
+                            {"status": "failed", "error": "It broke.", "warnings": ["It bent."]})
+    assert state("virtual-pull") is module.StepState.FAILED
+    texts = _draw_step(bpy, "pulls").names("label")
+    assert "It broke." in texts and "It bent." in texts
+    scene.limber.virtual_pull.name = "another"
+    properties.keep_outcome(scene, stages["virtual-pull"], str(branch_folder), {})
+    assert state("virtual-pull") is module.StepState.NOT_RUN
 
 
 def test_an_empty_scene(bpy, panels):
-    """At first: import, reconstruct and open are offered, playing and the job are not."""
+    """At first a result can be opened; playing and the job are not there."""
     context = bpy.context
-    assert _draw(panels("import_cloud"), context).names("operator") == ["limber.import_cloud"]
-    assert _draw(panels("reconstruct"), context).names("operator") == ["limber.reconstruct"]
     assert _draw(panels("result"), context).names("operator") == ["limber.open_result"]
     assert not panels("play").poll(context)
     assert not panels("job").poll(context)
+    assert "Young: assumed, not measured" in _draw_step(bpy, "material").names("label")
 
 
 def test_an_opened_result(bpy, panels, beam):
@@ -106,5 +219,6 @@ def test_a_running_and_a_failed_job(bpy, panels):
 def test_no_worker_is_said_in_the_panel(bpy, panels, monkeypatch):
     """The step that needs the worker says so where it is missing."""
     monkeypatch.setenv("LIMBER_PYTHON", "/nowhere/python")
-    texts = _draw(panels("reconstruct"), bpy.context).names("label")
-    assert "No worker was found." in texts
+    drawn = _draw(panels("result"), bpy.context)
+    assert "No worker was found." in drawn.names("label")
+    assert "preferences.addon_show" in drawn.names("operator")

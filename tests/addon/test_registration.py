@@ -16,8 +16,9 @@ def test_registers_twice(bpy, addon):
     for _ in range(2):
         addon.register()
         there = _ours(bpy)
-        assert {"LIMBER_PT_import_cloud", "LIMBER_PT_reconstruct", "LIMBER_PT_result",
-                "LIMBER_PT_play", "LIMBER_OT_import_cloud", "LIMBER_OT_reconstruct",
+        assert {"LIMBER_PT_scan", "LIMBER_PT_report", "LIMBER_PT_result", "LIMBER_FH_cloud",
+                "LIMBER_PT_play", "LIMBER_OT_plan", "LIMBER_OT_import_cloud",
+                "LIMBER_OT_reconstruct",
                 "LIMBER_OT_open_result", "LIMBER_OT_play", "LIMBER_OT_cancel_job",
                 "LIMBER_OT_check_worker", "Scene.limber", "bpy.ops.limber"} <= there
         addon.unregister()

@@ -1,0 +1,124 @@
+"""What a branch folder says of itself in ``branch.json``: stages, their results, its scan. No bpy.
+
+The worker alone writes there. What cannot be read counts as not there: the worker says why.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from .stages import Stage
+
+MANIFEST = "branch.json"
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What a branch folder knows of a stage that has run."""
+
+    settings: dict[str, Any]
+    reads: dict[str, str]
+    result: dict[str, Any]
+    finished: str
+
+
+@dataclass(frozen=True)
+class BranchRecord:
+    """What a branch folder holds: stages by key, and its scan's sha256.
+
+    ``files`` has, by name, each file's sha256 and the key of the stage that wrote it.
+    """
+
+    name: str
+    stages: dict[str, StageRecord]
+    files: dict[str, tuple[str, str]]
+    scan_sha256: str
+
+    def of(self, stage: Stage, values: Mapping[str, Any]) -> StageRecord | None:
+        """Return what is known of a stage that would be run with these values."""
+        key = stage.key.format_map({"name": values.get("name", "")}) if stage.key else ""
+        record = self.stages.get(key)
+        # Two stages may make the same thing (a pull): the settings tell which one did.
+        return record if record and set(record.settings) <= set(stage.fields) else None
+
+    def is_stale(self, stage: Stage, record: StageRecord) -> bool:
+        """Whether something that the stage reads has been made anew since, by another stage."""
+        for name, (digest, maker) in self.files.items():
+            if not any(name == read or (read.endswith("/") and name.startswith(read))
+                       for read in stage.reads):
+                continue
+            if name in record.reads:
+                if record.reads[name] != digest:
+                    return True
+            # It read a part of the file: then the time has to tell.
+            elif (made := self.stages.get(maker)) and made is not record and (
+                    made.finished > record.finished):
+                return True
+        return False
+
+
+def read_record(folder: Path) -> BranchRecord | None:
+    """Return what ``folder`` holds; None where it is no branch folder, or a damaged one."""
+    path = Path(folder) / MANIFEST
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return _read(path, about.st_mtime_ns, about.st_size)
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, _changed: int, _size: int) -> BranchRecord | None:
+    """Read once for each state of the file: panels ask at every redraw."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        stages = {key: StageRecord(dict(entry["settings"]), dict(entry["reads"]),
+                                   dict(entry["result"]), str(entry["finished"]))
+                  for key, entry in content["stages"].items()}
+        files = {name: (entry["sha256"], entry["stage"])
+                 for name, entry in content["files"].items()}
+        return BranchRecord(str(content["name"]), stages, files,
+                            str(content.get("source", {}).get("sha256", "")))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def file_sha256(path: Path) -> str:
+    """Return the sha256 of a file, worked out once for each state of it."""
+    about = path.stat()
+    return _sha256(path, about.st_mtime_ns, about.st_size)
+
+
+@lru_cache(maxsize=16)
+def _sha256(path: Path, _changed: int, _size: int) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def folder_for(scan: Path) -> Path:
+    """Return the branch folder of a scan: the one beside it that is its own, or a new one."""
+    digest = file_sha256(scan)
+    for number in range(1, 1000):
+        folder = scan.with_name(f"{scan.stem}{'' if number == 1 else f'-{number}'}.branch")
+        if belongs(folder, digest):
+            return folder
+    raise ValueError(f"Beside {scan} are a thousand branch folders of other scans. "
+                     "Choose a folder yourself.")
+
+
+def is_of(folder: Path, digest: str) -> bool:
+    """Whether ``folder`` is the branch made of the scan with this sha256."""
+    record = read_record(folder)
+    return record is not None and record.scan_sha256 == digest
+
+
+def belongs(folder: Path, digest: str) -> bool:
+    """Whether ``folder`` is new, empty or that of the scan with this sha256."""
+    record = read_record(folder)
+    if record is not None:
+        return record.scan_sha256 in ("", digest)
+    return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))

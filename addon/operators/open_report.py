@@ -1,0 +1,30 @@
+"""Open the report in the browser."""
+
+from pathlib import Path
+
+import bpy
+
+
+class LIMBER_OT_open_report(bpy.types.Operator):
+    """Open the branch's report in the browser"""
+
+    bl_idname = "limber.open_report"
+    bl_label = "Open Report"
+
+    def execute(self, context):
+        folder = bpy.path.abspath(context.scene.limber.branch_folder)
+        page = Path(folder, "report.html").resolve()
+        if not folder or not page.is_file():
+            self.report({"ERROR"}, "There is no report yet: write it first.")
+            return {"CANCELLED"}
+        if not bpy.app.background:
+            bpy.ops.wm.url_open(url=page.as_uri())
+        return {"FINISHED"}
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_open_report)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(LIMBER_OT_open_report)

@@ -1,0 +1,153 @@
+"""Run a stage of the worker with what is set in the scene: one operator a stage."""
+
+from pathlib import Path
+
+import bpy
+
+from .. import branch_folder, properties
+from ..stages import SettingError, Stage, stages
+from ..steps import NOT_FROM_HERE, RUN, button_of
+from .worker_operator import WorkerOperator
+
+_registered: list[type] = []
+
+
+class StageOperator(WorkerOperator):
+    """Mix-in: runs ``stage``; keyword arguments of the operator change the scene's settings."""
+
+    stage_name = ""
+    _folder: Path | None = None
+    _is_asked = False
+
+    @property
+    def stage(self) -> Stage:
+        return stages()[self.stage_name]
+
+    @property
+    def title(self) -> str:
+        return button_of(self.stage_name)
+
+    def invoke(self, context, event):
+        try:
+            self._take_keywords(context)
+            trouble = "" if self.replace else self._foreign(context)
+        except (ValueError, OSError):
+            # Starting it says the same, and where.
+            trouble = ""
+        if not trouble or bpy.app.background or context.window is None:
+            return super().invoke(context, event)
+        self._is_asked = self.replace = True
+        return context.window_manager.invoke_confirm(
+            self, event, title="Replace the branch?", message=trouble, confirm_text="Replace",
+            icon="WARNING")
+
+    def execute(self, context):
+        if self._is_asked:
+            # The user has answered: from here on as from the button.
+            self._is_asked = False
+            return super().invoke(context, None)
+        return super().execute(context)
+
+    def arguments(self, context):
+        self._take_keywords(context)
+        stage, settings = self.stage, context.scene.limber
+        values = properties.values_of(properties.group_of(context.scene, stage), stage)
+        if "output" in stage.fields:
+            trouble = self._foreign(context)
+            if trouble and not self.replace:
+                raise ValueError(f"{trouble} Choose another branch folder, or run it with "
+                                 "replace=True.")
+            if not settings.branch_folder:
+                settings.branch_folder = str(branch_folder.folder_for(self._source(context)))
+            values["output"] = bpy.path.abspath(settings.branch_folder)
+        else:
+            if branch_folder.read_record(_folder_of(context)) is None:
+                raise ValueError("Choose a branch folder: one that holds a file branch.json.")
+            values["branch_folder"] = bpy.path.abspath(settings.branch_folder)
+        for name in NOT_FROM_HERE.get(stage.name, ()):
+            values.pop(name)
+        self._folder = _folder_of(context)
+        return stage.arguments(values)
+
+    def finish(self, context, result):
+        self.report({"INFO"}, f"{self.title}: done in {result['seconds']:.0f} s")
+        if self.stage_name == "predict":
+            position = result.get("grasp_position_m") or result.get("position_m")
+            if position:
+                self.report({"INFO"}, f"It comes to rest at {position} m")
+        if bpy.app.background or not _is_seen(self.stage):
+            return
+        # The folder that this job filled, whatever the scene names by now.
+        bpy.ops.limber.open_result("INVOKE_DEFAULT", directory=str(self._folder))
+
+    def ended(self, context, outcome):
+        properties.keep_outcome(context.scene, self.stage, str(self._folder), outcome)
+
+    def _take_keywords(self, context) -> None:
+        group = properties.group_of(context.scene, self.stage)
+        for name in properties.stage_properties(self.stage):
+            if not self.properties.is_property_set(name):
+                continue
+            if name in ("output", "branch_folder"):
+                context.scene.limber.branch_folder = getattr(self, name)
+                continue
+            setattr(group, name, getattr(self, name))
+            if hasattr(group, properties.OPEN + name):
+                setattr(group, properties.OPEN + name, True)
+
+    def _source(self, context) -> Path:
+        """Return the scan or surface that a new branch is made of."""
+        field = next(field for field in self.stage.fields.values() if field.is_argument)
+        given = getattr(properties.group_of(context.scene, self.stage), field.name)
+        path = Path(bpy.path.abspath(given)) if given else None
+        if path is None or not path.is_file():
+            raise SettingError(f"Choose a {'scan' if field.name == 'cloud' else field.name} "
+                               f"first. {field.description}")
+        return path
+
+    def _foreign(self, context) -> str:
+        """Return why the folder is not this scan's, or nothing."""
+        if "output" not in self.stage.fields:
+            return ""
+        source = self._source(context)
+        if not context.scene.limber.branch_folder:
+            return ""
+        folder = _folder_of(context)
+        if branch_folder.belongs(folder, branch_folder.file_sha256(source)):
+            return ""
+        return f"{folder.name} was not made of {source.name}: its results would be overwritten."
+
+
+def _folder_of(context) -> Path:
+    return Path(bpy.path.abspath(context.scene.limber.branch_folder))
+
+
+def _is_seen(stage: Stage) -> bool:
+    """Whether what the stage writes is shown in the scene."""
+    return any(name in ("mesh.vtu", "targets.json", "energy.npz")
+               or name.startswith(("plans/", "frames/")) for name in stage.writes)
+
+
+def register() -> None:
+    for name in RUN:
+        stage = stages()[name]
+        # Not saved: what a script gave once is not given again by the button.
+        own = properties.stage_properties(stage, {"SKIP_SAVE"})
+        for kept in NOT_FROM_HERE.get(name, ()):
+            own = {key: value for key, value in own.items()
+                   if key not in (kept, properties.OPEN + kept)}
+        operator = type(f"LIMBER_OT_{properties.attribute_name(name)}",
+                        (StageOperator, bpy.types.Operator), {
+            "__annotations__": own | {"replace": bpy.props.BoolProperty(
+                name="Replace", options={"HIDDEN", "SKIP_SAVE"},
+                description="Also where the folder holds the branch of another scan")},
+            "__doc__": stage.summary.rstrip("."), "__module__": __name__, "stage_name": name,
+            "bl_idname": f"limber.{properties.attribute_name(name)}",
+            "bl_label": button_of(name)})
+        bpy.utils.register_class(operator)
+        _registered.append(operator)
+
+
+def unregister() -> None:
+    while _registered:
+        bpy.utils.unregister_class(_registered.pop())

@@ -1,0 +1,205 @@
+"""One panel a step of the work, drawn from the stages' schema."""
+
+import textwrap
+from pathlib import Path
+
+import bpy
+
+from .. import branch_folder, jobs, properties
+from ..branch_folder import BranchRecord, StageRecord
+from ..stages import Field, Stage, stages
+from ..steps import FROM_SCENE, NOT_FROM_HERE, STEPS, WAYS, StageView, Step, StepState, button_of
+from ..steps import next_step as step_after
+from .results import draw_results
+from .sidebar import SidebarPanel
+
+_FIRST_ORDER = 2
+_registered: list[type] = []
+
+
+class StepPanel(SidebarPanel):
+    """Mix-in: the panel of ``step``."""
+
+    step: Step
+
+    def draw_header_preset(self, context):
+        """Show how far it is, at the right end of the header."""
+        self.layout.label(text="", icon=step_state(context.scene, self.step).icon)
+
+    def draw(self, context):
+        layout, step = self.layout, self.step
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        view = step.view
+        if step.hint:
+            layout.label(text=step.hint, icon="INFO")
+        if step.name == "scan":
+            _draw_fields(layout, context, view, names=("cloud", "unit"))
+        elif step.name == "material":
+            _draw_origin(layout, context)
+        if step.scene_operator:
+            _draw_scene_button(layout, context, step)
+        else:
+            _draw_stage(layout, context, view, is_primary=True)
+        if step.name == "report":
+            layout.operator("limber.open_report", icon="URL")
+        _draw_groups(layout, context, view)
+        for more in step.settings_of:
+            _draw_groups(layout, context, more)
+        for other in step.others:
+            header, body = layout.panel(f"limber_{step.name}_{other.stage}", default_closed=True)
+            header.label(text=other.label, icon=state_of(context.scene, other.stage)[0].icon)
+            if body is not None:
+                _draw_stage(body, context, other, is_primary=False)
+                _draw_groups(body, context, other)
+        after = step_after(step)
+        if after is not None and step_state(context.scene, step) is StepState.DONE:
+            layout.label(text=f"Next: {after.title}", icon="FORWARD")
+
+
+def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord | None]:
+    """Return how far a stage is for the branch of ``scene``, and what its folder has of it."""
+    stage = stages()[name]
+    folder = bpy.path.abspath(scene.limber.branch_folder)
+    record = branch_folder.read_record(Path(folder)) if folder else None
+    group = properties.group_of(scene, stage)
+    entry = record.of(stage, properties.values_of(group, stage, {"name"})) if record else None
+    job = jobs.current()
+    if job is not None and job.state is jobs.JobState.RUNNING and job.title == button_of(name):
+        return StepState.RUNNING, entry
+    outcome = properties.outcome_of(scene, stage, folder)
+    if outcome.get("status") == "failed":
+        return StepState.FAILED, entry
+    if entry is None:
+        # What makes no entry (a prediction) is done where it has ended well.
+        return (StepState.DONE if outcome.get("status") == "done" and not stage.key
+                else StepState.NOT_RUN), None
+    return _age(stage, group, record, entry), entry
+
+
+def step_state(scene: bpy.types.Scene, step: Step) -> StepState:
+    """Return how far a step is: by another of its stages that makes the same, where that was run.
+    """
+    state, _ = state_of(scene, step.view.stage)
+    made = set(stages()[step.view.stage].writes)
+    for other in step.others:
+        if state is StepState.NOT_RUN and made & set(stages()[other.stage].writes):
+            state, _ = state_of(scene, other.stage)
+    return state
+
+
+def _age(stage: Stage, group: bpy.types.PropertyGroup, record: BranchRecord,
+         entry: StageRecord) -> StepState:
+    if record.is_stale(stage, entry):
+        return StepState.STALE
+    return StepState.CHANGED if properties.differs(group, stage, entry.settings) else (
+        StepState.DONE)
+
+
+def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView, *,
+                is_primary: bool) -> None:
+    """Draw what must be given, the button, the state, and what came out."""
+    stage = stages()[view.stage]
+    required = [field.name for field in stage.fields.values()
+                if field.is_required and field.name not in FROM_SCENE]
+    if view.stage != "reconstruct":
+        # Its scan is the first step's.
+        _draw_fields(layout, context, view, names=required)
+    state, entry = state_of(context.scene, view.stage)
+    row = layout.row()
+    row.scale_y = 1.4 if is_primary else 1.0
+    row.operator(f"limber.{properties.attribute_name(view.stage)}", text=view.label,
+                 icon="PLAY" if is_primary else "NONE")
+    if state is not StepState.NOT_RUN:
+        layout.label(text=state.words[0].upper() + state.words[1:], icon=state.icon)
+    folder = bpy.path.abspath(context.scene.limber.branch_folder)
+    outcome = properties.outcome_of(context.scene, stage, folder)
+    if outcome.get("error"):
+        _draw_text(layout, outcome["error"], "ERROR")
+    for warning in outcome.get("warnings", []):
+        _draw_text(layout, warning, "INFO")
+    if entry is not None:
+        draw_results(layout, view.stage, entry.result)
+
+
+def _draw_scene_button(layout: bpy.types.UILayout, context: bpy.types.Context, step: Step) -> None:
+    row = layout.row()
+    row.scale_y = 1.4
+    idname, label = step.scene_operator
+    operator = row.operator(idname, text=label, icon="PLAY")
+    if step.name == "scan":
+        operator.filepath = context.scene.limber.reconstruct.cloud
+    elif step.name == "material":
+        operator.scalar = "young"
+
+
+def _draw_origin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Say whether Young's modulus was measured: an assumed one looks the same in colours."""
+    is_estimated = state_of(context.scene, "estimate")[1] is not None
+    layout.label(text="Young: estimated from pulls" if is_estimated else
+                 "Young: assumed, not measured",
+                 icon="CHECKMARK" if is_estimated else "QUESTION")
+
+
+def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView) -> None:
+    stage = stages()[view.stage]
+    hidden = FROM_SCENE | NOT_FROM_HERE.get(view.stage, frozenset())
+    for title, fields in stage.groups().items():
+        shown = [field for field in fields if field.name not in hidden and not field.is_required
+                 and (context.scene.limber.show_expert or not field.is_expert)
+                 and not (view.stage == "reconstruct" and field.name == "unit")]
+        if not shown or (view.groups is not None and title not in view.groups):
+            continue
+        header, body = layout.panel(f"limber_{view.stage}_{title}", default_closed=True)
+        header.label(text=title.capitalize())
+        if body is not None:
+            for field in shown:
+                _draw_field(body, context, stage, field)
+
+
+def _draw_fields(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView,
+                 names) -> None:
+    stage = stages()[view.stage]
+    for name in names:
+        _draw_field(layout, context, stage, stage.fields[name])
+
+
+def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
+                field: Field) -> None:
+    group = properties.group_of(context.scene, stage)
+    has_place = (field.kind == "vector" and field.length == 3 and field.unit == "m"
+                 and "branch_folder" in stage.fields and field.name not in WAYS)
+    if not (field.is_optional and properties.has_switch(field)) and not has_place:
+        layout.prop(group, field.name)
+        return
+    row = layout.row(heading=field.label)
+    inner = row
+    if field.is_optional:
+        row.prop(group, properties.OPEN + field.name, text="")
+        inner = row.row()
+        inner.active = getattr(group, properties.OPEN + field.name)
+    inner.prop(group, field.name, text="")
+    if has_place:
+        operator = row.operator("limber.from_cursor", text="", icon="CURSOR")
+        operator.stage, operator.field = stage.name, field.name
+
+
+def _draw_text(layout: bpy.types.UILayout, text: str, icon: str) -> None:
+    column = layout.column(align=True)
+    for number, line in enumerate(textwrap.wrap(text, 44)[:12]):
+        column.label(text=line, icon=icon if number == 0 else "BLANK1")
+
+
+def register() -> None:
+    for number, step in enumerate(STEPS):
+        panel = type(f"LIMBER_PT_{step.name}", (StepPanel, bpy.types.Panel), {
+            "bl_idname": f"LIMBER_PT_{step.name}", "bl_label": f"{number + 1}  {step.title}",
+            "bl_order": _FIRST_ORDER + number, "step": step, "__module__": __name__,
+            "bl_options": set() if step.name in ("scan", "skeleton") else {"DEFAULT_CLOSED"}})
+        bpy.utils.register_class(panel)
+        _registered.append(panel)
+
+
+def unregister() -> None:
+    while _registered:
+        bpy.utils.unregister_class(_registered.pop())

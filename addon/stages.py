@@ -1,0 +1,219 @@
+"""What the worker's stages take, read from ``stages.json``: the one source of panels and settings.
+
+``limber schema`` writes that file (``scripts/make_addon_schema``), so that the add-on knows every
+setting without a worker. No bpy here.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT = 1
+_FILE = Path(__file__).with_name("stages.json")
+
+
+class SettingError(ValueError):
+    """A value that the worker would not take; says which and what to give."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One input, setting or option of a stage.
+
+    Attributes:
+        name: As the command line has it, with ``_``.
+        kind: ``boolean``, ``integer``, ``number``, ``string``, ``path``, ``choice``, ``vector``
+            (``length`` numbers), ``list`` (any number of texts or numbers) or ``rows`` (any number
+            of vectors, ``length`` numbers each).
+        title: What the user reads, without the unit.
+        description: The tooltip.
+        group: The title under which it stands.
+        unit: Of its value, or nothing.
+        default: As JSON has it; None where it may be left open.
+        is_required: It has no default.
+        is_optional: It may be left open.
+        is_argument: Given on the command line without its name.
+        is_expert: Shown on demand only.
+        choices: Of a choice.
+        least, most: Bounds of a number, or None; ``is_open`` says that ``least`` itself is out.
+        length: Of a vector.
+    """
+
+    name: str
+    kind: str
+    title: str
+    description: str
+    group: str
+    unit: str = ""
+    default: Any = None
+    is_required: bool = False
+    is_optional: bool = False
+    is_argument: bool = False
+    is_expert: bool = False
+    choices: tuple[str, ...] = ()
+    least: float | None = None
+    most: float | None = None
+    is_open: bool = False
+    length: int = 0
+
+    @property
+    def label(self) -> str:
+        """The title with the unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def typed(self, value: Any) -> list[str]:
+        """Return ``value`` as options of a command line; SettingError where it is none."""
+        flag = "--" + self.name.replace("_", "-")
+        if self.kind == "boolean":
+            return [flag if value else f"--no-{flag[2:]}"]
+        if self.kind == "vector":
+            return [flag, *map(number_text, value)]
+        if self.kind == "rows":
+            return [text for row in _rows(self, value) for text in (flag, *map(number_text, row))]
+        if self.kind == "list":
+            return [flag, ",".join(_items(value))]
+        return [flag, number_text(value) if self.kind == "number" else str(value)]
+
+    def is_default(self, value: Any) -> bool:
+        """Whether ``value``, of single precision as Blender keeps it, is the default."""
+        if self.kind in ("vector", "number") and value is not None and self.default is not None:
+            return np.array_equal(np.asarray(value, np.float32),
+                                  np.asarray(self.default, np.float32))
+        if self.kind == "rows":
+            return _rows(self, value) == self.default
+        if self.kind == "list":
+            return _items(value) == [number_text(item) if isinstance(item, float) else str(item)
+                                     for item in self.default]
+        if self.kind in ("path", "string") and self.default is None:
+            return not value
+        return value == self.default
+
+    def shown(self, value: Any) -> Any:
+        """Return ``value``, as JSON has it, as a panel keeps it: lists are text."""
+        if self.kind == "rows":
+            return "; ".join(" ".join(map(number_text, row)) for row in value)
+        if self.kind == "list":
+            return ", ".join(number_text(item) if isinstance(item, float) else str(item)
+                             for item in value)
+        return value
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stage of the worker: its fields by name, and what it reads and writes."""
+
+    name: str
+    summary: str
+    key: str
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    fields: dict[str, Field]
+    settings: frozenset[str]
+
+    def groups(self) -> dict[str, list[Field]]:
+        """Return the fields by the title of their group, in the worker's order."""
+        found: dict[str, list[Field]] = {}
+        for field in self.fields.values():
+            found.setdefault(field.group, []).append(field)
+        return found
+
+    def arguments(self, values: Mapping[str, Any]) -> list[str]:
+        """Return the command line that gives the stage these values; defaults are left out.
+
+        Fields that ``values`` does not have keep the worker's default.
+
+        Raises:
+            SettingError: what is required is missing, or a text is no list of what it should be.
+        """
+        options: list[str] = []
+        arguments: list[str] = []
+        for field in self.fields.values():
+            if field.name not in values and not field.is_required:
+                continue
+            value = values.get(field.name)
+            if field.is_required and not value:
+                raise SettingError(f"{field.title} is missing: {field.description}")
+            if field.is_argument:
+                arguments.append(str(value))
+            elif value is not None and not field.is_default(value):
+                options += field.typed(value)
+        return [self.name, *options, "--", *arguments]
+
+
+@cache
+def stages() -> dict[str, Stage]:
+    """Return the stages by name, in the order in which they run.
+
+    Raises:
+        RuntimeError: the file is of another version than this add-on.
+    """
+    content = json.loads(_FILE.read_text(encoding="utf-8"))
+    if content.get("format") != FORMAT:
+        raise RuntimeError(f"{_FILE.name} has format {content.get('format')}, this add-on reads "
+                           f"{FORMAT}. Install the add-on again.")
+    return {name: _stage(name, told) for name, told in content["stages"].items()}
+
+
+def number_text(value: Any) -> str:
+    """Return a number as short as its single precision allows: 0.1, not 0.10000000149."""
+    if isinstance(value, int):
+        return str(value)
+    return str(float(str(np.float32(value))))
+
+
+def _stage(name: str, told: dict[str, Any]) -> Stage:
+    fields = {}
+    for part in ("inputs", "settings", "options"):
+        required = told[part].get("required", [])
+        for field, about in told[part].get("properties", {}).items():
+            fields[field] = _field(field, about, is_required=field in required)
+    return Stage(name, told["summary"], told["key"], tuple(told["reads"]), tuple(told["writes"]),
+                 fields, frozenset(told["settings"].get("properties", {})))
+
+
+def _field(name: str, about: dict[str, Any], *, is_required: bool) -> Field:
+    kinds = [kind for kind in about.get("anyOf", [about]) if kind.get("type") != "null"]
+    kind = kinds[0]
+    least = kind.get("minimum", kind.get("exclusiveMinimum"))
+    return Field(
+        name, _kind(kind), about["title"], about.get("description", ""), about["group"],
+        unit=about.get("unit", ""), default=about.get("default"), is_required=is_required,
+        is_optional=not is_required and about.get("default") is None,
+        is_argument=about.get("argument", False), is_expert=about["expert"],
+        choices=tuple(kind.get("enum", ())), least=least,
+        most=kind.get("maximum", kind.get("exclusiveMaximum")),
+        is_open="exclusiveMinimum" in kind,
+        length=len((kind.get("items", kind) if kind["type"] == "array" else {}).get(
+            "prefixItems", ())))
+
+
+def _kind(about: dict[str, Any]) -> str:
+    if "enum" in about:
+        return "choice"
+    if about["type"] == "array":
+        if "prefixItems" in about:
+            return "vector"
+        return "rows" if about["items"].get("type") == "array" else "list"
+    return "path" if about.get("format") == "path" else about["type"]
+
+
+def _items(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _rows(field: Field, text: str) -> list[list[float]]:
+    try:
+        rows = [[float(part) for part in row.split()] for row in text.split(";") if row.strip()]
+    except ValueError as error:
+        raise SettingError(f"{field.title}: {error}. {_ROWS_HELP}") from error
+    if any(len(row) != field.length for row in rows):
+        raise SettingError(f"{field.title} takes {field.length} numbers each time. {_ROWS_HELP}")
+    return rows
+
+
+_ROWS_HELP = "Write numbers with spaces between them, and ; between one and the next."

@@ -1,0 +1,99 @@
+"""The steps of the work: which stages stand in which panel, and how far each of them is. No bpy.
+
+Everything about a stage itself comes from its schema; here is only where the user meets it.
+"""
+
+import enum
+from dataclasses import dataclass
+
+FROM_SCENE = frozenset({"branch_folder", "output", "data", "render"})
+"""Inputs that the add-on gives itself: no panel asks for them."""
+NOT_FROM_HERE = {"execute": frozenset({"arm", "confirm", "after_stop"})}
+"""What the add-on never sets: a robot is set in motion at a terminal, by who stands beside it."""
+WAYS = frozenset({"move"})
+"""Vectors in metres that say how far, not where: the 3D cursor does not give them."""
+
+
+class StepState(enum.Enum):
+    """How far a stage is, with what the user reads and the icon beside it."""
+
+    NOT_RUN = ("not run yet", "RADIOBUT_OFF")
+    RUNNING = ("running", "SORTTIME")
+    DONE = ("done", "CHECKMARK")
+    STALE = ("out of date: what it read has changed", "FILE_REFRESH")
+    CHANGED = ("out of date: its settings have changed", "FILE_REFRESH")
+    FAILED = ("failed", "ERROR")
+
+    @property
+    def words(self) -> str:
+        return self.value[0]
+
+    @property
+    def icon(self) -> str:
+        return self.value[1]
+
+
+@dataclass(frozen=True)
+class StageView:
+    """A stage in a step: the label of its button, and the groups of settings shown with it."""
+
+    stage: str
+    label: str
+    groups: tuple[str, ...] | None = None
+    """None: all."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One panel: its stage, the groups of others that belong to it, and further stages.
+
+    ``scene_operator`` stands instead of the stage's button where the step itself runs none.
+    """
+
+    name: str
+    title: str
+    view: StageView
+    others: tuple[StageView, ...] = ()
+    settings_of: tuple[StageView, ...] = ()
+    scene_operator: tuple[str, str] = ()
+    hint: str = ""
+
+
+STEPS = (
+    Step("scan", "Scan", StageView("reconstruct", "", ("input",)),
+         scene_operator=("limber.import_cloud", "Import Scan")),
+    Step("skeleton", "Skeleton", StageView("reconstruct", "Reconstruct", ("shape", "running"))),
+    Step("mesh", "Mesh", StageView("reconstruct", "Reconstruct", ("mesh",)),
+         others=(StageView("mesh", "Mesh a Closed Surface"),),
+         hint="Made together with the skeleton"),
+    Step("material", "Material", StageView("reconstruct", "", ("material",)),
+         others=(StageView("simulate", "Simulate a Motion"),),
+         scene_operator=("limber.color_by", "Show Young's Modulus")),
+    Step("pulls", "Pulls", StageView("import-pull", "Import Pull"),
+         others=(StageView("virtual-pull", "Simulate a Pull"),)),
+    Step("estimate", "Estimate", StageView("estimate", "Estimate"),
+         others=(StageView("predict", "Predict Another Load"),)),
+    Step("goal", "Goal", StageView("energy", "Sample the Energy"),
+         settings_of=(StageView("plan", "", ("start and goal",)),),
+         others=(StageView("target", "Name a Target"),)),
+    Step("plan", "Plan", StageView("plan", "Plan Path", (
+        "output", "weights and limits", "solver", "running"))),
+    Step("robot", "Robot", StageView("execute", "Check With Robot"),
+         hint="A dry run: a robot is armed at a terminal"),
+    Step("report", "Report", StageView("report", "Write Report")),
+)
+
+RUN = tuple(dict.fromkeys(view.stage for step in STEPS for view in (step.view, *step.others)))
+"""The stages that the add-on can run."""
+
+
+def button_of(stage: str) -> str:
+    """Return what the button of a stage says: also the title of its job."""
+    return next(view.label for step in STEPS for view in (step.view, *step.others)
+                if view.stage == stage and view.label)
+
+
+def next_step(step: Step) -> Step | None:
+    """Return the step after this one."""
+    number = STEPS.index(step) + 1
+    return STEPS[number] if number < len(STEPS) else None
