@@ -62,7 +62,8 @@ class Step:
 STEPS = (
     Step("scan", "Scan", StageView("reconstruct", "", ("input",)),
          scene_operator=("limber.import_cloud", "Import Scan")),
-    Step("skeleton", "Skeleton", StageView("reconstruct", "Reconstruct", ("shape", "running"))),
+    Step("skeleton", "Skeleton", StageView("reconstruct", "Reconstruct", ("shape", "running")),
+         others=(StageView("skeleton", "Review and Edit"),)),
     Step("mesh", "Mesh", StageView("reconstruct", "Reconstruct", ("mesh",)),
          others=(StageView("mesh", "Mesh a Closed Surface"),),
          hint="Made together with the skeleton"),
@@ -85,6 +86,10 @@ STEPS = (
 
 RUN = tuple(dict.fromkeys(view.stage for step in STEPS for view in (step.view, *step.others)))
 """The stages that the add-on can run."""
+NOT_RUN_HERE = {
+    "record": "it moves a robot", "generate": "it makes scans, no branch",
+    "scene": "`limber.open_result` draws what it says"}
+"""The others, and why."""
 
 
 def button_of(stage: str) -> str:

@@ -39,7 +39,7 @@ class StageOperator(WorkerOperator):
         self._is_asked = self.replace = True
         return context.window_manager.invoke_confirm(
             self, event, title="Replace the branch?", message=trouble, confirm_text="Replace",
-            icon="WARNING")
+            icon="QUESTION")
 
     def execute(self, context):
         if self._is_asked:
@@ -52,7 +52,7 @@ class StageOperator(WorkerOperator):
         self._take_keywords(context)
         stage, settings = self.stage, context.scene.limber
         values = properties.values_of(properties.group_of(context.scene, stage), stage)
-        if "output" in stage.fields:
+        if _makes_branch(stage):
             trouble = self._foreign(context)
             if trouble and not self.replace:
                 raise ValueError(f"{trouble} Choose another branch folder, or run it with "
@@ -88,7 +88,7 @@ class StageOperator(WorkerOperator):
         for name in properties.stage_properties(self.stage):
             if not self.properties.is_property_set(name):
                 continue
-            if name in ("output", "branch_folder"):
+            if name == ("output" if _makes_branch(self.stage) else "branch_folder"):
                 context.scene.limber.branch_folder = getattr(self, name)
                 continue
             setattr(group, name, getattr(self, name))
@@ -107,7 +107,7 @@ class StageOperator(WorkerOperator):
 
     def _foreign(self, context) -> str:
         """Return why the folder is not this scan's, or nothing."""
-        if "output" not in self.stage.fields:
+        if not _makes_branch(self.stage):
             return ""
         source = self._source(context)
         if not context.scene.limber.branch_folder:
@@ -120,6 +120,11 @@ class StageOperator(WorkerOperator):
 
 def _folder_of(context) -> Path:
     return Path(bpy.path.abspath(context.scene.limber.branch_folder))
+
+
+def _makes_branch(stage: Stage) -> bool:
+    """Whether the stage makes a branch folder; all others work in one."""
+    return "branch_folder" not in stage.fields
 
 
 def _is_seen(stage: Stage) -> bool:

@@ -105,7 +105,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
 
 
 @pytest.mark.parametrize(("name", "operators"), [
-    ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct"]),
+    ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct", "limber.skeleton"]),
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
     ("material", ["limber.color_by", "limber.simulate"]),
     ("pulls", ["limber.import_pull", "limber.virtual_pull"]),

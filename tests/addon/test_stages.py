@@ -22,6 +22,12 @@ def test_the_shipped_schema_is_the_workers():
     assert shipped == json.loads(json.dumps(all_schemas())), "run scripts/make_addon_schema"
 
 
+def test_every_stage_has_its_place_in_the_add_on(addon):
+    """A new stage stands in a step, or it is said why not."""
+    steps = importlib.import_module("limber_addon.steps")
+    assert {*steps.RUN, *steps.NOT_RUN_HERE} == set(NAMES)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_command_line_gives_the_worker_what_the_panel_has(stages, name):
     """Values other than the defaults reach the worker's models as they are."""
