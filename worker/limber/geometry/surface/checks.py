@@ -60,16 +60,17 @@ class SurfaceCheck:
 def check_surface(surface: Surface) -> SurfaceCheck:
     """Check a surface; costs about half a second for 100,000 faces."""
     edges = np.vstack([surface.faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    _, inverse, counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    # Both ends in one number: sorted ten times as fast as rows.
+    key = edges.min(axis=1) * len(surface.vertices) + edges.max(axis=1)
+    _, inverse, counts = np.unique(key, return_inverse=True, return_counts=True)
     wrong = counts[inverse.ravel()] != 2
     turn = np.where(edges[:, 0] < edges[:, 1], 1, -1)
     balance = np.bincount(inverse.ravel(), turn, len(counts))
     volume = surface.volume
-    middle = surface.vertices[edges].mean(axis=1)
     return SurfaceCheck(
         not wrong.any(), bool((balance[counts == 2] == 0).all()) and volume > 0,
-        middle[wrong], crossings(surface), volume, int(pieces(surface).max(initial=-1)) + 1)
+        surface.vertices[edges[wrong]].mean(axis=1), crossings(surface), volume,
+        int(pieces(surface).max(initial=-1)) + 1)
 
 
 def pieces(surface: Surface) -> np.ndarray:

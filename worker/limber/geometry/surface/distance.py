@@ -53,11 +53,16 @@ def _distances(points: np.ndarray, bound: np.ndarray, corner: np.ndarray, origin
 def _square(p: np.ndarray, corner: np.ndarray) -> float:
     """Square of the distance of a point from a triangle (Ericson, Real-Time Collision Detection,
     5.1.5)."""
-    a, b, c = corner[0], corner[1], corner[2]
-    ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
-    d1, d2 = (ab * ap).sum(), (ac * ap).sum()
-    d3, d4 = (ab * bp).sum(), (ac * bp).sum()
-    d5, d6 = (ab * cp).sum(), (ac * cp).sum()
+    bx, by, bz = (corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1],
+                  corner[1, 2] - corner[0, 2])
+    cx, cy, cz = (corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1],
+                  corner[2, 2] - corner[0, 2])
+    px, py, pz = p[0] - corner[0, 0], p[1] - corner[0, 1], p[2] - corner[0, 2]
+    d1, d2 = bx * px + by * py + bz * pz, cx * px + cy * py + cz * pz
+    bb, cc = bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz
+    bc = bx * cx + by * cy + bz * cz
+    # The same products with the point seen from the other two corners.
+    d3, d4, d5, d6 = d1 - bb, d2 - bc, d1 - bc, d2 - cc
     v, w = 0.0, 0.0
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
     if d1 <= 0 and d2 <= 0:
@@ -77,5 +82,5 @@ def _square(p: np.ndarray, corner: np.ndarray) -> float:
     else:
         total = va + vb + vc
         v, w = (vb / total, vc / total) if total > 0 else (0.0, 0.0)
-    rest = ap - v * ab - w * ac
-    return (rest * rest).sum()
+    x, y, z = px - v * bx - w * cx, py - v * by - w * cy, pz - v * bz - w * cz
+    return x * x + y * y + z * z

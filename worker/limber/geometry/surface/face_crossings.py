@@ -83,25 +83,25 @@ def pierced(vertices: np.ndarray, faces: np.ndarray, low: np.ndarray, high: np.n
 @njit(cache=True)
 def _compare(vertices: np.ndarray, faces: np.ndarray, one: int, other: int, found: list) -> None:
     """Add the points where edges of ``one`` go through ``other`` (Moeller and Trumbore 1997)."""
-    common = np.zeros(3, np.bool_)
-    number = 0
+    o, p, q = faces[other, 0], faces[other, 1], faces[other, 2]
+    common, number = 0, 0  # corners of ``one`` that ``other`` has too, a bit each
     for i in range(3):
-        for j in range(3):
-            if faces[one, i] == faces[other, j]:
-                common[i] = True
-                number += 1
+        corner = faces[one, i]
+        if corner == o or corner == p or corner == q:
+            common |= 1 << i
+            number += 1
     if number > 1:
         return
-    o, p, q = faces[other]
-    ox, oy, oz = vertices[o]
+    ox, oy, oz = vertices[o, 0], vertices[o, 1], vertices[o, 2]
     sx, sy, sz = vertices[p, 0] - ox, vertices[p, 1] - oy, vertices[p, 2] - oz
     ex, ey, ez = vertices[q, 0] - ox, vertices[q, 1] - oy, vertices[q, 2] - oz
     for i in range(3):
         after = (i + 1) % 3
-        if common[i] or common[after]:
+        if common & (1 << i | 1 << after):
             continue
-        ax, ay, az = vertices[faces[one, i]]
-        bx, by, bz = vertices[faces[one, after]]
+        a, b = faces[one, i], faces[one, after]
+        ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+        bx, by, bz = vertices[b, 0], vertices[b, 1], vertices[b, 2]
         dx, dy, dz = bx - ax, by - ay, bz - az
         cx, cy, cz = dy * ez - dz * ey, dz * ex - dx * ez, dx * ey - dy * ex
         det = sx * cx + sy * cy + sz * cz

@@ -11,13 +11,14 @@ angle of the fork and however many twigs meet there.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import polygon_factor, tangents
-from limber.geometry.surface.checks import SurfaceCheck, check_surface
+from limber.geometry.surface.checks import SurfaceCheck, check_surface, crossings
 from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.rounded_union import distances, fillet_level, near_box, segments
 from limber.geometry.surface.surface import Surface
@@ -52,24 +53,53 @@ def smooth_forks(surface: Surface, skeleton: Skeleton, *, sides: int | None = No
         stay sharp.
     """
     forks = {fork.run: fork for fork in _forks(skeleton, sides, spacing)}
-    fillets = {run: fork.fillet(_SCALES[0]) for run, fork in forks.items()}
+    made = {run: fork.fillet(_SCALES[0]) for run, fork in forks.items()}
+    fillets = {run: solid(f.vertices, f.faces) for run, f in made.items() if f is not None}
+    cylinders = solid(surface.vertices, surface.faces)
     tolerance = 0.02 * float(skeleton.radius.min())
     # Where a fillet crosses something, another lattice may do; then it is left out.
-    for scale in (*_SCALES[1:], None, None):
-        made = [fillet for fillet in fillets.values() if fillet is not None]
-        joined = _joined(surface, made, tolerance)
+    for another in (True, False, False, False):
+        joined = _joined([cylinders, *fillets.values()], tolerance)
         if joined is None or abs(joined.volume / surface.volume - 1) > VOLUME_CHANGE:
             break
         check = check_surface(joined)
         if check.valid:
-            return joined, check, _warnings(len(forks) - len(made), len(forks))
-        wrong = [run for run, fillet in fillets.items()
-                 if fillet is not None and _holds(fillet, check.crossings)]
+            return joined, check, _warnings(len(forks) - len(fillets), len(forks))
+        wrong = [run for run, fillet in fillets.items() if _holds(fillet, check.crossings)]
         if not wrong:
             break
         for run in wrong:
-            fillets[run] = None if scale is None else forks[run].fillet(scale)
+            first = fillets.pop(run)
+            others = [cylinders, *(near for near in fillets.values() if _meet(near, first))]
+            other = _uncrossed(forks[run], first, others, tolerance) if another else None
+            if other is not None:
+                fillets[run] = other
     return surface, check_surface(surface), _warnings(len(forks), len(forks))
+
+
+def _uncrossed(fork: "_Fork", first: Any, others: list, tolerance: float) -> Any:
+    """A fillet from another lattice that crosses nothing around it; None if there is none.
+
+    Args:
+        fork: Where.
+        first: The solid that crosses something.
+        others: The solids that it joins.
+        tolerance: How far triangles may move when they are joined [m].
+    """
+    import manifold3d
+
+    low, high = _box(first)
+    room = manifold3d.Manifold.cube(tuple(high - low)).translate(tuple(low))
+    around = [part ^ room for part in others]
+    for scale in _SCALES[1:]:
+        made = fork.fillet(scale)
+        if made is None:
+            continue
+        fillet = solid(made.vertices, made.faces)
+        joined = _joined([*around, fillet], tolerance)
+        if joined is not None and len(crossings(joined)) == 0:
+            return fillet
+    return None
 
 
 def crease_angles(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
@@ -99,11 +129,22 @@ def _warnings(plain: int, count: int) -> list[str]:
             "it or change its volume."] if plain else []
 
 
-def _holds(fillet: Surface, places: np.ndarray) -> bool:
-    """Whether any of the places [m], shape [n, 3], lies in the box around a fillet."""
-    low, high = fillet.vertices.min(axis=0), fillet.vertices.max(axis=0)
+def _box(fillet: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box with some room around a fillet's solid [m], shape [3] each."""
+    low, high = np.reshape(fillet.bounding_box(), (2, 3))
     margin = 0.1 * (high - low)
-    return bool(((places > low - margin) & (places < high + margin)).all(axis=1).any())
+    return low - margin, high + margin
+
+
+def _holds(fillet: Any, places: np.ndarray) -> bool:
+    """Whether any of the places [m], shape [n, 3], lies in the box around a fillet."""
+    low, high = _box(fillet)
+    return bool(((places > low) & (places < high)).all(axis=1).any())
+
+
+def _meet(one: Any, other: Any) -> bool:
+    (low, high), (begin, end) = _box(one), _box(other)
+    return bool((low < end).all() and (begin < high).all())
 
 
 @dataclass(frozen=True)
@@ -207,11 +248,10 @@ def _fork(run: int, axis: tuple[np.ndarray, np.ndarray], twig: np.ndarray,
                  float(longest) if fades else np.inf)
 
 
-def _joined(surface: Surface, fillets: list[Surface], tolerance: float) -> Surface | None:
+def _joined(solids: list, tolerance: float) -> Surface | None:
     """The union of the cylinders and the fillets; None if that is empty."""
     import manifold3d
 
-    solids = [solid(part.vertices, part.faces) for part in (surface, *fillets)]
     joined = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).simplify(tolerance)
     try:
         return largest_piece(joined)

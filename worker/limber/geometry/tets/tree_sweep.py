@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import any_normal, bending_factor, frames, rings, tangents
+from limber.geometry.skeleton.sweep import bending_factor, frames, rings, tangents
 from limber.geometry.tets.cylinder_mesh import split_wedges
 from limber.geometry.tets.tet_mesh import TetMesh
 
@@ -23,6 +23,8 @@ _FLAT = 0.02  # a tetrahedron's shape under that (1 is regular) is avoided
 _SHIFTS = (1, -1, 2, -2, 3, -3)  # where else a twig's slice may go, in its own lengths
 _CLAMP_SLICES = (1.0, 3.0)  # where the first slices end, in radii of the root
 _TAPERED, _THINNEST = 2.5, 0.06  # radius ratio from which rings are graded; down to which
+_STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # where a twig's first ring is tried, and how far it leans
+_NEAR = 2.5  # radii beyond the first place that will do, within which the best one is taken
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
 
@@ -118,15 +120,13 @@ class _TreeSweep:
         self._axes = [_Axis.of(skeleton, run) for run in range(skeleton.branch_count)]
         starts = [members[0] for members in skeleton.runs()]
         self._carrier = [-1] + [int(skeleton.branch[start]) for start in starts[1:]]
-        self._nodes: list[np.ndarray] = []
-        self._node_count = 0
-        self._tets: list[np.ndarray] = []
+        self._nodes = np.empty((0, 3))
+        self._tets = np.empty((0, 4), np.int64)
         self._swept: dict[int, _Swept] = {}
         self._left_out: list[int] = []
 
     def result(self) -> SweptTree:
-        mesh = TetMesh(np.vstack(self._nodes), np.vstack(self._tets))
-        return SweptTree(mesh, self._left_out)
+        return SweptTree(TetMesh(self._nodes, self._tets), self._left_out)
 
     def add_run(self, run: int) -> None:
         if run == 0:
@@ -146,7 +146,7 @@ class _TreeSweep:
                first_tangent: np.ndarray | None = None) -> bool:
         axis = self._axes[run]
         windows = self._plan_windows(run, start)
-        first = self._node_count
+        first = len(self._nodes)
         where, mesh, centres = self._unfolded(axis, start, windows, sides, first_normal,
                                               first_tangent)
         nodes = mesh.nodes
@@ -158,9 +158,8 @@ class _TreeSweep:
             return False
         slices = {w.run: int(np.argmin(np.abs(where - w.low))) for w in windows
                   if np.abs(where - w.low).min() < 1e-9}
-        self._nodes.append(nodes)
-        self._node_count += len(nodes)
-        self._tets.append(mesh.tets + first)
+        self._nodes = np.vstack([self._nodes, nodes])
+        self._tets = np.vstack([self._tets, mesh.tets + first])
         self._swept[run] = _Swept(axis, where, first + np.arange(len(where)) * (sides + 1), sides,
                                   centres, slices)
         return True
@@ -299,7 +298,7 @@ class _TreeSweep:
         radius = float(self._axes[run].radius[1 if len(self._axes[run].radius) > 1 else 0])
         thick = sides == 6 and radius > _THICK_TWIG * float(
             carrier.axis.radius_at(carrier.where[at]))
-        nodes = np.vstack(self._nodes)
+        nodes = self._nodes
         middle = (nodes[low] + nodes[high]) / 2
         outward = next(w.outward for w in self._plan_windows_of(carrier, run))
         found = []
@@ -325,46 +324,29 @@ class _TreeSweep:
     def _grow(self, carrier: _Swept, run: int, patch: "_Patch") -> bool:
         """Join the twig to the patch: find the best first ring clear of it, sweep, fill between."""
         axis = self._axes[run]
-        known = np.vstack(self._nodes)
-        triangles = self._patch_triangles(patch)
-        _, foot = axis.nearest(known[patch.loop].mean(axis=0)[None])
-        joints = []
-        for start in np.linspace(foot[0], 0.75 * axis.length, 60):
-            for lean in (0.3, 0.8, 1.6):
-                joint = self._joint(axis, float(start), lean, patch, triangles, known)
-                if joint is not None:
-                    joints.append(joint)
-            if joints and start > joints[0].start + 2.5 * axis.radius_at(start):
-                break
-        for joint in sorted(joints, key=lambda found: -found.quality):
-            first = self._node_count
+        corner = self._nodes[patch.loop]
+        _, foot = axis.nearest(corner.mean(axis=0)[None])
+        start, lean = np.meshgrid(np.linspace(foot[0], 0.75 * axis.length, _STARTS), _LEANS,
+                                  indexing="ij")
+        joints = _joints(axis, start.ravel(), lean.ravel(), patch, corner,
+                         self._patch_triangles(patch))
+        # The best one near the patch: those farther out are for twigs that leave at a small angle.
+        near = [joint for joint in joints if joint.start <= joints[0].start + _NEAR * float(
+            axis.radius_at(joint.start))]
+        for joint in sorted(near, key=lambda found: -found.quality):
+            first = len(self._nodes)
             if self._sweep(run, joint.start, len(patch.loop), joint.turn, joint.tangent):
-                self._tets.append(np.where(joint.tets >= 0, joint.tets, first - 1 - joint.tets))
+                block = np.where(joint.tets >= 0, joint.tets, first - 1 - joint.tets)
+                self._tets = np.vstack([self._tets, block])
                 return True
         return False
 
-    def _joint(self, axis: _Axis, start: float, lean: float, patch: "_Patch",
-               triangles: np.ndarray, known: np.ndarray) -> "_Joint | None":
-        """The block between a patch and a twig's first ring at ``start``, if it is sound."""
-        sides = len(patch.loop)
-        radius = float(axis.radius_at(start))
-        ahead = axis.at(min(start + radius, axis.length)) - axis.at(max(start - radius, 0.0))
-        tangent = ahead / np.linalg.norm(ahead) + lean * patch.outward
-        tangent /= np.linalg.norm(tangent)
-        centre = axis.at(start)
-        order, turn = _matched(known[patch.loop], centre, tangent)
-        ring = rings(centre[None], np.array([radius]), turn[None],
-                     np.cross(tangent, turn)[None], sides, bending_factor(sides))[0]
-        tets, quality = _block(known, patch.loop[order], triangles, centre, ring)
-        return None if quality < _FLAT else _Joint(start, tangent, turn, tets, quality)
-
     def _patch_triangles(self, patch: "_Patch") -> np.ndarray:
         """The carrier's boundary triangles on the patch, outward, shape [2 or 4, 3]."""
-        inside = np.zeros(self._node_count, bool)
+        inside = np.zeros(len(self._nodes), bool)
         inside[patch.loop] = True
-        tets = np.vstack(self._tets)
         # Both tetrahedra at a face have three corners in the loop if the face has.
-        near = tets[inside[tets].sum(axis=1) > 2]
+        near = self._tets[inside[self._tets].sum(axis=1) > 2]
         faces = TetMesh(np.empty((0, 3)), near).surface_faces()
         return faces[inside[faces].all(axis=1)]
 
@@ -411,34 +393,79 @@ def _wedges(ring_count: int, sides: int) -> np.ndarray:
                     axis=2).reshape(-1, 6)
 
 
-def _matched(corner: np.ndarray, centre: np.ndarray, tangent: np.ndarray,
-             ) -> tuple[np.ndarray, np.ndarray]:
-    """Order of the patch's corners counter-clockwise about the twig, and the ring's first normal
-    so that ring corner k stands over patch corner k with the least twist."""
-    first = any_normal(tangent)
+def _joints(axis: _Axis, start: np.ndarray, lean: np.ndarray, patch: _Patch, corner: np.ndarray,
+            triangles: np.ndarray) -> list[_Joint]:
+    """The sound blocks between a patch and a twig's first ring.
+
+    Args:
+        axis: The twig's.
+        start: Where along it the ring may be [m], shape [j].
+        lean: How far the ring leans over towards the patch, shape [j].
+        patch: What the twig grows out of.
+        corner: The patch's corners [m], shape [sides, 3].
+        triangles: The carrier's faces there, node indices, shape [2 or 4, 3].
+    """
+    sides = len(corner)
+    radius = axis.radius_at(start)
+    ahead = axis.at(np.minimum(start + radius, axis.length)) - axis.at(
+        np.maximum(start - radius, 0.0))
+    tangent = _unit(ahead) + lean[:, None] * patch.outward
+    tangent = _unit(tangent)
+    centre = axis.at(start)
+    backwards, turn = _matched(corner, tangent)
+    ring = rings(centre, radius, turn, np.cross(tangent, turn), sides, bending_factor(sides))
+    base = np.where(backwards[:, None, None], corner[::-1], corner)
+    nodes = np.concatenate([base, centre[:, None], ring], axis=1)
+    sorter = np.argsort(patch.loop)
+    local = sorter[np.searchsorted(patch.loop, triangles, sorter=sorter)]
+    local = np.where(backwards[:, None, None], sides - 1 - local, local)
+    block, quality = _blocks(nodes, local)
+    joints = []
+    for place in np.flatnonzero(quality >= _FLAT):
+        order = patch.loop[::-1] if backwards[place] else patch.loop
+        numbers = np.concatenate([order, -1 - np.arange(sides + 1)])
+        joints.append(_Joint(float(start[place]), tangent[place], turn[place],
+                             numbers[block[place]], float(quality[place])))
+    return joints
+
+
+def _matched(corner: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which way a patch's corners run about each twig, and the first normal of each one's ring.
+
+    Ring corner k then stands over patch corner k with the least twist.
+
+    Args:
+        corner: The patch's corners [m], shape [sides, 3].
+        tangent: Directions of the twigs, shape [j, 3].
+
+    Returns:
+        Whether the corners must be taken backwards, to run counter-clockwise, shape [j]; normals,
+        shape [j, 3].
+    """
+    first = _unit(np.cross(tangent, np.eye(3)[np.argmin(np.abs(tangent), axis=1)]))
     second = np.cross(tangent, first)
     flat = corner - corner.mean(axis=0)
-    angle = np.arctan2(flat @ second, flat @ first)
-    count = len(corner)
-    order = np.arange(count)
-    if np.sum(np.sin(np.diff(np.append(angle, angle[0])))) < 0:
-        order = order[::-1]
-        angle = angle[::-1]
-    offset = np.angle(np.exp(1j * (angle - 2 * np.pi * np.arange(count) / count)).sum())
-    return order, np.cos(offset) * first + np.sin(offset) * second
+    angle = np.arctan2(second @ flat.T, first @ flat.T)
+    backwards = np.sin(np.roll(angle, -1, axis=1) - angle).sum(axis=1) < 0
+    angle = np.where(backwards[:, None], angle[:, ::-1], angle)
+    even = 2 * np.pi * np.arange(len(corner)) / len(corner)
+    offset = np.angle(np.exp(1j * (angle - even)).sum(axis=1))[:, None]
+    return backwards, np.cos(offset) * first + np.sin(offset) * second
 
 
-def _block(known: np.ndarray, loop: np.ndarray, triangles: np.ndarray, centre: np.ndarray,
-           ring: np.ndarray) -> tuple[np.ndarray, float]:
-    """Tetrahedra between a patch and a ring, and the smallest radius ratio among them.
+def _blocks(nodes: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tetrahedra between a patch and each ring, and the flattest shape among them.
 
-    The ring's centre and corners are numbered -1, -2, ...; an inverted tetrahedron gives -1 as
-    the quality.
+    Args:
+        nodes: The patch's corners, the ring's centre and its corners [m], shape
+            [j, 2 sides + 1, 3].
+        below: The carrier's triangles on the patch, shape [j, 2 or 4, 3].
+
+    Returns:
+        Indices into ``nodes``, shape [j, t, 4]; smallest shape (1 is regular, negative inverted),
+        shape [j].
     """
-    nodes = np.vstack([known[loop], centre[None], ring])
-    sides = len(ring)
-    local = np.searchsorted(loop, triangles, sorter=np.argsort(loop))
-    local = np.argsort(loop)[local]
+    count, sides = len(nodes), (nodes.shape[1] - 1) // 2
     k = np.arange(sides)
     after, top = (k + 1) % sides, sides
     a, b, top_a, top_b = k, after, sides + 1 + k, sides + 1 + after
@@ -446,18 +473,30 @@ def _block(known: np.ndarray, loop: np.ndarray, triangles: np.ndarray, centre: n
     # Each side quadrilateral lies on the surface, so either diagonal will do.
     one = np.stack([[b, a, top_b, hub], [top_b, a, top_a, hub]], axis=0).transpose(2, 0, 1)
     two = np.stack([[b, a, top_a, hub], [top_b, b, top_a, hub]], axis=0).transpose(2, 0, 1)
-    shape_one, shape_two = (_shapes(nodes, cut).min(axis=1) for cut in (one, two))
-    sidewise = np.where((shape_one >= shape_two)[:, None, None], one, two).reshape(-1, 4)
-    below = np.column_stack([local, np.full(len(local), top)])
-    block = np.vstack([below, sidewise])
-    numbers = np.concatenate([loop, -1 - np.arange(sides + 1)])
-    return numbers[block], float(_shapes(nodes, block).min())
+    shape_one, shape_two = (_shape(nodes[:, cut]).min(axis=2) for cut in (one, two))
+    sidewise = np.where((shape_one >= shape_two)[:, :, None, None], one, two)
+    under = np.concatenate([below, np.full((*below.shape[:2], 1), top)], axis=2)
+    block = np.concatenate([under, sidewise.reshape(count, -1, 4)], axis=1)
+    corner = nodes[np.arange(count)[:, None, None], block]
+    return block, _shape(corner).min(axis=1)
 
 
 def _shapes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Volume over the cube of the mean edge, 1 for a regular tetrahedron, negative if inverted."""
-    corner = nodes[tets]
+    return _shape(nodes[tets])
+
+
+def _shape(corner: np.ndarray) -> np.ndarray:
+    """Volume over the cube of the mean edge, 1 for a regular tetrahedron, negative if inverted.
+
+    Args:
+        corner: Corners [m], shape [..., 4, 3].
+    """
     edges = [corner[..., i, :] - corner[..., j, :] for i in range(4) for j in range(i)]
     square = sum(np.einsum("...k,...k->...", e, e) for e in edges) / 6
-    volume = np.linalg.det(corner[..., 1:, :] - corner[..., :1, :]) / 6
+    a, b, c = (corner[..., k, :] - corner[..., 0, :] for k in (1, 2, 3))
+    volume = np.einsum("...k,...k->...", a, np.cross(b, c)) / 6
     return 6 * np.sqrt(2) * volume / np.maximum(square, 1e-300)**1.5
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
