@@ -14,7 +14,7 @@ from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.virtual_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
-from limber.mechanics.model import PointMass
+from limber.mechanics.added import PointMass
 from limber.stages.mesh import mesh_surface
 from limber.stages.virtual_pull import virtual_pull
 from limber.store import Branch

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
+from limber.mechanics.added import PointMass
 from limber.mechanics.dynamics.simulate import simulate_dynamics
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.model import BranchModel
 from limber.mechanics.sensitivities import static_sensitivities
 from limber.mechanics.statics.rest_shape import unloaded_rest_shape
 from limber.mechanics.statics.solve import solve_static

@@ -9,7 +9,7 @@ import pytest
 
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics import BranchModel, Grasp, young_weights
-from limber.mechanics.model import PointMass
+from limber.mechanics.added import PointMass
 from limber.mechanics.reduced import cache as cache_module
 from limber.mechanics.reduced.cache import ReducedCache, learnt_model, model_key
 from limber.mechanics.reduced.model import ReducedSettings

@@ -15,8 +15,9 @@ from limber.estimation.settings import EstimateSettings
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added import PointMass
 from limber.mechanics.materials import RayleighDamping
-from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames, frames_of

@@ -21,8 +21,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added import PointMass
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.result import DEFAULT_SETTINGS, StaticResult, StaticSettings
 from limber.mechanics.statics.solve import solve_static

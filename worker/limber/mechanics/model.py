@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -11,6 +12,7 @@ from limber.compiled import for_kernels
 from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added import PointMass, Tied, mass_entries, nodal_masses, tied
 from limber.mechanics.elements import shapes as elements
 from limber.mechanics.elements.forces import (
     ForceLayout,
@@ -37,19 +39,6 @@ from limber.mechanics.mesh_checks import check_mesh, fixed_mask
 
 _NO_MEMORY = np.zeros((0, 0, 6))
 DEFAULT_DAMPING = RayleighDamping()
-
-
-@dataclass(frozen=True)
-class PointMass:
-    """A mass that hangs on the branch (a twig, a fruit, a flower).
-
-    Attributes:
-        position: Where [m]; it is tied to the nearest node.
-        mass: [kg].
-    """
-
-    position: tuple[float, float, float]
-    mass: float
 
 
 @dataclass(frozen=True)
@@ -122,8 +111,8 @@ class BranchModel:
         gravity: Acceleration [m/s^2], or None.
         material: Name of a limber.mechanics.materials.Material.
         damping: Rayleigh damping, used in dynamics.
-        point_masses: Added masses.
-        lumped_mass: Diagonal mass matrix instead of the consistent one.
+        point_masses: Added masses, and twigs (:class:`limber.mechanics.added.HungTwig`).
+        lumped_mass: Diagonal mass matrix instead of the consistent one, but for twigs.
 
     Attributes:
         lame_lambda, lame_mu: Lamé coefficients [Pa], shape [tet_count].
@@ -208,10 +197,8 @@ class BranchModel:
         other.hanging = None
         other._data = self._data.moved(nodes)
         other._mass = {}
-        # Added masses stay with their node, not with the place in space.
-        other.point_masses = tuple(
-            replace(point, position=tuple(nodes[node]))
-            for point, (node, _) in zip(self.point_masses, self._added, strict=True))
+        # Added masses stay with their nodes, not with the place in space.
+        other.point_masses = tuple(one.moved(nodes - self.mesh.nodes) for one in self._ties)
         return other
 
     def as_scanned(self) -> "BranchModel":
@@ -363,7 +350,7 @@ class BranchModel:
         """Weight that the mesh's shape does not carry already [N], shape [node_count, 3]."""
         if self.hanging is None:
             return self.mass_load[:, None] * self.gravity
-        later = self._nodal(self._added[self.hanging.mass_count:])
+        later = nodal_masses(self._ties[self.hanging.mass_count:], self.mesh.node_count)
         return later[:, None] * self.gravity
 
     @property
@@ -372,17 +359,13 @@ class BranchModel:
         own = np.bincount(self.mesh.tets.ravel(),
                           (self._data.volume_weights * self.density[:, None]).ravel(),
                           self.mesh.node_count)
-        return own, self._nodal(self._added)
+        return own, nodal_masses(self._ties, self.mesh.node_count)
 
     @property
     def mass_load(self) -> np.ndarray:
         """Mass that gravity acts on at each node [kg], consistent, shape [node_count]."""
         own, added = self.nodal_masses
         return own + added
-
-    def _nodal(self, masses: list[tuple[int, float]]) -> np.ndarray:
-        nodes = np.array([node for node, _ in masses], np.int64)
-        return np.bincount(nodes, [mass for _, mass in masses], self.mesh.node_count)
 
     @property
     def total_mass(self) -> float:
@@ -401,15 +384,12 @@ class BranchModel:
         return product_with(self.mass_matrix, field)
 
     @property
-    def _added(self) -> list[tuple[int, float]]:
-        found = []
-        for point in self.point_masses:
-            if not (np.isfinite(point.mass) and point.mass >= 0):
-                raise InputError(f"An added mass of {point.mass} kg.", "It must be 0 or more.",
-                                 "Give the mass in kilograms.")
-            distance = np.linalg.norm(self.mesh.nodes - np.asarray(point.position), axis=1)
-            found.append((int(distance.argmin()), point.mass))
-        return found
+    def _ties(self) -> list[Tied]:
+        if "ties" not in self._mass:
+            data = self._data
+            self._mass["ties"] = tied(self.mesh, self.point_masses, data.gradients, data.weights,
+                                      data.volume_weights)
+        return self._mass["ties"]
 
     def _make_mass_matrix(self) -> sp.csr_matrix:
         consistent, lumped = elements.node_weights(self.mesh)
@@ -423,10 +403,7 @@ class BranchModel:
             columns = np.tile(tets, (1, per_tet_count)).ravel()
             matrix = sp.csr_matrix(
                 ((consistent * self.density[:, None, None]).ravel(), (rows, columns)), (n, n))
-        added = np.zeros(n)
-        for node, mass in self._added:
-            added[node] += mass
-        return (matrix + sp.diags(added)).tocsr() if added.any() else matrix
+        return (matrix + mass_entries(self._ties, n)).tocsr() if self.point_masses else matrix
 
     def _set(self, young: float | np.ndarray, poisson: float | np.ndarray,
              density: float | np.ndarray) -> None:
@@ -444,7 +421,7 @@ class BranchModel:
         self.lame_lambda, self.lame_mu = lame(self.young, self.poisson)
         if changed:
             # Shared by the models that are made of this one with the same density.
-            self._mass: dict[str, sp.csr_matrix] = {}
+            self._mass: dict[str, Any] = {}
         if changed and self.hanging is not None:
             ratio = self.density / before
             self.hanging = (self.hanging.with_density(float(ratio[0])) if np.ptp(ratio) < 1e-12

@@ -4,6 +4,7 @@
 import numpy as np
 
 from limber.errors import InputError
+from limber.mechanics.added import PointMass
 from limber.mechanics.dynamics.load_case import (
     LoadCase,
     SimulatedMotion,
@@ -12,7 +13,7 @@ from limber.mechanics.dynamics.load_case import (
 )
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings, NewmarkSettings
 from limber.mechanics.grasp import Grasp
-from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.model import BranchModel
 from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.settings import Point, SimulateSettings
 from limber.mechanics.statics.solve import solve_static

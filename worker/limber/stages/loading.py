@@ -9,14 +9,17 @@ import json
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
 from limber.geometry.skeleton.files import read_cylinders, read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.added import HungTwig, PointMass
 from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
-from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.model import BranchModel
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import clean
@@ -50,13 +53,15 @@ def load_skeleton(branch: Branch) -> Skeleton:
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
     """Return what hung on the branch when it was scanned, and its mesh leaves out.
 
-    Twigs, as masses where they were attached, and targets.
+    Twigs, as stiff bodies that go with the section they grow from, and targets.
     """
     twigs: list[dict[str, Any]] = []
     if branch.has("point_masses.json"):
         twigs = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
-    return (*(PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in twigs),
-            *target_masses(load_targets(branch)))
+    return (*(HungTwig(tuple(m.get("centre_m", m["attached_m"])), m["mass_kg"],
+                       tuple(m["attached_m"]),
+                       tuple(map(tuple, m.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))))
+              for m in twigs), *target_masses(load_targets(branch)))
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:

@@ -62,7 +62,8 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         made.skeleton.write_swc(stage.path("skeleton.swc"))
         made.surface.write_ply(stage.path("surface.ply"))
         made.mesh.write(stage.path("mesh.vtu"))
-        stage.remove("point_masses.json")  # of an earlier scan in this folder
+        for name in ("point_masses.json", "skeleton.csv"):
+            stage.remove(name)  # of an earlier scan in this folder
         stage.result.update(made.numbers | {"warnings": warnings})
         progress(1.0, "meshed", tets=made.mesh.tet_count)
     return branch.manifest.stages["mesh"].result

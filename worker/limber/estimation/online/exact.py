@@ -12,7 +12,8 @@ import numpy as np
 
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.jobs import Pool
-from limber.mechanics.model import BranchModel, PointMass
+from limber.mechanics.added import PointMass
+from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
 from limber.mechanics.reduced.training import Trainer, sample_young
