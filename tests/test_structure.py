@@ -82,7 +82,7 @@ LAYERS = (
     ("session",),
     ("report", "scene"),
     ("stages",),
-    ("options",),
+    ("options", "batch"),
     ("cli",),
     ("commands", "__main__"),
 )

@@ -30,11 +30,6 @@ from limber.version import VERSION
 if TYPE_CHECKING:
     from limber.stages.registry import StageDescription
 
-# Designed, not built: named so that nobody looks for them in vain.
-NOT_YET = {
-    "batch": "many jobs, on this machine or a cluster (`limber reconstruct` takes a folder)",
-}
-
 
 def command_summaries() -> dict[str, str]:
     """Return what each command does in one line, by name; imports none of them.
@@ -56,8 +51,6 @@ class _Commands(click.Group):
         return list(command_summaries())
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        if name in NOT_YET:
-            raise click.UsageError(f"`limber {name}` is not there yet: {NOT_YET[name]}.")
         if name in stage_summaries():
             return command_of(stage_description(name), stage_module(name).__doc__)
         if name not in command_summaries():
@@ -67,8 +60,7 @@ class _Commands(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         stages = stage_summaries()
         others = {name: told for name, told in command_summaries().items() if name not in stages}
-        for title, commands in (("Stages", stages), ("Other commands", others),
-                                ("Not there yet", NOT_YET)):
+        for title, commands in (("Stages", stages), ("Other commands", others)):
             with formatter.section(title):
                 formatter.write_dl(list(commands.items()))
 

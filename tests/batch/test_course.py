@@ -1,0 +1,139 @@
+"""A batch on the pool: it resumes, keeps what is done, ends one branch alone by a failure."""
+
+import csv
+import html
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from limber import cli
+from limber.batch.course import run_jobs
+from limber.batch.job_file import read_jobs
+from limber.batch.records import Records, numbers_of
+from limber.errors import BranchFolderError
+from limber.store import Branch
+
+JOBS = """
+out = "results"
+[[job]]
+folders = ["*.branch"]
+[[job.stage]]
+run = "target"
+name = "flower"
+at = [0.0, 0.0, 0.2]
+farthest = "50 cm"
+[[job.stage]]
+run = "virtual-pull"
+name = "pull-2"
+frames = 4
+young = ["40 MPa", "22 MPa", "12 MPa", "3 MPa"]
+reach = {reach}
+"""
+
+
+@pytest.fixture
+def orchard(tmp_path, branch_template):
+    """Two branch folders and a job file for them."""
+    for name in ("one", "two"):
+        shutil.copytree(branch_template, tmp_path / f"{name}.branch")
+    (tmp_path / "jobs.toml").write_text(JOBS.replace("{reach}", "0.2"))
+    return tmp_path
+
+
+def call(capsys, *arguments) -> tuple[int, dict]:
+    code = cli.call([*map(str, arguments), "--json"])
+    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def states(path: Path) -> list[list[str]]:
+    jobs = read_jobs(path)
+    records = Records(jobs)
+    return [[records.of(branch, task).status for task in branch.tasks] for branch in jobs.branches]
+
+
+def test_run_fail_mend_and_resume(orchard, capsys):
+    """A broken branch fails alone; what is done is kept; --retry-failed brings the rest."""
+    jobs = orchard / "jobs.toml"
+    mesh = orchard / "two.branch" / "mesh.vtu"
+    good = mesh.read_bytes()
+    mesh.write_bytes(b"broken")
+    code, told = call(capsys, "batch", jobs, "--dry-run")
+    assert code == 0 and [row[2] for row in told["planned"]] == ["to run"] * 4
+    code, told = call(capsys, "batch", jobs, "--workers", "1")
+    assert code == 3 and "1 of 2 branches failed; two: target:flower" in told["error"]
+    assert states(jobs) == [["done", "done"], ["failed", "waiting"]]
+    assert Branch.open(orchard / "one.branch").has("pulls/pull-2/pull.toml")
+    code, told = call(capsys, "status", jobs)
+    assert (told["done"], told["failed"], told["failures"][0][0]) == (1, 1, "two")
+    # Mended, it is not tried again unasked; then it is, and the other one is kept as it is.
+    mesh.write_bytes(good)
+    before = (orchard / "one.branch" / "branch.json").read_bytes()
+    assert call(capsys, "batch", jobs, "--workers", "1")[0] == 3
+    code, told = call(capsys, "batch", jobs, "--workers", "1", "--retry-failed")
+    assert code == 0 and told["done"] == 2, told
+    assert states(jobs)[0][1] == "up to date" and states(jobs)[1] == ["done", "done"]
+    assert Branch.open(orchard / "one.branch").digest("pulls/pull-2/robot.csv") == json.loads(
+        before)["files"]["pulls/pull-2/robot.csv"]["sha256"]
+    rows = list(csv.DictReader((orchard / "results/jobs.csv").open()))
+    assert [row["branch"] for row in rows] == ["one", "two"]
+    assert float(rows[0]["virtual-pull:pull-2.peak_force_n"]) > 0
+    assert float(rows[1]["virtual-pull:pull-2.memory_mb"]) > 10
+    page = (orchard / "results/jobs.html").read_text()
+    assert "2 done" in page and page.count("<svg class=sketch viewBox") == 2
+
+
+def test_a_killed_batch_goes_on(orchard, monkeypatch):
+    """SIGKILL to the batch: nothing half made, a new run ends with what an undisturbed one has."""
+    jobs = orchard / "jobs.toml"
+    log = orchard / "results" / "jobs.jobs.jsonl"
+    process = subprocess.Popen([sys.executable, "-m", "limber", "batch", str(jobs), "--workers",
+                                "1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    end = time.monotonic() + 60
+    while not (log.is_file() and '"done"' in log.read_text()) and time.monotonic() < end:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not any("running" in row for row in states(jobs)), "what ran when it was killed waits"
+    checked = read_jobs(jobs)
+    time.sleep(1.0)
+    run_jobs(checked, Records(checked), workers=1)
+    found = states(jobs)
+    assert {status for row in found for status in row} <= {"done", "up to date"}
+    one, two = (Branch.open(orchard / f"{name}.branch", verify=True) for name in ("one", "two"))
+    assert one.digest("pulls/pull-2/robot.csv") == two.digest("pulls/pull-2/robot.csv")
+
+
+def test_two_batches_exclude_each_other(orchard):
+    jobs = read_jobs(orchard / "jobs.toml")
+    first, second = Records(jobs), Records(jobs)
+    with first.writing(), pytest.raises(BranchFolderError, match="Another program"), (
+            second.writing()):
+        raise AssertionError
+    damaged = first.path.read_text() + '{"branch": "one"}\nno json\n[' + "[" * 9999 + "\n"
+    first.path.write_text(damaged)
+    assert Records(jobs).of(jobs.branches[0], jobs.branches[0].tasks[0]).status == "waiting"
+
+
+def test_text_of_files_is_no_page_and_no_formula(orchard, capsys):
+    """A branch named like a formula or a script is text in the table and on the page."""
+    name = "=1+<b>"
+    shutil.move(orchard / "two.branch", orchard / f"{name}.branch")
+    (orchard / f"{name}.branch" / "mesh.vtu").write_bytes(b"")
+    jobs = orchard / "jobs.toml"
+    jobs.write_text(JOBS.replace("{reach}", "0.2").replace('["*.branch"]', f'["{name}.branch"]'))
+    assert call(capsys, "batch", jobs, "--workers", "1")[0] == 3
+    row = next(csv.DictReader((orchard / "results/jobs.csv").open()))
+    assert row["branch"] == f"'{name}"
+    page = (orchard / "results/jobs.html").read_text()
+    assert html.escape(name) in page and name not in page
+
+
+def test_numbers_of_a_result():
+    assert numbers_of({"a": 1, "b": True, "c": [1.5, 2], "d": "x", "e": None, "f": [[1]],
+                       "g": list(range(99))}) == {"a": 1, "c_1": 1.5, "c_2": 2}

@@ -1,0 +1,188 @@
+"""The job file: what it says, what is wrong with it and in which line, and that it stays inside."""
+
+from pathlib import Path
+
+import pytest
+
+from limber.batch.job_file import NOT_IN_BATCHES, read_jobs
+from limber.batch.toml_lines import toml_lines
+from limber.batch.units import in_unit
+from limber.errors import InputError
+from limber.stages.registry import stage_description, stage_summaries
+
+
+@pytest.fixture
+def write(tmp_path):
+    """A function that writes a job file beside two scans and their recordings."""
+    for name in ("scans/apple.ply", "scans/pear.ply", "pulls/apple/one.csv", "pulls/apple/two.csv",
+                 "pulls/pear/one.csv"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("")
+
+    def write(text):
+        (tmp_path / "jobs.toml").write_text(text)
+        return tmp_path / "jobs.toml"
+    return write
+
+
+SCANS = """
+[[job]]
+scans = ["scans/*.ply"]
+[[job.stage]]
+run = "reconstruct"
+"""
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        read_jobs(path)
+    return str(caught.value)
+
+
+def test_a_branch_for_each_scan_with_its_recordings(write, tmp_path):
+    """Patterns make branches and runs; {scan} and {file} are their names; units are converted."""
+    jobs = read_jobs(write('out = "results"\nworkers = 3\ntime_limit = "2 min"\n'
+                           'memory_limit = "1.5 GB"\n' + SCANS + """
+unit = "mm"
+density = "0.8 g/cm^3"
+up = [0, -1, 0]
+[[job.stage]]
+run = "import-pull"
+source = "pulls/{scan}/*.csv"
+name = "{file}"
+grasp_radius = "8 mm"
+[[job.stage]]
+run = "estimate"
+fractions = [0.3, 0.7]
+"""))
+    assert jobs.out == tmp_path / "results" and jobs.workers == 3
+    assert (jobs.limits.seconds, jobs.limits.memory_mb) == (120.0, 1500.0)
+    apple, pear = jobs.branches
+    assert [task.label for task in apple.tasks] == [
+        "reconstruct", "import-pull:one", "import-pull:two", "estimate"]
+    assert [task.label for task in pear.tasks] == ["reconstruct", "import-pull:one", "estimate"]
+    assert apple.folder == tmp_path / "results" / "apple.branch"
+    first, pull = apple.tasks[:2]
+    assert first.inputs.cloud == tmp_path / "scans/apple.ply"
+    assert first.inputs.output == apple.folder
+    assert first.settings.density == pytest.approx(800.0) and first.settings.up == (0, -1, 0)
+    assert pull.settings.grasp_radius == pytest.approx(0.008)
+    assert pull.inputs.branch_folder == apple.folder
+    assert apple.tasks[-1].settings.fractions == (0.3, 0.7)
+
+
+def test_a_sweep_is_every_combination(write):
+    """Each has a branch of its own, named after its values."""
+    jobs = read_jobs(write(SCANS + """
+[job.sweep]
+"reconstruct.mesh_spacing" = [2, 3.5]
+"reconstruct.radii" = ["fit", "paper"]
+"""))
+    assert [branch.name for branch in jobs.branches[:4]] == [
+        "apple-mesh_spacing-2-radii-fit", "apple-mesh_spacing-2-radii-paper",
+        "apple-mesh_spacing-3.5-radii-fit", "apple-mesh_spacing-3.5-radii-paper"]
+    assert len(jobs.branches) == 8
+    assert jobs.branches[3].tasks[0].settings.mesh_spacing == 3.5
+    assert len({branch.tasks[0].fingerprint for branch in jobs.branches}) == 8
+
+
+@pytest.mark.parametrize(("text", "line", "said"), [
+    ('outt = "x"', 1, "Did you mean out?"),
+    ("workers = 0", 1, "at least 1"),
+    ('workers = "two"', 1, "a whole number"),
+    ('time_limit = "3 MB"', 1, "known are s, ms, min, h"),
+    ("memory_limit = -5", 1, "no positive number"),
+    ("[[job]]\nscan = 1", 2, "Did you mean scans?"),
+    ("[[job]]\n[[job.stage]]\nrun = 'reconstruct'", 1, "either scans or folders"),
+    ("[[job]]\nscans = ['none*.ply']\n[[job.stage]]\nrun = 'reconstruct'", 2, "No file is"),
+    ("[[job]]\nscans = ['scans/*.ply']", 1, "no [[job.stage]]"),
+    (SCANS + "\n# a comment\nprun = 2", 8, "Did you mean prune?"),
+    (SCANS + "prune = -1", 6, "greater than or equal to 0"),
+    (SCANS + "prune = [1, 2]", 6, "should be a valid number"),
+    (SCANS + 'density = "8 mm"', 6, "It is in kg/m^3"),
+    (SCANS + 'prune = "8 mm"', 6, "It has no unit"),
+    (SCANS + 'unit = "yd"', 6, "should be 'm', 'cm', 'mm' or 'in'"),
+    (SCANS + 'output = "x"', 6, "given by the batch"),
+    (SCANS + '[[job.stage]]\nrun = "reconstuct"', 7, "Did you mean reconstruct?"),
+    (SCANS + '[[job.stage]]\nrun = "record"', 7, "It moves a robot"),
+    (SCANS + '[[job.stage]]\nrun = "import-pull"\nsource = "pulls/{scan}/*.c3d"\nname = "a"', 8,
+     "no file is"),
+    (SCANS + '[[job.stage]]\nrun = "import-pull"\nsource = "a.csv"', 6, "Field required"),
+    (SCANS + '[[job.stage]]\nrun = "target"\nname = "{branch}"', 8, "{scan} and {file} are"),
+    (SCANS + '[job.sweep]\n"reconstruct.mesh_spacing" = 3', 7, "takes a list"),
+    (SCANS + '[job.sweep]\n"mesh_spacing" = [3]', 7, "names no stage"),
+    (SCANS + '[job.sweep]\n"reconstruct.mesh_spacing" = [3, "5 mm"]', 7, "It has no unit"),
+    (SCANS + '[[job.stage]]\nrun = "scene"\noutput = "../../evil.blend"', 8, "leads out of"),
+    (SCANS + '[[job.stage]]\nrun = "scene"\noutput = "/tmp/evil.blend"', 8, "leads out of"),
+    ("[job]\nscans = []", 1, "[[job]]"),
+])
+def test_what_is_wrong_is_told_with_its_line(write, text, line, said):
+    """Before anything runs, and without a folder made."""
+    path = write(text)
+    told = refusal(path)
+    assert f"line {line}:" in told and said in told, told
+    assert not (path.parent / "jobs").exists()
+
+
+def test_every_problem_is_told_at_once(write):
+    told = refusal(write('outt = 1\n' + SCANS + "prune = -1\nmesh_side = 3\n"))
+    assert [word for word in ("line 1:", "line 7:", "line 8:") if word in told] == [
+        "line 1:", "line 7:", "line 8:"]
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"[[job", b"a = 1e400\nb=", b"[" * 5000])
+def test_no_toml_is_refused(tmp_path, content):
+    (tmp_path / "bad.toml").write_bytes(content)
+    assert "bad.toml" in refusal(tmp_path / "bad.toml")
+
+
+def test_names_cannot_lead_out(write, tmp_path):
+    """A scan called like a way out, a sweep value with slashes: plain names inside ``out``."""
+    (tmp_path / "scans" / "...ply").write_text("")
+    jobs = read_jobs(write(SCANS + """
+[[job.stage]]
+run = "simulate"
+kind = "static"
+[job.sweep]
+"simulate.name" = ["a", "b"]
+"""))
+    inside = (tmp_path / "jobs").resolve()
+    for branch in jobs.branches:
+        assert branch.folder.resolve().parent == inside
+    told = refusal(write(SCANS + '[[job.stage]]\nrun = "simulate"\nname = "../../x"'))
+    assert "line 8:" in told
+
+
+def test_two_branches_never_share_a_folder(write, tmp_path):
+    (tmp_path / "more").mkdir()
+    (tmp_path / "more" / "apple.ply").write_text("")
+    told = refusal(write(SCANS.replace('"scans/*.ply"', '"scans/*.ply", "more/*.ply"')))
+    assert "Two branches would be apple.branch" in told
+
+
+def test_every_stage_may_stand_in_a_job_file(write, tmp_path):
+    """Each but those that are named with a reason: its schema is all that is needed."""
+    for name in set(stage_summaries()) - set(NOT_IN_BATCHES):
+        stage = stage_description(name)
+        own = {"branch_folder", "cloud", "surface", "output"}
+        needed = "".join(f'{key} = "x"\n' for key, about in stage.inputs.model_fields.items()
+                         if about.is_required() and key not in own)
+        jobs = read_jobs(write(f'[[job]]\nscans = ["scans/apple.ply"]\n[[job.stage]]\n'
+                               f'run = "{name}"\n{needed}'))
+        assert [task.stage for task in jobs.branches[0].tasks] == [name]
+
+
+def test_lines_of_nested_tables():
+    lines = toml_lines('a = 1\n[b.c]\n"d e".f = 2\n[[g]]\n[[g.h]]\nx = [\n 1 ]\n[[g.h]]\nx = 2\n'
+                       "[[g]]\n[[g.h]]\nx = 3\n")
+    assert lines[("a",)] == 1 and lines[("b", "c", "d e", "f")] == 3
+    assert [lines[("g", 0, "h", 0, "x")], lines[("g", 0, "h", 1, "x")],
+            lines[("g", 1, "h", 0, "x")]] == [6, 9, 12]
+
+
+@pytest.mark.parametrize(("value", "unit", "wanted"), [
+    ("8 mm", "m", 0.008), ("2.5e8 Pa", "Pa", 2.5e8), ("0.1 GPa", "Pa", 1e8), (7, "m", 7),
+    ("90 deg", "rad", 1.5707963267948966), (["1 cm", 2], "m", [0.01, 2]), ("auto", "", "auto")])
+def test_units(value, unit, wanted):
+    assert in_unit(value, unit) == pytest.approx(wanted) if wanted != "auto" else (
+        in_unit(value, unit) == wanted)

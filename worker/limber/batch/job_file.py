@@ -1,0 +1,423 @@
+"""The job file: which stages are run on which scans or branch folders, and with what settings.
+
+::
+
+    out = "results"                       # where the branch folders, the table and the page go
+    time_limit = "1 h"                    # of each stage; memory_limit = "4 GB"
+
+    [[job]]
+    scans = ["scans/*.ply"]               # a branch each; or folders = ["old/*.branch"]
+
+    [[job.stage]]
+    run = "reconstruct"
+    unit = "mm"
+
+    [[job.stage]]
+    run = "import-pull"
+    source = "pulls/{scan}/*.csv"         # one run for each file
+    name = "{file}"
+
+    [[job.stage]]
+    run = "estimate"
+
+    [job.sweep]                           # a branch for each combination
+    "reconstruct.mesh_spacing" = [2.0, 3.0]
+
+It is checked whole against the stages' settings before anything runs. Nothing in it is executed;
+what it makes stays in ``out``, or in the folders that it names.
+"""
+
+import difflib
+import glob
+import hashlib
+import itertools
+import json
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from limber.batch.toml_lines import Place, line_of, toml_lines
+from limber.batch.units import in_unit
+from limber.errors import InputError
+from limber.jobs import Limits
+from limber.plain import plain
+from limber.settings import Settings
+from limber.stages.registry import stage_description, stage_schema, stage_summaries
+
+NOT_IN_BATCHES = {
+    "record": "It moves a robot: somebody has to stand beside it.",
+    "execute": "It may move a robot: run it at a terminal.",
+    "generate": "It makes a scan, not a branch: run it before, and name its cloud under scans."}
+_KEYS = ("out", "workers", "time_limit", "memory_limit", "job")
+_JOB_KEYS = ("scans", "folders", "stage", "sweep")
+_PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
+_MOST_BRANCHES = 100_000
+_SHOWN_PROBLEMS = 12
+
+
+@dataclass(frozen=True)
+class StageTask:
+    """A stage to run on a branch, with checked inputs, settings and options."""
+
+    stage: str
+    inputs: Settings
+    settings: Settings
+    options: Settings
+
+    @property
+    def label(self) -> str:
+        """The stage's name, with that of what it makes where there may be several."""
+        name = getattr(self.inputs, "name", None) or getattr(self.settings, "name", None)
+        return f"{self.stage}:{name}" if name else self.stage
+
+    @property
+    def fingerprint(self) -> str:
+        """What the task is, its options left out: the same text for the same task."""
+        told = json.dumps([self.stage, plain(self.inputs), plain(self.settings)], sort_keys=True)
+        return hashlib.sha256(told.encode("utf-8")).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class BranchJob:
+    """What is run on one branch, in this order; ``sweep`` says which values are its own."""
+
+    name: str
+    folder: Path
+    tasks: tuple[StageTask, ...]
+    sweep: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class JobFile:
+    """A checked job file; ``limits`` hold for each stage."""
+
+    path: Path
+    out: Path
+    branches: tuple[BranchJob, ...]
+    workers: int | None = None
+    limits: Limits = field(default_factory=Limits)
+
+
+def read_jobs(path: Path) -> JobFile:
+    """Read and check a job file.
+
+    Raises:
+        InputError: it is no TOML, or says what cannot be run; every problem with its line.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        content = tomllib.loads(text)
+    except FileNotFoundError:
+        raise InputError(f"There is no file {path}.", "A job file was expected.",
+                         "Check the path.") from None
+    except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path} is no readable TOML ({error}).", "",
+                         "`limber batch --help` shows what a job file looks like.") from error
+    return _Reader(Path(path), content, toml_lines(text)).read()
+
+
+class _Reader:
+    """Reads one file and gathers what is wrong with it."""
+
+    def __init__(self, path: Path, content: dict[str, Any], lines: dict[Place, int]):
+        self.path, self.content, self.lines = path, content, lines
+        self.problems: list[tuple[int, str]] = []
+        self.out = path.parent / path.stem
+
+    def read(self) -> JobFile:
+        content = self.content
+        self.check_keys(content, _KEYS, ())
+        out = self.typed(content, "out", str, (), "")
+        if out:
+            self.out = self.path.parent / out
+        workers = self.typed(content, "workers", int, (), None)
+        if workers is not None and workers < 1:
+            self.problem(("workers",), "workers is at least 1.")
+        limits = Limits(self.limit("time_limit", "s"), self.limit("memory_limit", "MB"))
+        branches: list[BranchJob] = []
+        jobs = self.tables(content, "job", ())
+        if not jobs:
+            self.problem((), "It has no [[job]].")
+        for number, job in enumerate(jobs):
+            branches += self.job(job, ("job", number))
+        self.check_folders(branches)
+        self.stop_on_problems()
+        return JobFile(self.path, self.out, tuple(branches), workers, limits)
+
+    def problem(self, place: Place, text: str) -> None:
+        self.problems.append((line_of(self.lines, place), text))
+
+    def stop_on_problems(self) -> None:
+        if not self.problems:
+            return
+        told = [f"{self.path}, line {line}: {text}"
+                for line, text in sorted(dict.fromkeys(self.problems))]
+        more = len(told) - _SHOWN_PROBLEMS
+        raise InputError("\n".join(told[:_SHOWN_PROBLEMS]) + (
+            f"\nand {more} more." if more > 0 else ""), "", "Nothing was run.")
+
+    def check_keys(self, table: dict[str, Any], known: tuple[str, ...], place: Place) -> None:
+        for key in table:
+            if key not in known:
+                self.problem((*place, key), f"{key!r} is not known here. {_nearest(key, known)}")
+
+    def typed(self, table: dict[str, Any], key: str, kind: type, place: Place,
+              otherwise: Any) -> Any:
+        value = table.get(key, otherwise)
+        if value is not otherwise and (not isinstance(value, kind) or isinstance(value, bool)):
+            self.problem((*place, key), f"{key} is {value!r}; it takes "
+                         f"{ {str: 'a text', int: 'a whole number', list: 'a list'}[kind]}.")
+            return otherwise
+        return value
+
+    def tables(self, table: dict[str, Any], key: str, place: Place) -> list[dict[str, Any]]:
+        found = table.get(key, [])
+        if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+            self.problem((*place, key), f"Write {key} as tables: "
+                         f"[[{'.'.join(str(p) for p in (*place, key) if isinstance(p, str))}]].")
+            return []
+        return found
+
+    def limit(self, key: str, unit: str) -> float | None:
+        if key not in self.content:
+            return None
+        try:
+            value = in_unit(self.content[key], unit)
+            if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
+                raise ValueError(f"{self.content[key]!r} is no positive number of {unit}.")
+            return float(value)
+        except ValueError as error:
+            self.problem((key,), f"{key}: {error}")
+            return None
+
+    def job(self, job: dict[str, Any], place: Place) -> list[BranchJob]:
+        self.check_keys(job, _JOB_KEYS, place)
+        stages = self.tables(job, "stage", place)
+        if not stages:
+            self.problem(place, "The job has no [[job.stage]].")
+        sources = self.sources(job, place)
+        sweeps = self.sweeps(job, stages, place)
+        found = []
+        for (source, is_scan), sweep in itertools.product(sources, sweeps):
+            name = source.name.removesuffix(".branch") if not is_scan else source.stem
+            if sweep:
+                name += "".join(f"-{key.split('.')[-1]}-{_plain_name(value)}"
+                                for key, value in sweep.items())
+            folder = self.out / f"{name}.branch" if is_scan else source
+            reader = _TaskReader(self, source, is_scan, folder, sweep)
+            tasks = [task for number, stage in enumerate(stages)
+                     for task in reader.tasks(stage, (*place, "stage", number))]
+            found.append(BranchJob(name, folder, tuple(tasks), sweep))
+            if len(found) > _MOST_BRANCHES:
+                self.problem(place, f"The job has over {_MOST_BRANCHES} branches.")
+                break
+        return found
+
+    def sources(self, job: dict[str, Any], place: Place) -> list[tuple[Path, bool]]:
+        given = [key for key in ("scans", "folders") if key in job]
+        if len(given) != 1:
+            self.problem(place, "A job has either scans or folders.")
+            return []
+        key = given[0]
+        found: list[tuple[Path, bool]] = []
+        for pattern in self.typed(job, key, list, place, []):
+            if not isinstance(pattern, str):
+                self.problem((*place, key), f"{pattern!r} is no path.")
+                continue
+            matches = self.matches(pattern)
+            if key == "folders":
+                matches = [path for path in matches if (path / "branch.json").is_file()]
+            if not matches:
+                what = "branch folder" if key == "folders" else "file"
+                self.problem((*place, key), f"No {what} is {pattern!r}.")
+            found += [(path, key == "scans") for path in matches]
+        return found
+
+    def matches(self, pattern: str) -> list[Path]:
+        """Return the paths that a pattern names, from the job file's folder, sorted."""
+        return [Path(self.path.parent, name) for name in sorted(
+            glob.glob(pattern, root_dir=self.path.parent, recursive=True))]
+
+    def sweeps(self, job: dict[str, Any], stages: list[dict[str, Any]], place: Place,
+               ) -> list[dict[str, Any]]:
+        table = job.get("sweep", {})
+        at = (*place, "sweep")
+        if not isinstance(table, dict):
+            self.problem(at, "Write the sweep as a table: [job.sweep].")
+            return [{}]
+        if table and "folders" in job:
+            self.problem(at, "A sweep over branch folders would overwrite its own results. Sweep "
+                         "over scans, or give the stages names of their own.")
+            return [{}]
+        choices = []
+        for key, values in table.items():
+            stage, _, name = key.partition(".")
+            if not name or stage not in [about.get("run") for about in stages]:
+                self.problem((*at, key), f"{key!r} names no stage of this job and setting of it, "
+                             "as \"reconstruct.mesh_spacing\" does.")
+            elif not isinstance(values, list) or not values:
+                self.problem((*at, key), f"{key} takes a list of values.")
+            else:
+                choices.append([(key, value) for value in values])
+        return [dict(choice) for choice in itertools.product(*choices)]
+
+    def check_folders(self, branches: list[BranchJob]) -> None:
+        """Two branches cannot share a folder; none leaves the folder that they go to."""
+        seen: set[Path] = set()
+        for branch in branches:
+            folder = branch.folder.resolve()
+            if folder in seen:
+                self.problem((), f"Two branches would be {branch.name}.branch. Give the scans "
+                             "different names, or run them as two job files.")
+            seen.add(folder)
+
+
+class _TaskReader:
+    """Makes the tasks of one branch."""
+
+    def __init__(self, reader: _Reader, source: Path, is_scan: bool, folder: Path,
+                 sweep: dict[str, Any]):
+        self.reader, self.source, self.is_scan = reader, source, is_scan
+        self.folder, self.sweep = folder, sweep
+
+    def tasks(self, table: dict[str, Any], place: Place) -> list[StageTask]:
+        name = table.get("run")
+        if name in NOT_IN_BATCHES or name not in stage_summaries():
+            known = tuple(each for each in stage_summaries() if each not in NOT_IN_BATCHES)
+            self.reader.problem((*place, "run"), f"run = {name!r}: " + NOT_IN_BATCHES.get(
+                str(name), f"there is no such stage. {_nearest(str(name), known)}"))
+            return []
+        stage = stage_description(name)
+        schema = stage_schema(name)
+        fields = {key: (part, about) for part in ("inputs", "settings", "options")
+                  for key, about in schema[part].get("properties", {}).items()}
+        given = {key: value for key, value in table.items() if key != "run"}
+        given |= {key.partition(".")[2]: value for key, value in self.sweep.items()
+                  if key.partition(".")[0] == name}
+        own = self.own_inputs(name, fields)
+        values: dict[str, Any] = {}
+        for key, value in given.items():
+            if key in own:
+                self.reader.problem((*place, key), f"{key!r} is given by the batch.")
+            elif key not in fields:
+                self.reader.problem(self.place_of(place, name, key),
+                                    f"{name} has no {key!r}. {_nearest(key, tuple(fields))}")
+            else:
+                values[key] = self.value(value, fields[key][1], self.place_of(place, name, key))
+        models = (stage.inputs, stage.settings, stage.options)
+        return [task for each in self.runs(values, fields, place)
+                if (task := self.checked(name, models, own | each, fields, place)) is not None]
+
+    def place_of(self, place: Place, stage: str, key: str) -> Place:
+        swept = f"{stage}.{key}"
+        return (*place[:2], "sweep", swept) if swept in self.sweep else (*place, key)
+
+    def own_inputs(self, name: str, fields: dict[str, Any]) -> dict[str, Any]:
+        """Return the inputs that follow from the branch."""
+        if "branch_folder" in fields:
+            return {"branch_folder": self.folder}
+        source = next(key for key, (_, about) in fields.items() if about.get("argument"))
+        if not self.is_scan:
+            raise_at = f"{name} makes a branch of a scan; this job has branch folders."
+            self.reader.problem((), raise_at)
+        return {source: self.source, "output": self.folder}
+
+    def value(self, value: Any, about: dict[str, Any], place: Place) -> Any:
+        """Return a value with its unit and its placeholders resolved."""
+        try:
+            if about.get("unit") or "string" not in _types(about):
+                return in_unit(value, about.get("unit", ""))
+        except ValueError as error:
+            self.reader.problem(place, f"{place[-1]}: {error}")
+        return self.filled(value, place) if isinstance(value, str) else value
+
+    def filled(self, text: str, place: Place) -> str:
+        known = {"scan": self.source.name.removesuffix(".branch") if not self.is_scan
+                 else self.source.stem}
+
+        def fill(match: re.Match) -> str:
+            if match.group(1) == "file":
+                return match.group(0)
+            if match.group(1) not in known:
+                self.reader.problem(place, f"{match.group(0)} is not known; {{scan}} and {{file}} "
+                                    "are.")
+                return ""
+            return known[match.group(1)]
+        return _PLACEHOLDER.sub(fill, text)
+
+    def runs(self, values: dict[str, Any], fields: dict[str, Any], place: Place,
+             ) -> list[dict[str, Any]]:
+        """Return the values of each run: as many as a pattern among the inputs has files."""
+        found = [values]
+        for key, value in values.items():
+            _, about = fields[key]
+            if "path" not in _formats(about) or not isinstance(value, str):
+                continue
+            if about["group"] == "output":
+                found = [each | {key: self.inside(value, (*place, key))} for each in found]
+            elif glob.has_magic(value):
+                matches = self.reader.matches(value)
+                if not matches:
+                    self.reader.problem((*place, key), f"{key}: no file is {value!r}.")
+                found = [each | {key: path, "": path.stem} for each in found for path in matches]
+            else:
+                found = [each | {key: self.reader.path.parent / value} for each in found]
+        return [_with_file(each) for each in found]
+
+    def inside(self, value: str, place: Place) -> Path:
+        """Return where a file goes: in the branch's own folder of files, never outside ``out``."""
+        path = (self.reader.out / value).resolve()
+        if not path.is_relative_to(self.reader.out.resolve()):
+            self.reader.problem(place, f"{value!r} leads out of {self.reader.out}.")
+        return path
+
+    def checked(self, name: str, models: tuple, values: dict[str, Any], fields: dict[str, Any],
+                place: Place) -> StageTask | None:
+        made = []
+        for model in models:
+            own = {key: value for key, value in values.items() if key in model.model_fields}
+            try:
+                made.append(model(**own))
+            except ValidationError as error:
+                for one in error.errors():
+                    key = str(one["loc"][0]) if one["loc"] else ""
+                    unit = fields.get(key, ("", {}))[1].get("unit")
+                    self.reader.problem(
+                        self.place_of(place, name, key), f"{name} {key}: {one['msg']}"
+                        + ("" if one["type"] == "missing" else f", not {one['input']!r}")
+                        + (f" [{unit}]." if unit else "."))
+        return StageTask(name, *made) if len(made) == len(models) else None
+
+
+def _with_file(values: dict[str, Any]) -> dict[str, Any]:
+    """Put the name of the file that a pattern has found where ``{file}`` stands."""
+    stem = values.pop("", "")
+    return {key: value.replace("{file}", stem) if isinstance(value, str) else value
+            for key, value in values.items()}
+
+
+def _nearest(key: str, known: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(key, known, 3)
+    return f"Did you mean {' or '.join(close)}?" if close else f"Known: {', '.join(known)}."
+
+
+def _plain_name(value: Any) -> str:
+    return re.sub(r"[^A-Za-z0-9.+-]+", "_", str(value)).strip("_.") or "_"
+
+
+def _kinds(about: dict[str, Any]) -> list[dict[str, Any]]:
+    return about.get("anyOf", [about])
+
+
+def _types(about: dict[str, Any]) -> set[str]:
+    return {each.get("type", "") for each in _kinds(about)}
+
+
+def _formats(about: dict[str, Any]) -> set[str]:
+    return {each.get("format", "") for each in _kinds(about)}
+
+

@@ -1,0 +1,107 @@
+"""What a batch has done so far: lines that are appended as it happens, whatever ends it."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.owner import is_alive
+from limber.store.streams import Stream, stream_lines
+
+WAITING, RUNNING, DONE, KEPT, FAILED = "waiting", "running", "done", "up to date", "failed"
+
+
+@dataclass(frozen=True)
+class Record:
+    """How a task stands: ``numbers`` are those of its result, ``memory_mb`` its largest."""
+
+    status: str = WAITING
+    error: str = ""
+    seconds: float | None = None
+    memory_mb: float | None = None
+    warnings: tuple[str, ...] = ()
+    numbers: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def has_succeeded(self) -> bool:
+        return self.status in (DONE, KEPT)
+
+
+class Records:
+    """The records of a job file's tasks, by branch and fingerprint."""
+
+    def __init__(self, jobs: JobFile):
+        self.path = jobs.out / f"{jobs.path.stem}.jobs.jsonl"
+        self._found: dict[tuple[str, str], Record] = {}
+        self._stream: Stream | None = None
+        for line in stream_lines(self.path) if self.path.is_file() else ():
+            self._take(line)
+
+    def of(self, branch: BranchJob, task: StageTask) -> Record:
+        """Return how a task stands; one that was running when its batch was killed waits."""
+        return self._found.get((branch.name, task.fingerprint), Record())
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Take the right to append; another batch of this job file is refused meanwhile."""
+        with Stream(self.path) as self._stream:
+            yield
+        self._stream = None
+
+    def begin(self, branch: BranchJob, task: StageTask) -> None:
+        import psutil
+
+        self._append(branch, task, {"status": RUNNING, "process": [
+            os.getpid(), round(psutil.Process().create_time())]})
+
+    def end(self, branch: BranchJob, task: StageTask, record: Record) -> None:
+        self._append(branch, task, {**vars(record)})
+
+    def _append(self, branch: BranchJob, task: StageTask, told: dict[str, Any]) -> None:
+        line = json.dumps({"branch": branch.name, "stage": task.label,
+                           "task": task.fingerprint, **told})
+        self._stream.append(line)
+        self._take(line)
+
+    def _take(self, line: str) -> None:
+        try:
+            told = json.loads(line)
+            key = (str(told["branch"]), str(told["task"]))
+            status = str(told["status"])
+            if status == RUNNING:
+                process, since = told["process"]
+                record = Record(RUNNING) if is_alive(int(process), int(since)) else Record()
+            else:
+                record = Record(status, str(told["error"]), told["seconds"], told["memory_mb"],
+                                tuple(told["warnings"]), dict(told["numbers"]))
+        except (ValueError, KeyError, TypeError, RecursionError):
+            # A line that was damaged tells nothing: its task is run again, and kept if it is done.
+            return
+        self._found[key] = record
+
+
+def numbers_of(result: dict[str, Any], longest: int = 12) -> dict[str, float]:
+    """Return the numbers of a result, those of short lists one by one: ``young_pa_1``."""
+    found: dict[str, float] = {}
+    for key, value in result.items():
+        items = value if isinstance(value, list) else [value]
+        if len(items) > longest or not all(
+                isinstance(one, int | float) and not isinstance(one, bool) for one in items):
+            continue
+        names = [key] if items is not value else [f"{key}_{n}" for n in range(1, len(items) + 1)]
+        found |= dict(zip(names, items, strict=True))
+    return found
+
+
+def path_of_table(jobs: JobFile) -> Path:
+    """Return where the table of results goes."""
+    return jobs.out / f"{jobs.path.stem}.csv"
+
+
+def path_of_page(jobs: JobFile) -> Path:
+    """Return where the summary goes."""
+    return jobs.out / f"{jobs.path.stem}.html"

@@ -1,0 +1,161 @@
+"""What came of a batch: a table with one row a branch, and a page to look at."""
+
+import csv
+import html
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from limber.batch.job_file import BranchJob, JobFile
+from limber.batch.records import (
+    DONE,
+    FAILED,
+    KEPT,
+    RUNNING,
+    WAITING,
+    Record,
+    Records,
+    path_of_page,
+    path_of_table,
+)
+from limber.errors import LimberError
+from limber.files import write_atomically
+from limber.geometry.skeleton.files import read_swc
+from limber.version import VERSION
+
+_COLORS = {DONE: "#2d7a3a", KEPT: "#6c9a74", FAILED: "#b3261e", RUNNING: "#1f5fa8",
+           WAITING: "#888888"}
+_SKETCH_PIXELS = 120
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+
+
+def counts(jobs: JobFile, records: Records) -> dict[str, int]:
+    """Return how many branches are done, failed, running and waiting."""
+    found = dict.fromkeys(("done", "failed", "running", "waiting"), 0)
+    for branch in jobs.branches:
+        found[branch_status(branch, records)] += 1
+    return found
+
+
+def branch_status(branch: BranchJob, records: Records) -> str:
+    """Return ``done``, ``failed``, ``running`` or ``waiting``."""
+    states = [records.of(branch, task).status for task in branch.tasks]
+    if FAILED in states:
+        return "failed"
+    if RUNNING in states:
+        return "running"
+    return "done" if all(state in (DONE, KEPT) for state in states) else "waiting"
+
+
+def failures(jobs: JobFile, records: Records) -> list[tuple[str, str, str]]:
+    """Return branch, stage and reason of each failure."""
+    return [(branch.name, task.label, record.error) for branch in jobs.branches
+            for task in branch.tasks if (record := records.of(branch, task)).status == FAILED]
+
+
+def write_table(jobs: JobFile, records: Records) -> None:
+    """Write the CSV: a row a branch, its stages' results beside each other."""
+    rows = [_row(branch, records) for branch in jobs.branches]
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, restval="")
+    writer.writeheader()
+    writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
+    write_atomically(path_of_table(jobs), text.getvalue())
+
+
+def _row(branch: BranchJob, records: Records) -> dict[str, Any]:
+    row: dict[str, Any] = {"branch": branch.name, **branch.sweep,
+                           "status": branch_status(branch, records)}
+    for task in branch.tasks:
+        record = records.of(branch, task)
+        row |= {f"{task.label}.status": record.status, f"{task.label}.seconds": record.seconds,
+                f"{task.label}.memory_mb": record.memory_mb}
+        row |= {f"{task.label}.{key}": value for key, value in record.numbers.items()}
+    reasons = [records.of(branch, task).error for task in branch.tasks]
+    return row | {"error": " ".join(filter(None, reasons))}
+
+
+def _cell(value: Any) -> Any:
+    """Return a value that no spreadsheet takes for a formula."""
+    if value is None:
+        return ""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def write_page(jobs: JobFile, records: Records) -> None:
+    """Write the page: how many are done, what failed and why, time, memory, a sketch of each."""
+    write_atomically(path_of_page(jobs), "\n".join(_page(jobs, records)) + "\n")
+
+
+def _page(jobs: JobFile, records: Records) -> Iterator[str]:
+    title = html.escape(jobs.path.name)
+    yield ("<!doctype html><html lang=en><meta charset=utf-8>"
+           "<meta name=viewport content='width=device-width'>"
+           f"<title>{title}: Limber batch</title><style>{_STYLE}</style>")
+    yield f"<h1>{title}</h1>"
+    told = ", ".join(f"{count} {name}" for name, count in counts(jobs, records).items() if count)
+    seconds = sum(records.of(branch, task).seconds or 0.0
+                  for branch in jobs.branches for task in branch.tasks)
+    yield (f"<p>{len(jobs.branches)} branches: {told}. {seconds / 60:.1f} minutes of work. "
+           f"Limber {VERSION}.</p>")
+    failed = failures(jobs, records)
+    if failed:
+        yield "<h2>Failed</h2><table><tr><th>branch<th>stage<th>why</tr>"
+        for cells in failed:
+            yield "<tr>" + "".join(f"<td>{html.escape(cell)}" for cell in cells) + "</tr>"
+        yield "</table>"
+    yield "<h2>Branches</h2>"
+    for branch in jobs.branches:
+        yield from _branch(branch, records)
+
+
+def _branch(branch: BranchJob, records: Records) -> Iterator[str]:
+    swept = ", ".join(f"{key} = {value}" for key, value in branch.sweep.items())
+    yield f"<section>{_sketch(branch)}<div><h3>{html.escape(branch.name)}</h3>"
+    if swept:
+        yield f"<p>{html.escape(swept)}</p>"
+    yield "<table><tr><th>stage<th>status<th>time [s]<th>memory [MB]<th></tr>"
+    for task in branch.tasks:
+        record = records.of(branch, task)
+        yield (f"<tr><td>{html.escape(task.label)}"
+               f"<td style='color:{_COLORS[record.status]}'>{record.status}"
+               f"<td>{_number(record.seconds, 1)}<td>{_number(record.memory_mb, 0)}"
+               f"<td>{html.escape(_told(record))}</tr>")
+    yield "</table></div></section>"
+
+
+def _told(record: Record) -> str:
+    return " ".join(filter(None, (record.error, *record.warnings)))
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _sketch(branch: BranchJob) -> str:
+    """Return the skeleton, seen from the front, as a drawing; nothing where there is none."""
+    path = branch.folder / "skeleton.swc"
+    try:
+        skeleton = read_swc(path)
+    except (OSError, LimberError):
+        return "<svg class=sketch></svg>"
+    flat = skeleton.nodes[:, [0, 2]]
+    low, size = flat.min(axis=0), max(np.ptp(flat, axis=0).max(), 1e-9)
+    place = (flat - low) / size * (_SKETCH_PIXELS - 12) + 6
+    place[:, 1] = _SKETCH_PIXELS - place[:, 1]
+    width = np.maximum(2 * skeleton.radius / size * _SKETCH_PIXELS, 0.7)
+    lines = "".join(
+        f"<line x1='{place[a, 0]:.1f}' y1='{place[a, 1]:.1f}' x2='{place[b, 0]:.1f}' "
+        f"y2='{place[b, 1]:.1f}' stroke-width='{width[b]:.1f}'/>"
+        for b, a in enumerate(skeleton.parent) if a >= 0)
+    return (f"<svg class=sketch viewBox='0 0 {_SKETCH_PIXELS} {_SKETCH_PIXELS}' stroke='#5a4632' "
+            f"stroke-linecap='round'>{lines}</svg>")
+
+
+_STYLE = ("body{font:15px/1.45 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
+          "table{border-collapse:collapse}td,th{padding:.15em .7em .15em 0;text-align:left;"
+          "vertical-align:top}section{display:flex;gap:1.5em;border-top:1px solid #ddd;"
+          "padding:.8em 0}h3{margin:.1em 0 .4em}.sketch{width:120px;height:120px;flex:none}")

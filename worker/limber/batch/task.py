@@ -1,0 +1,83 @@
+"""One stage on one branch, in a process of the pool."""
+
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from limber.batch.job_file import StageTask
+from limber.errors import BranchFolderError, Cancelled, LimberError
+from limber.jobs.pool import memory_mb
+from limber.plain import plain
+from limber.progress import Progress
+from limber.stages.registry import stage_description
+from limber.store.manifest import read_manifest
+
+_SAMPLE_SECONDS = 0.2
+
+
+def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Run a stage; returns how it ended, also where it failed.
+
+    Returns:
+        ``error`` (empty where it succeeded), ``result``, ``warnings``, ``seconds``, ``memory_mb``
+        at its largest, and ``is_kept``: the branch had it already, from this input with these
+        settings.
+
+    Raises:
+        Cancelled: it was.
+    """
+    warnings: list[str] = []
+    before = _finished(task, folder)
+    started = time.perf_counter()
+    outcome: dict[str, Any] = {"error": "", "result": {}}
+    with _Memory() as memory:
+        try:
+            outcome["result"] = plain(stage_description(task.stage).run(
+                task.inputs, task.settings, task.options, progress.keeping(warnings)))
+        except Cancelled:
+            raise
+        except LimberError as error:
+            outcome["error"] = str(error)
+    after = _finished(task, folder)
+    return outcome | {
+        "warnings": warnings, "seconds": round(time.perf_counter() - started, 3),
+        "memory_mb": round(memory.most_mb, 1), "is_kept": before is not None and before == after}
+
+
+def _finished(task: StageTask, folder: Path) -> str | None:
+    """Return when the branch's entry of the task was made; None where there is none."""
+    key = stage_description(task.stage).key
+    if not key or not folder.is_dir():
+        return None
+    name = getattr(task.inputs, "name", None) or getattr(task.settings, "name", "")
+    try:
+        entry = read_manifest(folder).stages.get(key.replace("{name}", str(name)))
+    except BranchFolderError:
+        # The stage says what is wrong with it.
+        return None
+    return entry.finished + str(entry.seconds) if entry else None
+
+
+class _Memory:
+    """Watches the memory of this process and of what it starts."""
+
+    def __init__(self):
+        self.most_mb = 0.0
+        self._closing = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="memory watch", daemon=True)
+
+    def __enter__(self) -> "_Memory":
+        self._watcher.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._closing.set()
+        self._watcher.join()
+
+    def _watch(self) -> None:
+        while True:
+            self.most_mb = max(self.most_mb, memory_mb(os.getpid()))
+            if self._closing.wait(_SAMPLE_SECONDS):
+                return
