@@ -95,7 +95,7 @@ def bench_branch(spacing: float = 2.0) -> Branching:
 def rows(quick: bool, progress: Progress = SILENT, out: Path | None = None) -> list[Row]:
     """Measure the rows; ``out`` gets the raw numbers as JSON."""
     branch = bench_branch()
-    bench = _Bench(branch, "pinned", quick)
+    bench = GraspBench(branch, "pinned", quick)
     count, varied = (50, 100) if quick else (120, 160)
     known = bench.train(count, 1.0, None, progress.part(0.0, 0.25))
     held_out = bench.test(10 if quick else 40, False, known, progress.part(0.25, 0.32))
@@ -135,7 +135,7 @@ def rows(quick: bool, progress: Progress = SILENT, out: Path | None = None) -> l
     return found
 
 
-class _Bench:
+class GraspBench:
     """One grasp of the branch, its training and its test grasps."""
 
     def __init__(self, branch: Branching, mode: str, quick: bool):
@@ -202,7 +202,7 @@ def brisk(reduced: ReducedModel, pose: np.ndarray) -> ReducedMotion:
     return min(runs, key=lambda run: np.median(run.step_seconds))
 
 
-def moving(bench: _Bench, reduced: ReducedModel, pose: np.ndarray,
+def moving(bench: GraspBench, reduced: ReducedModel, pose: np.ndarray,
            energy: float) -> tuple[ReducedMotion, str]:
     """The same pull by both models."""
     times, poses = _pull(reduced, pose)
@@ -217,7 +217,7 @@ def moving(bench: _Bench, reduced: ReducedModel, pose: np.ndarray,
                     f" {strain:.2f} %, {ratio:.0f} times as fast as the full model")
 
 
-def run_session(bench: _Bench, reduced: ReducedModel, snapshots: Snapshots,
+def run_session(bench: GraspBench, reduced: ReducedModel, snapshots: Snapshots,
                 seconds: float) -> tuple[str, bool]:
     """Send poses at 60 Hz along a smooth path with one jump, and watch the frames come.
 
@@ -243,7 +243,7 @@ def run_session(bench: _Bench, reduced: ReducedModel, snapshots: Snapshots,
     return "; ".join(texts), good
 
 
-def write_branch(path: Path, bench: _Bench) -> Path:
+def write_branch(path: Path, bench: GraspBench) -> Path:
     """Write the bench's branch as a branch folder."""
     mesh: TetMesh = bench.branch.model.mesh
     full = np.ones(mesh.tet_count)
@@ -310,7 +310,7 @@ def _watch(session: InteractiveSession, until: float, sent: dict[int, float], se
 
 
 def _clamped_row(branch: Branching, progress: Progress) -> Row:
-    bench = _Bench(branch, "clamped", False)
+    bench = GraspBench(branch, "clamped", False)
     known = bench.train(200, 1.0, None, progress.part(0.0, 0.7))
     errors = measure(bench.reduce(known.for_known_young(), CLAMPED),
                      bench.test(30, False, known, progress.part(0.8, 0.95)))

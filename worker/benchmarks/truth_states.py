@@ -1,8 +1,11 @@
-"""States that are what they are said to be: swings keep their energy."""
+"""States that are what they are said to be: swings keep their energy, bad states are doubted."""
+
+import time
 
 import numpy as np
 
 from benchmarks.mechanics import DENSITY, short_beam
+from benchmarks.mechanics_reduced import CHANGED, LENGTH, GraspBench, bench_branch
 from benchmarks.table import Row
 from limber.mechanics import (
     BranchModel,
@@ -12,6 +15,8 @@ from limber.mechanics import (
     simulate_dynamics,
     solve_static,
 )
+from limber.mechanics.reduced.refresh import checked, estimate_error
+from limber.mechanics.reduced.training import TrainingSettings, sample_poses
 from limber.progress import Progress
 
 _AMPLITUDES = (0.01, 0.25, 0.6)
@@ -21,7 +26,8 @@ _YOUNG = 1e7
 
 def rows(quick: bool, progress: Progress, seed: int) -> list[Row]:
     """Measure everything; ``seed`` is the base of all that is drawn."""
-    return [swing_row(quick, progress, np.random.default_rng([seed, 11]))]
+    return [swing_row(quick, progress.part(0.0, 0.2), np.random.default_rng([seed, 11])),
+            *doubt_rows(quick, progress.part(0.2, 1.0), np.random.default_rng([seed, 12]))]
 
 
 def swing_row(quick: bool, progress: Progress, rng: np.random.Generator) -> Row:
@@ -62,3 +68,46 @@ def _pulled_aside(model: BranchModel, tip: Grasp, direction: np.ndarray,
     while missing(most) < 0:
         most *= 2
     return pulled(brentq(missing, 0.0, most, rtol=1e-3))
+
+
+def doubt_rows(quick: bool, progress: Progress, rng: np.random.Generator) -> list[Row]:
+    """Grasps of a reduced model after E changed by up to 3 at each control point, checked."""
+    bench = GraspBench(bench_branch(), "pinned", quick)
+    branch = bench.branch
+    known = bench.train(50 if quick else 120, 1.0, None, progress.part(0.0, 0.2))
+    both = known.joined(bench.train(100 if quick else 160, 4.0, known, progress.part(0.2, 0.4)))
+    wide = bench.reduce(both, CHANGED)
+    count = 30 if quick else 300
+    poses = sample_poses(branch.model, bench.grasp, count, rng, TrainingSettings())
+    young = branch.young * 3.0 ** rng.uniform(-1, 1, (count, len(branch.young)))
+    truth = bench.trainer.take(poses, young, known, progress=progress.part(0.5, 0.9))
+    off, energy, flagged, seconds = [], [], [], []
+    for pose, moduli, exact, exact_energy in zip(
+            truth.poses, truth.young, truth.displacement, truth.energy, strict=True):
+        model = wide.with_young(moduli)
+        began = time.process_time()
+        state = model.solve_static(pose)
+        state = checked(state, estimate_error(branch.model, branch.weights, model, state))
+        seconds.append(time.process_time() - began)
+        away = np.linalg.norm(model.displacement(state) - exact, axis=1).max()
+        off.append(100 * away / LENGTH)
+        energy.append(100 * abs(state.strain_energy / exact_energy - 1))
+        flagged.append(not state.trusted)
+    return _doubted(np.array(off), np.array(energy), np.array(flagged),
+                    1e3 * float(np.median(seconds)))
+
+
+def _doubted(off: np.ndarray, energy: np.ndarray, flagged: np.ndarray, milliseconds: float,
+             ) -> list[Row]:
+    bad = (off > 0.5) | (energy > 1)
+    worst, worst_energy = off[~flagged].max(initial=0), energy[~flagged].max(initial=0)
+    caught = 100 * flagged[bad].mean() if bad.any() else np.nan
+    false = 100 * flagged[~bad].mean() if (~bad).any() else np.nan
+    return [
+        Row(f"reduced model after E changed by up to 3, {len(off)} grasps: worst error among the "
+            "unflagged", "0.5 % of the length, 1 % energy",
+            f"{worst:.2f} %, {worst_energy:.2f} % (among all {off.max():.1f}, {energy.max():.1f} "
+            f"%; {milliseconds:.0f} ms a checked grasp)", bool(worst <= 0.5 and worst_energy <= 1)),
+        Row("bad states flagged / good ones flagged", "95 % / under 10 %",
+            f"{caught:.0f} % of {bad.sum()} / {false:.1f} % of {(~bad).sum()}",
+            bool(caught >= 95 and false < 10) if bad.any() else None)]

@@ -11,6 +11,7 @@ from limber.mechanics.reduced.dynamics import ReducedStepper, simulate_reduced
 from limber.mechanics.reduced.model import ReducedSettings, build_reduced, reduce_snapshots
 from limber.mechanics.reduced.refresh import (
     RefreshingModel,
+    checked,
     estimate_error,
     estimate_motion_error,
 )
@@ -127,12 +128,15 @@ def test_measured_error_is_the_error(model, grasp, trained):
         assert estimate.position * model.extent == pytest.approx(true, rel=0.3)
         assert estimate.energy == pytest.approx(state.strain_energy / full.strain_energy - 1,
                                                 abs=0.002)
+        # The reduced model trusts itself where it is off; the check does not.
+        assert state.trusted and not checked(state, estimate, energy_tolerance=1e-4).trusted
+        assert checked(state, estimate, position_tolerance=0.1, energy_tolerance=1.0).trusted
 
 
 def test_good_states_are_answered_reduced(model, grasp, trained):
     """Within the training the reduced answer stands, and the check agrees."""
     answer = refreshing(model, grasp, trained).solve(
-        grasp.rest_pose + [0.02, 0.01, -0.008, 0, 0, 0], always_check=True)
+        grasp.rest_pose + [0.02, 0.01, -0.008, 0, 0, 0])
     assert answer.source == "reduced" and answer.estimate.certain
 
 
@@ -152,7 +156,7 @@ def test_it_learns_what_it_did_not_know(model, grasp):
     for pose in poses[1:]:
         learner.solve(pose)
     assert learner.refresh_count == 1 and learner.pending == 0
-    again = learner.solve(poses[0], always_check=True)
+    again = learner.solve(poses[0])
     assert again.source == "reduced"
     assert again.strain_energy == pytest.approx(full.strain_energy, rel=0.01)
 
