@@ -120,13 +120,13 @@ def test_a_correction_makes_up_for_a_poor_basis(thick, noisy, monkeypatch):
 
 
 def test_a_pull_of_three_frames_is_enough_for_a_basis(thick, small_pull):
-    """Fewer poses than a basis has coordinates: they are taken at several moduli."""
+    """Fewer poses than a basis has coordinates: it has others around them."""
     seen = small_pull.observations
     few = replace(measured(small_pull, 0, points=0, force=0), observations=replace(
         seen, times=seen.times[::7], positions=seen.positions[::7]))
     reduction = Reduction(thick.objective([few], SETTINGS).forwards)
     reduction.build(replace(thick.objective([few], SETTINGS).space.base, young=TRUTH))
-    assert reduction.bases[0].size == 64
+    assert reduction.bases[0].size == 72
 
 
 def test_pulls_it_cannot_hold_are_refused(thick, noisy):

@@ -165,7 +165,7 @@ def _speed_rows() -> list[Row]:
     found = bench.fit([pull], SETTINGS)
     full = time.perf_counter() - started
     short, build, away = _reduced(bench, pull, found)
-    updates, online_error = _online(bench, measured(exact_pull(branch, 1), 6), pull, found)
+    updates, _, online_error = followed(bench, measured(exact_pull(branch, 1), 6), pull, found)
     return [
         Row(f"one pull of 100 frames, {bench.mesh.tet_count} quadratic tetrahedra, full model",
             "240 s", f"{full:.0f} s ({found.objective.forward_count} simulations)", full <= 240),
@@ -190,9 +190,13 @@ def _reduced(bench: Bench, pull: Pull, found: Estimate) -> tuple[float, float, f
     return seconds[1], seconds[0], away
 
 
-def _online(bench: Bench, earlier: Pull, pull: Pull, found: Estimate,
-            ) -> tuple[np.ndarray, float]:
-    """Follow a pull at its own pace, with what a rough fit of an earlier one gave to start with."""
+def followed(bench: Bench, earlier: Pull, pull: Pull, found: Estimate,
+             ) -> tuple[np.ndarray, float, float]:
+    """Follow a pull at its own pace, with what a rough fit of an earlier one gave to start with.
+
+    Returns:
+        Seconds of each frame; how far E is from the full fit's after the last frame, and settled.
+    """
     mesh = bench.mesh.with_data(cell_data={"young": np.full(bench.mesh.tet_count, 1e7)})
     subject = Subject(mesh, bench.branch.skeleton, bench.points, bench.weights,
                       bench.model, Values(np.full(4, 1e7), 0.35, 900.0))
@@ -209,9 +213,10 @@ def _online(bench: Bench, earlier: Pull, pull: Pull, found: Estimate,
             started = time.perf_counter()
             estimator.update(frame)
             seconds.append(time.perf_counter() - started)
+        live = float(np.abs(estimator.young / found.values.young - 1).max())
         estimator.settle()
-    error = float(np.abs(estimator.young / found.values.young - 1).max())
-    return np.array(seconds[2:]), error
+    settled = float(np.abs(estimator.young / found.values.young - 1).max())
+    return np.array(seconds), live, settled
 
 
 def _beam_rows() -> list[Row]:

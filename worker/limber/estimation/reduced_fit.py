@@ -1,11 +1,12 @@
 """A fit on the reduced model that ends where the full model's would.
 
 A basis made for any grasp and any Young's modulus is good nowhere in particular: moduli found with
-it were off by up to 14 %. Here it is made from the pull's own poses, at moduli around a rough fit,
-and what it still gets wrong is measured: the full model at some frames gives the difference in
-positions, forces and their derivatives, which is added to the reduced model's answers (space
-mapping with first-order consistency; Alexandrov et al., "Approximation and model management in
-aerodynamic optimization with variable-fidelity models", 2001). Where the corrected fit no longer
+it were off by up to 14 %. Here it is made for one branch and grasp, from the first pull's own poses
+and others as far out in every direction, at moduli around a rough fit; later pulls of that grasp
+find it made. What it still gets wrong is measured: the full model at some frames gives the
+difference in positions, forces and their derivatives, which is added to the reduced model's answers
+(space mapping with first-order consistency; Alexandrov et al., "Approximation and model management
+in aerodynamic optimization with variable-fidelity models", 2001). Where the corrected fit no longer
 moves, its residuals and derivatives are the full model's.
 """
 
@@ -26,7 +27,12 @@ from limber.estimation.objective import Objective
 from limber.estimation.optimise import Fit, FitStatus
 from limber.estimation.parameters import Values
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, reduce_snapshots
-from limber.mechanics.reduced.training import Trainer, sample_young
+from limber.mechanics.reduced.training import (
+    Trainer,
+    TrainingSettings,
+    sample_poses,
+    sample_young,
+)
 from limber.progress import SILENT, Progress
 from limber.recordings.grasping import pose_on
 
@@ -34,9 +40,9 @@ from limber.recordings.grasping import pose_on
 # they cost time, not truth.
 STATES_PER_PULL = 24
 """Full solutions along each pull that the basis is made of."""
-FEWEST_STATES = 24
-"""A short pull's few poses are taken at several moduli each."""
-SIZE, SIZE_PER_PULL = 48, 16
+STATES_AROUND = 24
+"""And so many in all directions, for pulls that are yet to come."""
+SIZE, SIZE_PER_PULL = 56, 16
 """Coordinates of a basis: so many, and so many more a pull; 90 at most."""
 YOUNG_SPREAD = 1.5
 """Factor in Young's modulus within which they are sampled."""
@@ -61,7 +67,7 @@ class Reduction:
     Args:
         forwards: Of the full model; pulls of one grasp and one gravity share a basis.
         cache: Folder in which bases are kept for the next estimate, or None.
-        digest: Of all that a basis depends on beside the pulls' settings.
+        digest: Of what else a basis depends on, beside branch and grasp.
 
     Raises:
         InputError: a pull is driven by force or dynamic.
@@ -70,7 +76,7 @@ class Reduction:
     def __init__(self, forwards: list[Forward], cache: Path | None = None, digest: str = ""):
         self.forwards = [_required(forward) for forward in forwards]
         self.groups = _groups(self.forwards)
-        self.paths = [None if cache is None else cache / f".reduced-{_digest(group, digest)}.npz"
+        self.paths = [None if cache is None else cache / _file_name(group[0], digest)
                       for group in self.groups]
         found = [_read(path, group[0])
                  for path, group in zip(self.paths, self.groups, strict=True)]
@@ -100,11 +106,12 @@ class Reduction:
             forward.rest_points, density=values.density)) for forward in self.forwards])
 
     def keep(self) -> None:
-        """Write the bases into the cache, in place of those that are there."""
+        """Write the bases into the cache; those of another mesh go, of other grasps stay."""
         kept = {path for path in self.paths if path is not None}
-        for folder in {path.parent for path in kept}:
-            for old in folder.glob(".reduced-*.npz"):
-                if old not in kept:
+        for path in kept:
+            own = path.name.rsplit("-", 1)[0]
+            for old in path.parent.glob(".reduced-*.npz"):
+                if not old.name.startswith(own):
                     old.unlink()
         for path, basis in zip(self.paths, self.bases, strict=True):
             if path is not None:
@@ -206,8 +213,8 @@ def _built(group: list[QuasiStaticForward], values: Values, progress: Progress) 
     """Make the basis from full solutions along the group's own pulls."""
     first = group[0]
     model = first.model_with(values)
-    poses = np.concatenate([_training_poses(forward) for forward in group])
-    poses = np.resize(poses, (max(len(poses), FEWEST_STATES), 6))
+    own = [_training_poses(forward) for forward in group]
+    poses = np.concatenate([*own, _poses_around(first, np.concatenate(own))])
     trainer = Trainer(model, first.grasp, first.weights, values.young)
     young = sample_young(values.young, len(poses), np.random.default_rng(0), YOUNG_SPREAD)
     snapshots = trainer.take(poses, young, progress=progress)
@@ -221,13 +228,23 @@ def _training_poses(forward: QuasiStaticForward) -> np.ndarray:
                      for pose in forward.frames.poses[keys]])
 
 
-def _digest(group: list[QuasiStaticForward], digest: str) -> str:
-    """Of what a basis depends on; the weights tell where the control points are."""
-    text = " ".join([digest, *(f"{forward.name} {forward.entry.model_dump_json()}"
-                               for forward in group)])
-    joined = hashlib.sha256(text.encode())
-    joined.update(np.ascontiguousarray(group[0].weights).tobytes())
-    return joined.hexdigest()[:20]
+def _poses_around(forward: QuasiStaticForward, poses: np.ndarray) -> np.ndarray:
+    """Return poses [s, 6] in all directions, as far out as a pull's own."""
+    model, rng = forward.model, np.random.default_rng(1)
+    reach = np.linalg.norm(poses[:, :3] - forward.grasp.centre, axis=1).max() / model.extent
+    return sample_poses(model, forward.grasp, STATES_AROUND, rng,
+                        TrainingSettings(reach=float(np.clip(1.1 * reach, 0.01, 0.9))))
+
+
+def _file_name(forward: QuasiStaticForward, digest: str) -> str:
+    """Of what a basis depends on: mesh, then grasp, weight and control points; no pull."""
+    model, grasp, entry = forward.model, forward.grasp, forward.entry
+    joined = hashlib.sha256(
+        f"{digest} {grasp.mode} {entry.gravity_m_s2} {entry.weightless} {model.gravity}"
+        f" {sorted(map(repr, model.point_masses))} {STATES_PER_PULL} {STATES_AROUND}".encode())
+    for array in (forward.weights, grasp.nodes, grasp.weights, model.fixed):
+        joined.update(np.ascontiguousarray(array).tobytes())
+    return f".reduced-{forward.mesh.geometry_digest()[:10]}-{joined.hexdigest()[:20]}.npz"
 
 
 def _read(path: Path | None, forward: QuasiStaticForward) -> ReducedModel | None:

@@ -98,7 +98,6 @@ def _estimate(branch: Branch, settings: EstimateSettings, *, force: bool, resume
     bases = _finished_bases(branch)
     log = EvaluationLog(log_path, json.dumps([plain(settings), digests], sort_keys=True))
     found = fit_branch(pulls, subject, settings, log=log, cache=branch.folder,
-                       digest=json.dumps(digests, sort_keys=True),
                        progress=heard.part(0.2, 0.9))
     found.warnings = warnings
     if not found.stopped:

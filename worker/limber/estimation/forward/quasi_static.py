@@ -118,6 +118,11 @@ class QuasiStaticForward(Forward):
     def mesh(self) -> TetMesh:
         return self._model.mesh
 
+    @property
+    def model(self) -> BranchModel:
+        """The branch under its weight, with the values to start from."""
+        return self._model
+
     def model_with(self, values: Values) -> BranchModel:
         """Return the branch with these parameters."""
         return self._model.with_parameters(
