@@ -10,7 +10,9 @@ import argparse
 import importlib
 import importlib.util
 import json
+import os
 import sys
+import threading
 from pathlib import Path
 
 import bpy
@@ -26,6 +28,23 @@ def _load_addon():
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
+
+
+def _end_with_parent() -> None:
+    """End when whoever started this does: `limber` then closes our standard input.
+
+    The core says so by LIMBER_PARENT_PIPE; see limber.jobs.ending, which Blender's Python lacks.
+    """
+    if os.environ.pop("LIMBER_PARENT_PIPE", None) != "stdin":
+        return
+
+    def watch() -> None:
+        while os.read(0, 1024):
+            continue
+        # Rendering hears no exception: the scene file is written whole or not at all.
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()
 
 
 def _say(**content) -> None:
@@ -93,6 +112,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--width", type=int, default=1120)
     parser.add_argument("--color")
     given = parser.parse_args(arguments)
+    _end_with_parent()
     try:
         summary = make_scene(given.data, given.scene, given.picture, given.width, given.color)
     except (ValueError, RuntimeError, OSError) as error:

@@ -30,6 +30,7 @@ COLORS = {
     "targets": (0.75, 0.45, 0.0),
     "base": (0.10, 0.075, 0.06),
     "rest": (0.22, 0.22, 0.22),
+    "robot": (0.32, 0.40, 0.48),
 }
 
 
@@ -220,6 +221,28 @@ def _add_base(shown: ShownBranch, data: SceneData) -> None:
     shown.objects["base"] = [thing]
 
 
+def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
+    """Add the arm, a rod a link, moving along with the frames."""
+    if "robot_links" not in data.arrays:
+        return
+    links, radius = data.arrays["robot_links"], float(data.arrays["robot_radius"][0])
+    title = f"Robot {data.info.get('robot', '')}".strip()
+    material = materials.plain_material(title, COLORS["robot"], roughness=0.5)
+    shown.objects["robot"] = []
+    for number in range(links.shape[1] - 1):
+        ends = links[:, number], links[:, number + 1]
+        length = float(np.linalg.norm(ends[1][0] - ends[0][0]))
+        if length < radius / 4:
+            # Two joints whose axes meet: there is no link to be seen.
+            continue
+        thin = radius if number < 3 else 0.7 * radius
+        rod = meshes.new_cylinder(f"{title} link {number + 1}", thin, length)
+        meshes.set_one_color(rod, COLORS["robot"])
+        thing = add_object(shown.collection, f"{title} link {number + 1}", rod, material)
+        animation.move_between(thing, *ends, speed=speed)
+        shown.objects["robot"].append(thing)
+
+
 def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> None:
     frames = data.info.get("frames")
     if not frames:
@@ -242,6 +265,7 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     for name in ("control_points", "targets"):
         for number, thing in enumerate(shown.objects.get(name, ())):
             animation.move_along(thing, data.arrays[f"{name}_motion"][:, number], speed=speed)
+    _add_robot(shown, data, speed)
     # Last: what was keyed stands where it is at the first frame, not at its last key.
     scene.frame_set(1)
     if "frame_energy" in data.arrays:

@@ -35,6 +35,7 @@ _SHAPES = {
     "path_strain": "p r", "path_color": "p4 r",
     "observation": "om3 r", "observation_visible": "om b", "observation_times": "o r",
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
+    "robot_links": "s83 r", "robot_radius": "1 r",
     "view_points": "w3 r", "view_direction": "3 r"}
 _NEEDED = ("vertices", "faces", "view_points", "view_direction")
 _NEEDED_INFO = {"name": str, "folder": str, "scalars": dict, "paths": dict, "notes": list,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Vector
 
 _HEADER = struct.Struct("<12siiffi")
 MODIFIER = "Limber motion"
@@ -116,6 +117,30 @@ def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 
         target.keyframe_insert("location", frame=frame_start + number / speed)
     if len(points):
         target.location = points[0]
+
+
+def move_between(target: bpy.types.Object, starts: np.ndarray, ends: np.ndarray,
+                 frame_start: int = 1, *, speed: float = 1.0) -> None:
+    """Key a rod that lies along z about its middle to reach from ``starts`` to ``ends`` [m].
+
+    Both have the shape [frames, 3]; otherwise as :func:`move_along`.
+    """
+    target.rotation_mode = "QUATERNION"
+    before = None
+    poses = []
+    for start, end in zip(np.asarray(starts, float), np.asarray(ends, float), strict=True):
+        turn = Vector(end - start).to_track_quat("Z", "Y")
+        if before is not None:
+            # Of the two quaternions of a rotation the one on this side: no spin in between.
+            turn.make_compatible(before)
+        before = turn
+        poses.append((Vector((start + end) / 2), turn))
+    for number, (place, turn) in enumerate(poses):
+        target.location, target.rotation_quaternion = place, turn
+        for channel in ("location", "rotation_quaternion"):
+            target.keyframe_insert(channel, frame=frame_start + number / speed)
+    if poses:
+        target.location, target.rotation_quaternion = poses[0]
 
 
 def cache_frame(target: bpy.types.Object, frame: float) -> float:

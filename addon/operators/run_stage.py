@@ -130,7 +130,7 @@ def _makes_branch(stage: Stage) -> bool:
 def _is_seen(stage: Stage) -> bool:
     """Whether what the stage writes is shown in the scene."""
     return any(name in ("mesh.vtu", "targets.json", "energy.npz")
-               or name.startswith(("plans/", "frames/")) for name in stage.writes)
+               or name.startswith(("plans/", "frames/", "executions/")) for name in stage.writes)
 
 
 def register() -> None:

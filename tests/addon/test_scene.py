@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -271,3 +272,60 @@ def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
          "--scene", tmp_path / "scene.blend"], check=False, capture_output=True, text=True)
     assert done.returncode == 3
     assert "another mesh" in json.loads(done.stdout.splitlines()[-1])["error"]
+
+
+def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
+    """A rod for each link reaches from joint to joint in every frame; too short ones are left out.
+    """
+    from mathutils import Vector
+
+    from limber.scene.data import scene_data as data_of
+    from limber.store import Branch
+
+    shown_data = data_of(Branch.open(beam.folder))
+    rng = np.random.default_rng(3)
+    links = np.cumsum(rng.uniform(0.1, 0.2, (6, 8, 3)), axis=1)
+    links[:, 4] = links[:, 3]
+    # Links are stiff: the same lengths in every frame.
+    steps = np.diff(links, axis=1)
+    lengths = np.linalg.norm(steps[0], axis=1)
+    norms = np.linalg.norm(steps, axis=2)
+    steps *= np.divide(lengths, norms, out=np.zeros_like(norms), where=norms > 0)[..., None]
+    links = np.concatenate([links[:, :1], links[:, :1] + np.cumsum(steps, axis=1)], axis=1)
+    shown_data.arrays |= {"robot_links": links, "robot_radius": np.array([0.03])}
+    shown_data.info["robot"] = "ur5e"
+    shown_data.write(tmp_path / "data.npz")
+    scenes = importlib.import_module("limber_addon.scene")
+    reader = importlib.import_module("limber_addon.scene_data")
+    shown = scenes.show_branch(bpy.context.scene, reader.read_scene_data(tmp_path / "data.npz"))
+    rods = shown.objects["robot"]
+    assert len(rods) == 6
+    for frame in (1, 4, 6):
+        bpy.context.scene.frame_set(frame)
+        for rod, number in zip(rods, (0, 1, 2, 4, 5, 6), strict=True):
+            half = np.linalg.norm(links[0, number + 1] - links[0, number]) / 2
+            ends = [np.array(rod.matrix_world @ Vector((0, 0, side * half))) for side in (-1, 1)]
+            np.testing.assert_allclose(ends, links[frame - 1, number:number + 2], atol=1e-5)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="kill -9")
+def test_a_killed_scene_leaves_no_blender(bpy, beam, tmp_path):
+    """SIGKILL to `limber scene` while it renders: what it started ends within seconds."""
+    import psutil
+
+    program = subprocess.Popen(
+        [sys.executable, "-m", "limber", "scene", str(beam.folder), "-o", str(tmp_path / "s.blend"),
+         "--render", str(tmp_path / "s.png"), "--width", "4000", "--progress", "json"],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    try:
+        for line in program.stdout:
+            if "rendering" in line:
+                break
+        started = psutil.Process(program.pid).children(recursive=True)
+        assert started and all(each.is_running() for each in started)
+    finally:
+        program.kill()
+        program.wait()
+        program.stdout.close()
+    _, alive = psutil.wait_procs(started, timeout=5)
+    assert not alive

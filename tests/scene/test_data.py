@@ -294,3 +294,47 @@ def test_the_stage_shows_the_folders_targets(tmp_path, mesh):
         assert json.loads(str(content["info"]))["targets"] == ["flower"]
         np.testing.assert_allclose(content["targets"], [[0.0, 0.0, 0.4]])
         assert content["targets_radius"].shape == (1,)
+
+
+def _preview(joints, base, arm):
+    """A dry run's table for these joints; its poses are those of the flange."""
+    from limber.robot.kinematics import forward, matrices, pose_vectors
+
+    poses = pose_vectors(matrices(np.array(base)) @ forward(arm, joints))
+    columns = ["t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
+               *(f"q{n}_rad" for n in range(1, 7)), "fx_n", "fy_n", "fz_n"]
+    rows = np.column_stack([np.arange(len(poses)), poses, joints, np.zeros((len(poses), 3))])
+    return poses, ",".join(columns) + "\n" + "\n".join(
+        ",".join(f"{x:.9g}" for x in row) for row in rows) + "\n"
+
+
+@pytest.mark.parametrize("away", [0.0, 0.1])
+def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away):
+    """In each frame: base, six origins with the arm's own distances, grasp at the branch's; an
+    arm that is elsewhere than the grasp is not shown."""
+    from limber.robot.arms import arm_named
+
+    arm = arm_named("ur5e")
+    steps = np.linspace(0, 1, 41)[:, None]
+    joints = np.array([0.4, -1.2, 1.5, -0.3, 0.8, 0.2]) + steps * [0.3, 0.1, -0.2, 0.2, 0.1, 0.0]
+    base = [0.5, -0.3, 0.1, 0.0, 0.0, 0.7]
+    poses, table = _preview(joints, base, arm)
+    taken = poses[::10]
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    points = taken[:, :3] + [away, 0, 0]
+    branch = _branch(tmp_path / "a.branch", mesh, plan__p=_plan({}, points) | {
+        "frames/p.pc2": _pc2(np.repeat(surface[None], len(points), axis=0))})
+    with branch.stage("execute-preview:p", reads=["plans/p.csv"]) as stage:
+        stage.path("executions/p-preview.csv").write_text(table)
+        stage.result.update(model="ur5e", base_pose=base)
+    data = scene_data(Branch.open(tmp_path / "a.branch"))
+    if away:
+        assert "robot_links" not in data.arrays
+        return
+    links = data.arrays["robot_links"]
+    assert links.shape == (5, 8, 3) and data.info["robot"] == "ur5e"
+    np.testing.assert_allclose(links[:, 0], np.repeat([base[:3]], 5, axis=0))
+    np.testing.assert_allclose(links[:, -1], points, atol=1e-7)
+    np.testing.assert_allclose(links[:, 6], points, atol=1e-7)
+    lengths = np.linalg.norm(np.diff(links[:, :7], axis=1), axis=2)
+    np.testing.assert_allclose(lengths, np.repeat([np.hypot(arm.a, arm.d)], 5, axis=0), atol=1e-7)

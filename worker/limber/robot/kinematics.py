@@ -31,6 +31,20 @@ def forward(arm: Arm, joints: np.ndarray) -> np.ndarray:
     return frames.reshape(*joints.shape[:-1], 4, 4)
 
 
+def link_frames(arm: Arm, joints: np.ndarray) -> np.ndarray:
+    """Return the frames of all six links in the base's, the last of them the flange's.
+
+    Args:
+        joints: Joint angles [rad], shape [..., 6].
+
+    Returns:
+        Homogeneous matrices, shape [..., 6, 4, 4].
+    """
+    joints = np.asarray(joints, float)
+    frames = _link_frames(arm.table, for_kernels(joints.reshape(-1, 6)))
+    return frames.reshape(*joints.shape[:-1], 6, 4, 4)
+
+
 def inverse(arm: Arm, frames: np.ndarray, reference: np.ndarray | None = None) -> np.ndarray:
     """Return every joint pose that brings the flange to ``frames``, angles within half a turn.
 
@@ -135,12 +149,16 @@ def _link(table: np.ndarray, joint: int, angle: float) -> np.ndarray:
 
 @compiled
 def _forward(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    frames = np.empty((len(joints), 4, 4))
+    return np.ascontiguousarray(_link_frames(table, joints)[:, 5])
+
+
+@compiled
+def _link_frames(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    frames = np.empty((len(joints), 6, 4, 4))
     for n in range(len(joints)):
-        frame = _link(table, 0, joints[n, 0])
+        frames[n, 0] = _link(table, 0, joints[n, 0])
         for k in range(1, 6):
-            frame = _product(frame, _link(table, k, joints[n, k]))
-        frames[n] = frame
+            frames[n, k] = _product(frames[n, k - 1], _link(table, k, joints[n, k]))
     return frames
 
 

@@ -196,6 +196,7 @@ def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: C
     with branch.stage(f"execute-preview:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
         stage.path(f"executions/{name}-preview.csv").write_text("\n".join(lines) + "\n",
                                                                encoding="utf-8")
+        stage.result.update(model=cell.robot.model, base_pose=list(cell.base.pose))
 
 
 def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
