@@ -1,6 +1,7 @@
 """The whole pipeline on one branch: every stage as a process, and a closing table."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import click
 
 from limber.cli import Run, stage_command
-from limber.errors import InputError
+from limber.errors import Cancelled, InputError, LimberError
 from limber.jobs.process import run_stage
 from limber.optional import require_extra
 
@@ -52,13 +53,21 @@ class _Demo:
               help="Folder of the results.  [default: out/NAME]")
 @click.option("--unit", type=click.Choice(["m", "cm", "mm", "in"]),
               help="Unit of the cloud.  [default: m]")
+@click.option("--up", type=float, nargs=3, metavar="X Y Z",
+              help="Which way is up in the cloud's axes.  [default: 0 0 1]")
+@click.option("--root", type=float, nargs=3, metavar="X Y Z",
+              help="A point near the root, in the cloud's coordinates; else the thick end.")
+@click.option("--crop", type=float, nargs=6, metavar="X Y Z X Y Z",
+              help="Lower and upper corner of the part to keep, in the cloud's coordinates.")
+@click.option("--goal", type=float, nargs=3, metavar="X Y Z",
+              help="Where the grasp shall be, in the branch's frame [m]; else a far pose.")
 @click.option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
               show_default=True, metavar="A,B,C,D",
               help="True Young's modulus [Pa] at the control points of your CLOUD's pull.")
 @click.option("--seed", type=int, default=1, show_default=True,
               help="Of the generated branch, the sensor noise and the planner.")
 def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None, young: str,
-            seed: int) -> dict[str, Any]:
+            seed: int, **wishes: tuple[float, ...] | None) -> dict[str, Any]:
     """The whole pipeline on one branch: a generated one with known truth, or your CLOUD."""
     if cloud is not None and not cloud.is_file():
         raise InputError(f"There is no file {cloud}.", "The demo wants the scan of one branch.",
@@ -70,16 +79,25 @@ def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None,
     _make_folder(demo.folder)
     started = time.perf_counter()
     run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
-    branch = _run_stages(demo, cloud, name, unit=unit, young=young, seed=seed)
+    branch, failure = _run_stages(demo, cloud, name, unit=unit, young=young, seed=seed,
+                                  wishes=wishes)
     _show_tables(demo)
     summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}
     run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\n"
             f"picture {summary['picture']}\n{summary['demo_seconds']:.0f} s in all")
+    if failure is not None:
+        raise failure
     return summary
 
 
 def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None, young: str,
-                seed: int) -> Path:
+                seed: int, wishes: Mapping[str, tuple[float, ...] | None],
+                ) -> tuple[Path, LimberError | None]:
+    """Run all stages; what fails between mesh and scene ends in a report all the same.
+
+    Returns:
+        The branch folder, and what failed.
+    """
     branch = demo.folder / f"{name}.branch"
     truth: list[str] = []
     if cloud is None:
@@ -89,18 +107,39 @@ def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None,
     else:
         truth = ["--young", young]
     units = ["--unit", unit] if unit else []
-    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *units)
-    demo.stage("a simulated pull, with sensor noise", "virtual-pull", branch,
-               "--name", "pull-1", "--seed", seed, *truth)
-    demo.stage("Young's modulus from the pull", "estimate", branch)
-    demo.stage("a pull with the estimated modulus", "simulate", branch)
-    demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
-    demo.stage("RRT* and D-RRT* paths", "plan", branch, "--name", "to-goal", "--seed", seed)
+    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *units,
+               *_scan_options(wishes))
+    goal = ["--goal", *wishes["goal"]] if wishes.get("goal") else []
+    failure = None
+    try:
+        demo.stage("a simulated pull, with sensor noise", "virtual-pull", branch,
+                   "--name", "pull-1", "--seed", seed, *truth)
+        demo.stage("Young's modulus from the pull", "estimate", branch)
+        demo.stage("a pull with the estimated modulus", "simulate", branch)
+        demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
+        demo.stage("RRT* and D-RRT* paths", "plan", branch, "--name", "to-goal", "--seed", seed,
+                   *goal)
+    except Cancelled:
+        raise
+    except LimberError as error:
+        failure = error
+        demo.run.progress.warn(f"{error} Scene and report show what there is.")
     picture = demo.folder / "scene.png"
     demo.stage("a Blender scene and its picture", "scene", branch,
                "-o", demo.folder / "scene.blend", "--render", picture)
     demo.stage("the report", "report", branch, "--picture", picture)
-    return branch
+    return branch, failure
+
+
+def _scan_options(wishes: Mapping[str, tuple[float, ...] | None]) -> list[object]:
+    """What is known of the scan, as options of `limber reconstruct`."""
+    options: list[object] = []
+    for name in ("up", "root"):
+        if wishes.get(name):
+            options += [f"--{name}", *wishes[name]]
+    if wishes.get("crop"):
+        options += ["--crop-low", *wishes["crop"][:3], "--crop-high", *wishes["crop"][3:]]
+    return options
 
 
 def _make_folder(folder: Path) -> None:
@@ -114,9 +153,11 @@ def _make_folder(folder: Path) -> None:
 def _show_tables(demo: _Demo) -> None:
     from limber.report.tables import comparison_rows, modulus_rows
 
-    demo.run.show("Young's modulus",
-                  modulus_rows(demo.results["estimate"], demo.results["virtual-pull"]))
-    demo.run.show("Paths", comparison_rows(demo.results["plan"]))
+    if "estimate" in demo.results:
+        demo.run.show("Young's modulus",
+                      modulus_rows(demo.results["estimate"], demo.results["virtual-pull"]))
+    if "plan" in demo.results:
+        demo.run.show("Paths", comparison_rows(demo.results["plan"]))
 
 
 def _summary(demo: _Demo, branch: Path) -> dict[str, Any]:
@@ -124,7 +165,7 @@ def _summary(demo: _Demo, branch: Path) -> dict[str, Any]:
         "branch": branch, "report": branch / "report.html",
         "scene": demo.folder / "scene.blend", "picture": demo.folder / "scene.png",
         "stage_seconds": demo.seconds,
-        "young_pa": demo.results["estimate"]["young_pa"],
-        "energy_saved_percent": demo.results["plan"]["energy_saved_percent"],
-        "length_added_percent": demo.results["plan"]["length_added_percent"],
+        "young_pa": demo.results.get("estimate", {}).get("young_pa"),
+        "energy_saved_percent": demo.results.get("plan", {}).get("energy_saved_percent"),
+        "length_added_percent": demo.results.get("plan", {}).get("length_added_percent"),
     }
