@@ -89,6 +89,7 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     in_radii = np.concatenate([away / there.radius[near], back / there.radius])
     error = here.radius / there.radius[near] - 1
     hits, right = fork_matches(truth, found)
+    right = (away < np.maximum(there.radius[near], 0.001)) & ~doubled(found, here, near)
     on_axis = away < 1.5 * there.radius[near]
     sigma = found.radius_sigma[here.high]
     covered = np.abs(here.radius - there.radius[near]) < 1.96 * sigma
@@ -110,10 +111,24 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
         "told_forks": [[p, bool(r)] for p, r in zip(stated, right, strict=True)],
         "resolved_bias": float(np.median(error[resolved])) if resolved.any() else 0.0,
-        "told_nodes": _told_nodes(found.probability[here.high], away < np.maximum(
-            there.radius[near], 0.001), found.branch[here.high]),
+        "told_nodes": _told_nodes(found.probability[here.high], right, found.branch[here.high]),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
-        "right": float((away < np.maximum(there.radius[near], 0.001)).mean())}
+        "right": float(right.mean())}
+
+
+def doubled(found: Skeleton, here: Dense, near: np.ndarray) -> np.ndarray:
+    """Which places lie on a run that for the most part is where its carrier is: none of its own.
+
+    Args:
+        found: The skeleton.
+        here: Its places.
+        near: The nearest true place of each.
+    """
+    run, twice = found.branch[here.high], np.zeros(len(near), bool)
+    for number, members in enumerate(found.runs()[1:], start=1):
+        own, carrier = run == number, run == found.branch[members[0]]
+        twice |= own & (np.isin(near[own], near[carrier]).mean() > 0.5 if own.any() else False)
+    return twice
 
 
 def _told_nodes(stated: np.ndarray, right: np.ndarray, branch: np.ndarray) -> list[list[float]]:

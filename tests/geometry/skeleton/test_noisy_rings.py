@@ -44,7 +44,8 @@ def test_sides_are_told_apart() -> None:
         distance = np.linalg.norm(points[:, :2], axis=1)
         out = np.column_stack([points[:, :2] / distance[:, None], np.zeros(len(points))])
         sharpness = 0.006 * distance / 0.001**2
-        return out, sharpness, seen_sides(out, axis, distance - 0.006, sharpness, np.ones(6000))
+        return out, sharpness, seen_sides(
+            out, axis, distance - 0.006, sharpness, np.full(6000, 36.0), np.ones(6000))
 
     assert seen(_points(0.006, 0.001, False))[2].share.min() == 1.0
     out, sharpness, half = seen(_points(0.006, 0.001, True))
@@ -55,3 +56,17 @@ def test_sides_are_told_apart() -> None:
     # The mean place is shorter the less is known, and never longer than the circle's radius.
     size = np.linalg.norm(mean_places(out, axis, sharpness, np.full(6000, 36.0), half), axis=1)
     assert size.max() <= 1 + 1e-9 and size.min() > 0.3
+
+
+def test_half_a_noisy_ring_is_not_taken_for_a_thinner_whole_one() -> None:
+    """Noise of half the radius, and the axis at first in the middle of the points that one side
+    shows: points lie all around it, and only how they scatter tells that it is half a ring."""
+    half = _points(0.005, 0.0025, True)
+    start = _axis(0.003)
+    fit = fit_axes(start.moved(start.nodes + [half[:, 0].mean(), 0, 0]), half, rounds=30)
+    assert np.median(fit.skeleton.radius[5:-5]) == pytest.approx(0.005, rel=0.15)
+    whole = fit_axes(_axis(0.005), _points(0.005, 0.0025, False), rounds=30)
+    assert np.median(whole.skeleton.radius[5:-5]) == pytest.approx(0.005, rel=0.1)
+    # Where the seen side ends is open: its doubt is in the interval, of half a ring alone.
+    assert fit.skeleton.radius_sigma[20] > 0.03 * fit.skeleton.radius[20]
+    assert whole.skeleton.radius_sigma[20] < fit.skeleton.radius_sigma[20]

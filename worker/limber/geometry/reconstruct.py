@@ -216,7 +216,7 @@ def seen_skeleton(found: SkeletonResult, prepared: Prepared, reach: float,
     skeleton, dropped = without_hidden_twigs(found.skeleton, prepared.view, reach)
     skeleton, limited = within_silhouette(skeleton, prepared.cloud.points, prepared.view)
     if not (dropped or limited):
-        return found, ""
+        return replace(found, skeleton=skeleton), ""
     node, residual = nearest_cylinders(skeleton, prepared.cloud.points)
     text = ""
     if dropped:

@@ -15,7 +15,12 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.fit_kernels import nearest_of, normal_blocks
-from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides
+from limber.geometry.skeleton.radii.noisy_rings import (
+    SeenSides,
+    mean_places,
+    seen_sides,
+    side_doubt,
+)
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
@@ -81,7 +86,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         trusted = noise if settled or number > rounds // 2 else 0.0
         place = match.normal
         if trusted:
-            place = _places(skeleton.parent, nodes, match, weight, noise)
+            place, _ = _places(skeleton.parent, nodes, match, weight, noise)
         system = _system(skeleton, nodes, radius, match, weight, trusted, place)
         step = system.solve()
         limit = 0.5 * radius
@@ -99,6 +104,8 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     if uncertainty:
         weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
         sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
+        _, seen = _places(skeleton.parent, nodes, match, weight, noise)
+        sigma = np.hypot(sigma, side_doubt(seen, radius, noise))
         state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     fitted = replace(skeleton, nodes=nodes, radius=np.maximum(radius, 0.1 * floor),
                      radius_sigma=sigma, radius_state=state)
@@ -111,14 +118,15 @@ def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
 
 
 def _places(parent: np.ndarray, nodes: np.ndarray, match: "_Match", weight: np.ndarray,
-            noise: float) -> np.ndarray:
-    """Mean direction to where on its cylinder each point comes from, shape [m, 3]."""
+            noise: float) -> tuple[np.ndarray, SeenSides]:
+    """Mean direction to where on its cylinder each point comes from, shape [m, 3]; what was seen.
+    """
     axis = nodes[match.segment] - nodes[parent[match.segment]]
     axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
     sharpness = match.thick * (match.residual + match.thick) / max(noise, 1e-12)**2
-    seen = seen_sides(match.normal, axis, match.residual, sharpness, weight)
     stout = (match.thick / max(noise, 1e-12))**2
-    return mean_places(match.normal, axis, sharpness, stout, seen)
+    seen = seen_sides(match.normal, axis, match.residual, sharpness, stout, weight)
+    return mean_places(match.normal, axis, sharpness, stout, seen), seen
 
 
 def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,

@@ -17,6 +17,7 @@ _ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouet
 _WINDOW = 3  # nodes to each side whose silhouette is taken together
 _SLACK = 1.2  # times as thick as its silhouette a branch may be
 _LEAST = 8  # pixels that make a silhouette
+_EDGE = 0.3  # pixels that a radius may be off, whatever its fit says: each edge is known to one
 
 
 def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
@@ -52,7 +53,7 @@ def without_hidden_twigs(skeleton: Skeleton, view: View, factor: float,
 
 def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
                       ) -> tuple[Skeleton, int]:
-    """Clamp radii to what the silhouettes are wide.
+    """Clamp radii to what the silhouettes are wide, and widen their intervals by the pixels.
 
     The pixels of a piece of branch cover its length, as the camera sees it, times its width.
 
@@ -87,7 +88,8 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
         if run == 0 and radius[0] > 1.1 * radius[members[1]]:
             radius[0], state[0] = 1.1 * radius[members[1]], LIMITED
     limited = int((radius < skeleton.radius).sum())
-    return replace(skeleton, radius=radius, radius_state=state), limited
+    sigma = np.hypot(skeleton.radius_sigma, _EDGE * np.where(count > 0, width, np.median(pixel)))
+    return replace(skeleton, radius=radius, radius_sigma=sigma, radius_state=state), limited
 
 
 def _beyond(skeleton: Skeleton, twig: np.ndarray, carrier: np.ndarray, view: View,
