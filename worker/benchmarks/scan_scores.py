@@ -88,7 +88,7 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
     back, _ = cKDTree(here.points).query(there.points)
     in_radii = np.concatenate([away / there.radius[near], back / there.radius])
     error = here.radius / there.radius[near] - 1
-    hits, right = fork_matches(truth, found)
+    hits, true_fork = fork_matches(truth, found)
     right = (away < np.maximum(there.radius[near], 0.001)) & ~doubled(found, here, near)
     on_axis = away < 1.5 * there.radius[near]
     sigma = found.radius_sigma[here.high]
@@ -105,11 +105,11 @@ def score(truth: Skeleton, found: Skeleton) -> dict[str, float]:
         "radius_error": float(np.median(np.abs(error))), "radius_bias": float(np.median(error)),
         "sigma_m": float(np.median(sigma)), "covered": float(covered[on_axis].mean()),
         "measured": float((found.radius_state[here.high] == MEASURED).mean()),
-        "forks": len(truth.forks()), "forks_found": hits, "forks_false": int((~right).sum()),
+        "forks": len(truth.forks()), "forks_found": hits, "forks_false": int((~true_fork).sum()),
         "root_diameters": float(np.linalg.norm(found.nodes[0] - truth.nodes[0])
                                 / (2 * truth.radius[0])),
         "main_axis_radii": main_off, "length_error": found.length / truth.length - 1,
-        "told_forks": [[p, bool(r)] for p, r in zip(stated, right, strict=True)],
+        "told_forks": [[p, bool(r)] for p, r in zip(stated, true_fork, strict=True)],
         "resolved_bias": float(np.median(error[resolved])) if resolved.any() else 0.0,
         "told_nodes": _told_nodes(found.probability[here.high], right, found.branch[here.high]),
         "recall": float((back < np.maximum(there.radius, 0.001)).mean()),
