@@ -53,9 +53,11 @@ def _read_ply(path: Path) -> np.ndarray:
             names = [name for name, _ in columns]
             return rows[:, [names.index(axis) for axis in "xyz"]]
         kind = np.dtype([(name, order + code) for name, code in columns])
+        if count * kind.itemsize > path.stat().st_size:
+            raise ValueError("it is cut short")
         content = stream.read(count * kind.itemsize)
     if len(content) < count * kind.itemsize:
-        raise ValueError("it is cut short")
+        raise ValueError("it is cut short after its header")
     rows = np.frombuffer(content, kind)
     return np.column_stack([rows[axis].astype(float) for axis in "xyz"])
 

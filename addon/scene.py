@@ -78,7 +78,10 @@ def place_scans(scene: bpy.types.Scene, data: SceneData) -> None:
     """Put imported scans to where the branch made of them is: it was set upright and to 0."""
     for thing in scene.objects:
         if thing.get(SCAN_KEY) == data.info["source"].get("sha256", ""):
-            thing.matrix_world = Matrix(data.info["alignment"])
+            # In double precision: offset and alignment take far places off each other.
+            matrix = np.array(data.info["alignment"], float)
+            matrix[:3, 3] += matrix[:3, :3] @ np.array(thing.get(OFFSET_KEY, (0.0,) * 3))
+            thing.matrix_world = Matrix(matrix.tolist())
 
 
 def color_by(surface: bpy.types.Object, name: str) -> None:

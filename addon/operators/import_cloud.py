@@ -3,10 +3,11 @@
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from .. import branch_folder, clouds
 from ..bridge import meshes
-from ..scene import SCAN_KEY, add_object
+from ..scene import OFFSET_KEY, SCAN_KEY, add_object
 from .viewing import look_at
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
@@ -34,13 +35,16 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         path = Path(bpy.path.abspath(self.filepath or settings.reconstruct.cloud))
         try:
             points = clouds.read_points(path)
-            mesh = meshes.new_mesh(path.stem, points)
+            offset = _offset(points)
+            mesh = meshes.new_mesh(path.stem, points - offset)
             folder = self._folder(context, path)
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         cloud = add_object(context.scene.collection, f"{path.stem} scan", mesh)
         cloud[SCAN_KEY] = branch_folder.file_sha256(path)
+        if offset.any():
+            cloud[OFFSET_KEY] = [float(value) for value in offset]
         cloud.scale = [_METRES[settings.reconstruct.unit]] * 3
         settings.reconstruct.cloud = str(path)
         settings.branch_folder = str(folder)
@@ -55,6 +59,16 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
                                           branch_folder.file_sha256(path)):
             return Path(chosen)
         return branch_folder.folder_for(path)
+
+
+def _offset(points: np.ndarray) -> np.ndarray:
+    """Return what to take off the points [n, 3]: map coordinates would lose their last digits.
+
+    A viewport has single precision. Whole numbers, so that nothing is lost by taking them off.
+    """
+    middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
+    extent = np.ptp(points, axis=0).max()
+    return middle if np.abs(middle).max() > 100 * max(extent, 1e-9) else np.zeros(3)
 
 
 class LIMBER_FH_cloud(bpy.types.FileHandler):

@@ -62,6 +62,8 @@ class WorkerOperator:
         """Blender closes or loads another file: the worker must not live on unseen."""
         self._remove_timer(context)
         if self._job is not None:
+            # Not a failure: the panel of the next file shall not show one.
+            self._job.cancel()
             self._job.stop_now()
             self._job.poll()
 

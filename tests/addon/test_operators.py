@@ -3,6 +3,8 @@
 import importlib
 import shutil
 import struct
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -246,3 +248,44 @@ def test_import_stands_in_the_file_menu(bpy, registered):
     imports = importlib.import_module("limber_addon.operators.import_cloud")
     assert imports._draw_menu in menu._dyn_ui_initialize()
     assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"
+
+
+def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
+    """A scan in a map's coordinates: a millimetre is still there, and it comes to its branch."""
+    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    scene = importlib.import_module("limber_addon.scene")
+    points = np.array([[432100.001, 5412300.002, 512.003], [432100.501, 5412300.102, 513.0]])
+    (tmp_path / "map.xyz").write_text("".join(f"{x} {y} {z}\n" for x, y, z in points))
+    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "map.xyz"))
+    cloud = bpy.data.objects["map scan"]
+    offset = np.array(cloud[scene.OFFSET_KEY])
+    np.testing.assert_allclose(meshes.positions(cloud.data) + offset, points, rtol=0, atol=1e-6)
+    alignment = np.eye(4)
+    alignment[:3, 3] = -points[0]
+    data = SimpleNamespace(info={"source": {"sha256": cloud[scene.SCAN_KEY]},
+                                 "alignment": alignment.tolist()})
+    scene.place_scans(bpy.context.scene, data)
+    bpy.context.view_layer.update()
+    placed = [np.array(cloud.matrix_world @ vertex.co) for vertex in cloud.data.vertices]
+    np.testing.assert_allclose(placed, points - points[0], rtol=0, atol=1e-5)
+
+
+def test_a_count_that_the_file_has_no_room_for(bpy, registered, tmp_path):
+    """No memory is taken for what a header only claims."""
+    clouds = importlib.import_module("limber_addon.clouds")
+    path = tmp_path / "huge.ply"
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 900000000000\n"
+                     b"property float x\nproperty float y\nproperty float z\nend_header\n1234")
+    with pytest.raises(ValueError, match="cut short"):
+        clouds.read_points(path)
+
+
+def test_a_job_that_blender_ends_is_no_failure(bpy, registered, tmp_path):
+    """File > New while the worker works: the panel of the new file shows no failure."""
+    jobs = importlib.import_module("limber_addon.jobs")
+    operators = importlib.import_module("limber_addon.operators.worker_operator")
+    operator = operators.WorkerOperator()
+    operator._job = jobs.start("Working", [sys.executable, "-c", "import time; time.sleep(60)"])
+    operator.cancel(bpy.context)
+    assert operator._job.state is jobs.JobState.CANCELLED and not operator._job.error
+    assert operator._job._process.stdout.closed and operator._job._process.stderr.closed

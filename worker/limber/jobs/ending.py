@@ -8,6 +8,7 @@ import _thread
 import ctypes
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -62,6 +63,21 @@ def _when_closed(handle: int, then: Callable[[], None]) -> None:
         then()
 
     threading.Thread(target=watch, name="parent watch", daemon=True).start()
+
+
+def end_by_closing(process: subprocess.Popen, seconds: float = 5.0) -> None:
+    """Close a child's standard input, which tells it to end; kill it if it does not in time."""
+    if process.stdin is not None and not process.stdin.closed:
+        try:
+            process.stdin.close()
+        except OSError:
+            # It ended with a line on the way.
+            process.kill()
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def kill_tree(process_id: int) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from limber.compiled import compiled, for_kernels
 from limber.robot.arms import Arm
+from limber.robot.frames import inverse_of
 
 BRANCH_COUNT = 8
 """Inverse solutions a pose has at most, whole turns apart."""
@@ -232,7 +233,7 @@ def _solve_plane(table: np.ndarray, frame: np.ndarray, q1: float, q5: float, q6:
                  a3: float, d5: float, rows: np.ndarray) -> None:
     """Fill the two elbow solutions ``rows`` [2, 6], with the three parallel joints left over."""
     end = _product(_link(table, 4, q5), _link(table, 5, q6))
-    middle = _product(_rigid_inverse(_link(table, 0, q1)), _product(frame, _rigid_inverse(end)))
+    middle = _product(inverse_of(_link(table, 0, q1)), _product(frame, inverse_of(end)))
     # Frame 4 in frame 1: joints 2 to 4 turn about one direction, its z.
     x, y = middle[0, 3], middle[1, 3]
     # Frame 4 stands after a twist of a quarter turn: its x axis carries the sum of the angles.
@@ -253,17 +254,6 @@ def _solve_plane(table: np.ndarray, frame: np.ndarray, q1: float, q5: float, q6:
         rows[elbow, 0], rows[elbow, 1], rows[elbow, 2] = _half_turn(q1), _half_turn(q2), q3
         rows[elbow, 3] = _half_turn(total - q2 - q3)
         rows[elbow, 4], rows[elbow, 5] = q5, _half_turn(q6)
-
-
-@compiled
-def _rigid_inverse(frame: np.ndarray) -> np.ndarray:
-    result = np.zeros((4, 4))
-    for i in range(3):
-        for j in range(3):
-            result[i, j] = frame[j, i]
-            result[i, 3] -= frame[j, i] * frame[j, 3]
-    result[3, 3] = 1.0
-    return result
 
 
 @compiled

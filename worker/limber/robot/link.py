@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.jobs.ending import end_by_closing
 from limber.robot.cell import Cell
 from limber.robot.trajectory import Trajectory
 
@@ -163,17 +164,7 @@ class RobotLink:
         """Stop what moves and end the process."""
         self._closing.set()
         with self._write_lock:
-            if self.process.stdin is not None and not self.process.stdin.closed:
-                try:
-                    self.process.stdin.close()
-                except OSError:
-                    # It ended with a line on the way.
-                    self.process.kill()
-        try:
-            self.process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+            end_by_closing(self.process)
 
     def _order(self, **content: Any) -> None:
         self._write(json.dumps(content))

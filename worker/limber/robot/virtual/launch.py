@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import LimberError, WorkError
+from limber.jobs.ending import end_by_closing
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.motion import Servo, SpeedMotion, Waypoint, line_move
 from limber.robot.virtual.server import Server, new_loop
@@ -87,17 +88,7 @@ class VirtualRobot:
 
     def close(self) -> None:
         """End the process."""
-        if self.process.stdin is not None and not self.process.stdin.closed:
-            try:
-                self.process.stdin.close()
-            except OSError:
-                # It was killed with a line on the way.
-                self.process.kill()
-        try:
-            self.process.wait(5.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        end_by_closing(self.process)
         self._reader.join(5.0)
         if self.process.stdout is not None:
             self.process.stdout.close()
