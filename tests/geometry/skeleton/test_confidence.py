@@ -47,6 +47,13 @@ def test_gaps_and_thin_twigs_are_said(tmp_path) -> None:
     back = read_fitted(tmp_path / "s.csv")
     np.testing.assert_array_equal(back.radius_state[1:], told.radius_state[1:])
     np.testing.assert_allclose(back.probability[1:], told.probability[1:], atol=6e-4)
+    # Two nodes at one place are read as one, and the others keep what was said of them.
+    twice = told.nodes.copy()
+    twice[20] = twice[19]
+    write_cylinders(told.moved(twice), tmp_path / "t.csv")
+    once = read_fitted(tmp_path / "t.csv")
+    assert once.node_count == told.node_count - 1
+    np.testing.assert_allclose(once.probability[20:], told.probability[21:], atol=6e-4)
 
 
 def test_a_twig_with_more_points_is_surer() -> None:

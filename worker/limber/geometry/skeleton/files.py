@@ -88,12 +88,10 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
     radius = np.concatenate([[first], table[:, 8]]) * scale
     hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
     fitted = _fitted_columns(path, rows, scale)
-    count = len(nodes)
-    nodes, hang, radius = _without_repeats(nodes, hang, radius)
-    # Where nodes at one place were merged it is not known what belongs to which.
-    fitted = fitted if len(nodes) == count else {}
-    return Skeleton.from_edges(nodes, hang, radius, **{
-        name: np.concatenate([values[root:root + 1], values]) for name, values in fitted.items()})
+    hang, keep = _without_repeats(nodes, hang)
+    return Skeleton.from_edges(nodes[keep], hang, radius[keep], **{
+        name: np.concatenate([values[root:root + 1], values])[keep]
+        for name, values in fitted.items()})
 
 
 def write_cylinders(skeleton: Skeleton, path: Path) -> None:
@@ -191,9 +189,8 @@ def _parents(path: Path, ids: np.ndarray, parent_ids: np.ndarray) -> np.ndarray:
     return np.array([where[int(p)] if p >= 0 else -1 for p in parent_ids], np.int64)
 
 
-def _without_repeats(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray,
-                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge a node with its parent where both are at the same place."""
+def _without_repeats(nodes: np.ndarray, parent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Merge a node with its parent where both are at the same place: new parents, nodes kept."""
     step = np.linalg.norm(nodes - nodes[parent], axis=1)
     repeated = (parent >= 0) & (step < 1e-9)
     target = np.arange(len(nodes))
@@ -205,4 +202,4 @@ def _without_repeats(nodes: np.ndarray, parent: np.ndarray, radius: np.ndarray,
     keep = ~repeated
     new_index = np.cumsum(keep) - 1
     moved = np.where(parent < 0, -1, new_index[target[parent]])
-    return nodes[keep], moved[keep], radius[keep]
+    return moved[keep], keep
