@@ -38,7 +38,8 @@ def _table(done: dict[str, Outcomes]) -> list[Row]:
     table += _view_rows("single-view", done["single-view"], None, None, None, None, None)
     table.append(_root_row([done["one-sided"], done["round"]]))
     table.append(_gap_row(done["gaps"]))
-    table += probability_rows(list(done.values()))
+    table += probability_rows("", [one for kind, one in done.items() if kind != "leafy"])
+    table += probability_rows(" of leafy plants", [done["leafy"]])
     table.append(_crown_row(done["crowns"]))
     table.append(_leafy_row(done["leafy"]))
     return table
@@ -108,7 +109,7 @@ def _gap_row(gaps: Outcomes) -> Row:
                f"{gaps.forks()[0]}{gaps.told()}", held >= 0.95 * gaps.count)
 
 
-def probability_rows(kinds: list[Outcomes]) -> list[Row]:
+def probability_rows(name: str, kinds: list[Outcomes]) -> list[Row]:
     """Stated probabilities of forks and of nodes against how often they are there, in tenths.
 
     Nodes are counted by length; how many branches they lie on says how sure their share is.
@@ -120,7 +121,7 @@ def probability_rows(kinds: list[Outcomes]) -> list[Row]:
         np.ones(len(forks)), forks[:, 0], forks[:, 1], np.ones(len(forks)))], axis=1)
     nodes = sum((np.array(score["told_nodes"]) for one in kinds for score in one.scores),
                 np.zeros((10, 4)))
-    return [_probability_row(name, bins) for name, bins in (("forks", counted), ("nodes", nodes))]
+    return [_probability_row(f"forks{name}", counted), _probability_row(f"nodes{name}", nodes)]
 
 
 def _probability_row(name: str, bins: np.ndarray) -> Row:
