@@ -10,7 +10,7 @@ from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.sight import View
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
-from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 from limber.perception.simulated_camera import render_depth, with_noise
 from limber.stages.reconstruct import reconstruct
 
@@ -58,6 +58,13 @@ def test_no_branch_is_thicker_than_its_silhouette():
     assert np.mean(thinner.radius <= 1.25 * truth.radius + pixel) > 0.8
     assert np.all(thinner.radius > 0.9 * truth.radius)
     assert count == (thinner.radius_state == LIMITED).sum() > 0.8 * truth.node_count
+    # A fit that depth noise made collapse is not believed: the silhouette tells the radius.
+    hidden = Skeleton.from_edges(truth.nodes, truth.parent, 0.2 * truth.radius, radius_state=(
+        np.full(truth.node_count, UNRESOLVED, np.int8)))
+    told, _ = within_silhouette(hidden, points, view)
+    assert abs(np.median(told.radius / truth.radius) - 1) < 0.15
+    assert np.mean(np.abs(told.radius - truth.radius) < 1.96 * told.radius_sigma) > 0.8
+    assert (told.radius_state == UNRESOLVED).all()
 
 
 def test_a_depth_cameras_place_goes_with_the_cloud():

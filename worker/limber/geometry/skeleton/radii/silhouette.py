@@ -11,12 +11,13 @@ import numpy as np
 
 from limber.geometry.cloud.sight import View
 from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
-from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
+from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 
 _ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouette tells the width
 _WINDOW = 3  # nodes to each side whose silhouette is taken together
 _SLACK = 1.2  # times as thick as its silhouette a branch may be
 _LEAST = 8  # pixels that make a silhouette
+_WIDE = 0.35  # of a radius that a silhouette tells: leaves and crossing branches are in it too
 _EDGE = 0.3  # pixels that a radius may be off, whatever its fit says: each edge is known to one
 
 
@@ -55,7 +56,9 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
                       ) -> tuple[Skeleton, int]:
     """Clamp radii to what the silhouettes are wide, and widen their intervals by the pixels.
 
-    The pixels of a piece of branch cover its length, as the camera sees it, times its width.
+    The pixels of a piece of branch cover its length, as the camera sees it, times its width. Where
+    the scatter of the depth hides how thick a branch is, they tell its radius, and it stays
+    marked as not resolved.
 
     Args:
         skeleton: Fitted to the cloud.
@@ -71,6 +74,7 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
     count = np.bincount(segment, minlength=skeleton.node_count)
     width = np.bincount(segment, pixel, skeleton.node_count) / np.maximum(count, 1)
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
+    sigma = skeleton.radius_sigma.copy()
     for run, members in enumerate(skeleton.runs()):
         step = np.diff(skeleton.nodes[members], axis=0)
         seen, aside = _seen_lengths(step, skeleton.nodes[members[1:]], view)
@@ -81,14 +85,20 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
             total = float(seen[near].sum())
             if count[own[near]].sum() < _LEAST or total <= 0 or aside[near].min() < _ASIDE:
                 continue
+            half, pixels = float(area[own[near]].sum()) / (2 * total), width[own[near]].max()
             # Half a pixel to each side, that the edge may have lost, and as much for its place.
-            cap = _SLACK * float(area[own[near]].sum()) / (2 * total) + width[own[near]].max()
-            if radius[node] > cap:
+            cap = _SLACK * half + pixels
+            if state[node] == UNRESOLVED:
+                # Images that take a pixel for the branch's if any of it is are half a pixel wider
+                # to each side, those that take it by its middle are not.
+                radius[node] = max(half - 0.25 * pixels, 0.25 * pixels)
+                sigma[node] = max(_WIDE * radius[node], 0.5 * pixels)
+            elif radius[node] > cap:
                 radius[node], state[node] = cap, LIMITED
         if run == 0 and radius[0] > 1.1 * radius[members[1]]:
             radius[0], state[0] = 1.1 * radius[members[1]], LIMITED
-    limited = int((radius < skeleton.radius).sum())
-    sigma = np.hypot(skeleton.radius_sigma, _EDGE * np.where(count > 0, width, np.median(pixel)))
+    limited = int(((radius < skeleton.radius) & (state == LIMITED)).sum())
+    sigma = np.hypot(sigma, _EDGE * np.where(count > 0, width, np.median(pixel)))
     return replace(skeleton, radius=radius, radius_sigma=sigma, radius_state=state), limited
 
 
