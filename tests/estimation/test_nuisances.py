@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from tests.subjects.paper_branches import measured
 
 from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
+from limber.estimation.doubt.path_error import led_by_path, path_error
 from limber.estimation.fit import fit_pulls
 from limber.estimation.forward.watched import WatchedForward
 from limber.estimation.nuisances import eliminated, in_words
@@ -124,3 +125,24 @@ def test_calibration_survives_a_pull_file(tmp_path, small_pull):
         update={"calibration": CalibrationEntry(pose_sigma_m=2e-4)})
     write_entry(tmp_path / "pull.toml", entry)
     assert read_entry(tmp_path / "pull.toml").calibration == entry.calibration
+
+
+def test_a_path_that_leads_says_so_and_widens_the_interval(small_bench, small_pull):
+    """Without a measured force the frame counts as exact in the fit: a millimetre of it enters the
+    interval, ten times less of it ten times less, and where it is known exactly there is no word.
+    """
+    def found(**known):
+        calibration = EXACT.model_copy(update=known)
+        pull = measured(small_pull, 3)
+        pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": calibration}))
+        objective = small_bench.objective([pull], SETTINGS)
+        evaluation = objective.evaluate(objective.space.pack(Values(TRUTH, 0.36, 900.0)),
+                                        jacobian=True)
+        return led_by_path(objective.forwards), path_error(evaluation, objective)
+
+    led, wide = found(pose_sigma_m=1e-3)
+    assert [forward.name for forward in led] == ["pull-1"]
+    assert wide.shape == (4,) and wide.max() > 0.1
+    assert found(pose_sigma_m=1e-4)[1] == pytest.approx(wide / 10, rel=0.05)
+    assert np.all(found(pose_sigma_m=1e-3, pose_sigma_rad=0.02)[1] > wide)
+    assert led_by_path(small_bench.objective([small_pull], SETTINGS).forwards) == []

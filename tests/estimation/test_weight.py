@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.estimation.fit import fit_pulls
+from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace
@@ -15,6 +16,7 @@ from limber.estimation.virtual_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
 from limber.mechanics.added import PointMass
+from limber.progress import Progress
 from limber.stages.mesh import mesh_surface
 from limber.stages.virtual_pull import virtual_pull
 from limber.store import Branch
@@ -68,6 +70,22 @@ def test_estimate_knows_that_the_branch_hangs(scanned, pull):
     np.testing.assert_allclose(with_weight, TRUTH, rtol=2e-3)
     without = fitted(scanned, pull, gravity=False)
     assert np.abs(without / TRUTH - 1).max() > 5 * np.abs(with_weight / TRUTH - 1).max()
+
+
+def test_a_branch_too_soft_for_its_weight_is_estimated_without(scanned):
+    """As other doors do: a warning, and the moduli of the pull as they are."""
+    start, soft = subject(scanned), TRUTH / 300
+    assert not start.carries_itself(replace(start.start, young=soft))
+    truth = TrueBranch(start.mesh, start.skeleton, start.control_points, (0.2, 0.4, 0.6, 0.8),
+                       soft, GRAVITY, is_weightless=True)
+    pull = simulate_pull(truth, "pull", VirtualPullSettings(
+        frames=6, reach=0.15, position_noise=0.0, force_noise=0.0, poisson=0.36, phase=0.4))[0]
+    pull = replace(pull, entry=pull.entry.model_copy(update={"weightless": False}))
+    messages: list[str] = []
+    found = fit_branch([pull], start, EstimateSettings(**SETTINGS), log=EvaluationLog(None, ""),
+                       progress=Progress(on_warning=messages.append))
+    assert found.is_weightless and any("too soft to carry" in text for text in messages)
+    np.testing.assert_allclose(found.values.young, soft, rtol=0.02)
 
 
 def test_forward_derivatives_under_weight(scanned, pull):

@@ -19,10 +19,11 @@ from limber.estimation.doubt.identifiability import (
     require_scale,
 )
 from limber.estimation.doubt.model_error import ModelError, geometry_error, mesh_error
+from limber.estimation.doubt.path_error import led_by_path, path_error
 from limber.estimation.doubt.shape_error import shape_error
 from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
 from limber.estimation.evaluations import EvaluationLog
-from limber.estimation.forward.forward import Forward
+from limber.estimation.forward.forward import Forward, under_its_weight
 from limber.estimation.nuisances import in_words, told
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
@@ -41,6 +42,7 @@ from limber.progress import SILENT, Progress
 from limber.recordings.checks import force_unit_suspicion
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
+from limber.sparse import NotPositiveDefiniteError
 
 MISFIT_FACTOR = 4.0
 """Mean squared residual over the expected one from which model and pull do not belong together:
@@ -66,6 +68,7 @@ class Estimate:
         held_out: Per pull, how a fit that did not see it foretells it: RMS distance [m] and RMS
             force error [N], also over the pull's own travel and peak force.
         model_error: What residuals cannot show: of the branch's shape and of its mesh.
+        is_weightless: Whether the branch's weight was left out, since it could not carry it.
     """
 
     fit: Fit
@@ -75,6 +78,7 @@ class Estimate:
     warnings: list[str] = field(default_factory=list)
     held_out: dict[str, dict[str, Any]] = field(default_factory=dict)
     model_error: ModelError = field(default_factory=ModelError)
+    is_weightless: bool = False
 
     @property
     def stopped(self) -> bool:
@@ -93,7 +97,8 @@ class Estimate:
         sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
         error = self.model_error
         return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-                "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
+                "path": error.path, "axis_is_exact": error.axis_is_exact,
+                "total": error.total(sensor)}
 
     @property
     def young(self) -> np.ndarray:
@@ -117,6 +122,8 @@ class Estimate:
             parts["shape of the scan"] = self.model_error.geometry**2
         if self.model_error.mesh is not None:
             parts["mesh"] = self.model_error.mesh**2
+        if self.model_error.path is not None:
+            parts["gripper frame"] = parts.get("gripper frame", 0.0) + self.model_error.path**2
         return parts
 
     @property
@@ -152,14 +159,44 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         WorkError: the simulation finds no equilibrium.
         Cancelled: stopped before the first step.
     """
-    forwards = forwards_of(pulls, subject, settings, progress)
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
-    sigma = [pull.entry.sensor.force_sigma_n for pull in pulls]
-    objective = Objective(forwards, parameter_space(subject, forwards, settings),
-                          log=log, force_sigma=sigma, progress=progress,
-                          expected_count=20 if settings.method == "gauss-newton" else 200)
-    return fit_pulls(objective, subject.start, settings, progress, cache=cache, digest=digest)
+
+    def fitted(branch: Subject) -> Estimate:
+        forwards = forwards_of(pulls, branch, settings, progress)
+        objective = Objective(forwards, parameter_space(branch, forwards, settings),
+                              log=log, force_sigma=[pull.entry.sensor.force_sigma_n
+                                                    for pull in pulls], progress=progress,
+                              expected_count=20 if settings.method == "gauss-newton" else 200)
+        return fit_pulls(objective, branch.start, settings, progress, cache=cache, digest=digest)
+
+    if not (subject.hangs and any(under_its_weight(subject.model, pull.entry).hanging is not None
+                                  for pull in pulls)):
+        return fitted(subject)
+    heavy, failure = None, None
+    try:
+        heavy = fitted(subject)
+        sound = heavy.uncertainty.variance_factor < MISFIT_FACTOR
+        if heavy.stopped or (sound and subject.carries_itself(heavy.values)):
+            return heavy
+    except (WorkError, NotPositiveDefiniteError) as error:
+        failure = error
+    try:
+        found = fitted(subject.without_weight())
+    except WorkError:
+        if heavy is None:
+            raise
+        return heavy
+    if subject.carries_itself(found.values):
+        # It was not the weight.
+        if failure is not None:
+            raise failure
+        return heavy
+    found.is_weightless = True
+    progress.warn(
+        "The branch is too soft to carry its own weight in the scanned shape: its weight is left "
+        "out of the estimate. Check density, gravity and the force's unit.")
+    return found
 
 
 def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
@@ -406,6 +443,7 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
         axes: The table of cylinders that were fitted to the scan, or None.
         cloud: The scan's points [m], shape [n, 3], or None.
     """
+    subject = subject.without_weight() if found.is_weightless else subject
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
     if settings.mesh_check:
         progress(1.0, "how much the mesh is too stiff")
@@ -415,8 +453,25 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
                            found.values.young)
         if stiff is not None:
             error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
-    found.model_error = error
+    found.model_error = replace(error, path=_path_error(found, progress))
     _tell_largest_part(found.causes, progress)
+
+
+def _path_error(found: Estimate, progress: Progress) -> np.ndarray | None:
+    """From the gripper's frame where its path leads; said where the user reads it."""
+    led = led_by_path(found.objective.forwards)
+    if not led:
+        return None
+    error = path_error(found.fit.evaluation, found.objective)
+    grown = ("how much that matters could not be found, and is NOT in the intervals"
+             if error is None else
+             f"that adds up to {100 * error.max():.0f} % to the standard deviations")
+    progress.warn(
+        f"{', '.join(forward.name for forward in led)}: the gripper's recorded path leads the fit, "
+        "where its frame counts as exact. By its calibration it may be off: "
+        f"{grown}. Record the force (of a clamped grasp also the torque, with torque_sigma_nm) and "
+        "let it lead, or state a better [calibration] in pull.toml.")
+    return error
 
 
 def _geometry_error(subject: Subject, found: Estimate, settings: EstimateSettings,

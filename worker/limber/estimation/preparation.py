@@ -16,6 +16,7 @@ from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added import PointMass
+from limber.mechanics.loaded import is_stable
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights
@@ -50,6 +51,20 @@ class Subject:
     def young(self, values: Values) -> np.ndarray:
         """Young's modulus of the tetrahedra [Pa], shape [tet_count]."""
         return (self.field or YoungField(self.weights)).young(values)
+
+    @property
+    def hangs(self) -> bool:
+        """Whether its weight acts in the scanned shape."""
+        return self.model.hanging is not None and bool(self.model.gravity.any())
+
+    def carries_itself(self, values: Values) -> bool:
+        """Whether it stays in the scanned shape under its weight, with these values."""
+        return is_stable(self.model.with_parameters(
+            young=self.young(values), poisson=values.poisson, density=values.density))
+
+    def without_weight(self) -> "Subject":
+        """Return it as a branch without weight."""
+        return replace(self, model=self.model.with_parameters(gravity=(0.0, 0.0, 0.0)))
 
 
 def subject_of(mesh: TetMesh, skeleton: Skeleton, masses: tuple[PointMass, ...],

@@ -43,16 +43,19 @@ class ModelError:
             of axis and radii (:func:`limber.estimation.doubt.shape_error.shape_error`).
         mesh_factor: Young's modulus of the material over that of the model on its mesh, which is
             too stiff by as much; shape [K]. ``mesh`` is what that leaves open.
+        path: From the gripper's frame where its path leads the fit, shape [K]; None where none
+            does (:func:`limber.estimation.doubt.path_error.path_error`).
     """
 
     geometry: np.ndarray | None = None
     mesh: np.ndarray | None = None
     axis_is_exact: bool = True
     mesh_factor: np.ndarray | float = 1.0
+    path: np.ndarray | None = None
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
-        parts = [part for part in (sensor, self.geometry, self.mesh) if part is not None]
+        parts = [part for part in (sensor, self.geometry, self.mesh, self.path) if part is not None]
         return np.sqrt(np.sum(np.square(parts), axis=0))
 
 

@@ -52,6 +52,9 @@ class CorrectedForward(Forward):
     def full(self) -> QuasiStaticForward:
         return self._full
 
+    def led_elsewhere(self, poses: np.ndarray) -> QuasiStaticForward:
+        return self._full.led_elsewhere(poses)
+
     @property
     def reduction_error(self) -> tuple[float, float]:
         if self._correction is None:

@@ -107,6 +107,11 @@ class DynamicForward(Forward):
         return DynamicForward(name, model, weights, entry, self.frames[:count], self.rest_points,
                               field=self.field)
 
+    def led_elsewhere(self, poses: np.ndarray) -> "DynamicForward":
+        name, model, weights, entry = self._arguments
+        return DynamicForward(name, model, weights, entry, replace(self.frames, poses=poses),
+                              self.rest_points, field=self.field)
+
     def shift_force(self, change: np.ndarray) -> None:
         self._forces = self._forces + change.reshape(-1, 3)
         self.response = None

@@ -151,6 +151,12 @@ class Forward(ABC):
         """Simulate twice as many frames from now on, where not all of them are simulated."""
         return  # Here all of them are.
 
+    def led_elsewhere(self, poses: np.ndarray) -> "Forward":
+        """Return the same pull, on the full model, with other recorded poses [m, rad], [f, 6]; a
+        slow one at few key frames, enough to see a difference.
+        """
+        raise NotImplementedError(f"{type(self).__name__} is corrected by a full model.")
+
     def until(self, count: int) -> "Forward":
         """Return what a first fit is to see of a pull that is fitted part by part: the first
         ``count`` frames of a dynamic pull, all of a slow one.

@@ -29,6 +29,9 @@ from limber.recordings.recording import PullEntry
 from limber.sparse import NotPositiveDefiniteError
 
 SETTINGS = StaticSettings(tolerance=1e-6)
+FEW_KEYS = 4
+"""Simulated frames where only the difference of two pulls is looked at, which varies slowly: with
+4, 6 and 12 what follows for the moduli came out within 1.5 % of each other."""
 YOUNG_STEP_LIMIT = 0.7
 """A state is carried over to parameters by its derivative up to this change of a log E: a factor
 of two, chosen; farther away the solve only starts worse."""
@@ -231,6 +234,13 @@ class QuasiStaticForward(Forward):
         sensor = self.entry.sensor
         each = [sensor.force_sigma_n] * 3 + [sensor.torque_sigma_nm] * (components - 3)
         return np.array(each, float) / np.sqrt(np.maximum(self.frames.wrench_counts, 1))[:, None]
+
+    def led_elsewhere(self, poses: np.ndarray) -> "QuasiStaticForward":
+        made = type(self)(self.name, self._model, self.weights, self.entry,
+                          replace(self.frames, poses=poses), self.rest_points,
+                          key_count=FEW_KEYS, field=self.field)
+        made.begin_at(self)
+        return made
 
     def begin_at(self, other: "QuasiStaticForward") -> None:
         """Start from states and force that another simulation of the same pull, on as many nodes,
