@@ -15,6 +15,7 @@ from limber.report.tables import (
     comparison_rows,
     deviation_rows,
     held_out_rows,
+    held_sentence,
     modulus_rows,
 )
 from limber.stages.report import write_report
@@ -67,6 +68,15 @@ def test_tables_without_truth_or_numbers():
                     ["1", "2", "1 to 4"], ["2", "3", "undetermined"]]
     plan = {"baseline": {"length_m": 0.5, "peak_force_n": None}, "plan": {"length_m": 0.55}}
     assert comparison_rows(plan)[1:] == [["path length [m]", "0.5", "0.55", "+10.0 %"]]
+
+
+def test_a_known_truth_tells_how_far_the_intervals_held():
+    estimate = {"young_pa": [2e6, 3e6, 1e6],
+                "young_interval_pa": [[1e6, 4e6], [2.5e6, 3.5e6], [None, None]]}
+    pull = {"young_true_pa": [3e6, 4e6, 1e6]}
+    rows = modulus_rows(estimate, pull)
+    assert [row[-1] for row in rows] == ["in the interval", "yes", "NO", "NO"]
+    assert held_sentence(estimate, pull).startswith("1 of 3 ")
 
 
 def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():

@@ -151,11 +151,12 @@ def _make_folder(folder: Path) -> None:
 
 
 def _show_tables(demo: _Demo) -> None:
-    from limber.report.tables import comparison_rows, modulus_rows
+    from limber.report.tables import comparison_rows, held_sentence, modulus_rows
 
     if "estimate" in demo.results:
-        demo.run.show("Young's modulus",
-                      modulus_rows(demo.results["estimate"], demo.results["virtual-pull"]))
+        estimate, pull = demo.results["estimate"], demo.results["virtual-pull"]
+        demo.run.show("Young's modulus", modulus_rows(estimate, pull))
+        demo.run.say(held_sentence(estimate, pull))
     if "plan" in demo.results:
         demo.run.show("Paths", comparison_rows(demo.results["plan"]))
 

@@ -74,7 +74,7 @@ class VirtualPullSettings(Settings):
     """A simulated pull."""
 
     groups: ClassVar[Groups] = {
-        "material": ("young", "poisson", "density", "damping", "gravity", "own_weight"),
+        "material": ("young", "poisson", "density", "damping", "gravity", "own_weight", "shape"),
         "motion": ("motion", "drive", "weight", "frames", "duration", "grasp_fraction", "mode",
             "reach", "turn", "phase"),
         "noise": ("position_noise", "force_noise", "torque_noise", "camera", "outliers", "seed"),
@@ -123,6 +123,9 @@ class VirtualPullSettings(Settings):
     own_weight: bool = Field(
         False, description="The shape is as drawn, without load: let gravity bend the branch out "
         "of it, as for `limber import-pull --own-weight`.")
+    shape: Literal["likely", "fitted"] = Field(
+        "likely", description="What is pulled where only a scan is known. likely: a branch that "
+        "the scan allows as well as the reconstructed one, drawn from the seed; fitted: that one.")
     camera: bool = Field(
         False, description="Record depth images of a simulated D455 instead of points.")
     outliers: float = Field(0.0, ge=0, lt=0.5, description="Share of points displaced by 5 cm.")

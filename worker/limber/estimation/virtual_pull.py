@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from limber.constants import GRAVITY
-from limber.errors import InputError
+from limber.errors import InputError, WorkError
 from limber.estimation.doubt.model_error import refined
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.settings import VirtualPullSettings
 from limber.geometry.cloud.camera import D455, Camera, write_camera
+from limber.geometry.likely_shapes import likely_skeletons, reshaped
 from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import base_nodes
@@ -42,6 +43,7 @@ from limber.recordings.recording import (
 
 BODY_LIMIT = 25_000
 """Most tetrahedra of a meshed body's truth: a finer one takes minutes a pull."""
+SHAPE_TRIES = 8
 DEFAULT_YOUNG_PA = (1.6e8, 1.0e8, 7.0e7, 4.0e7)
 """A gradient like that of the paper's branches, at the stiffness of young wood."""
 
@@ -70,7 +72,8 @@ class TrueBranch:
 
 
 def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
-                body: TetMesh | None = None, fractions: tuple[float, ...] = FRACTIONS,
+                body: TetMesh | None = None, scan: np.ndarray | None = None,
+                fractions: tuple[float, ...] = FRACTIONS,
                 young: Sequence[float] = DEFAULT_YOUNG_PA,
                 gravity: tuple[float, float, float] = GRAVITY) -> TrueBranch:
     """Return the branch of true axes, on a mesh of its own; the settings' moduli come first.
@@ -78,9 +81,11 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
     Args:
         body: Tetrahedra of a body that was meshed as it is: it is the truth then, each cut in eight
             where that stays small, and not the round branch of its axes.
+        scan: The points that the axes were fitted to [m], shape [n, 3]: the branch is another
+            one then that they allow as well (:mod:`limber.geometry.likely_shapes`).
 
     Raises:
-        InputError: not one modulus a control point.
+        InputError: not one modulus a control point. WorkError: no other shape can be meshed.
     """
     if settings.young:
         young = settings.young
@@ -93,9 +98,23 @@ def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
         # Reconstructed branches have sections four radii apart, of six sides.
         mesh = mesh_branch(skeleton, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)
                            ).mesh
+    if scan is not None and body is None:
+        skeleton, mesh = _another(skeleton, mesh, scan, np.random.default_rng([settings.seed, 2]))
     mesh = mesh.with_data(point_data={"fixed": base_nodes(mesh, skeleton)})
     return TrueBranch(mesh, skeleton, control_points(skeleton, fractions), fractions,
                       np.array(young, float), gravity)
+
+
+def _another(skeleton: Skeleton, mesh: TetMesh, scan: np.ndarray, rng: np.random.Generator,
+             ) -> tuple[Skeleton, TetMesh]:
+    """Axes and tetrahedra of a branch that the scan allows as well."""
+    for shape in likely_skeletons(skeleton, scan, SHAPE_TRIES, rng):
+        moved = reshaped(mesh, skeleton, shape)
+        if moved.volumes.min() > 0:
+            return shape, moved
+    raise WorkError(f"None of {SHAPE_TRIES} other shapes that the scan allows can be pulled.",
+                    "The scan leaves so much open that their tetrahedra turn inside out.",
+                    "Scan with less noise, or give --shape fitted.")
 
 
 def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *,

@@ -15,13 +15,21 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
     """
     truth = (pull or {}).get("young_true_pa")
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
-    rows = [[*header, "true E [MPa]", "error"] if truth else header]
+    rows = [[*header, "true E [MPa]", "error", "in the interval"] if truth else header]
     for number, young in enumerate(estimate["young_pa"]):
         row = [str(number + 1), _mpa(young), _interval(estimate, number)]
         if truth:
-            row += [_mpa(truth[number]), f"{100 * (young / truth[number] - 1):+.1f} %"]
+            row += [_mpa(truth[number]), f"{100 * (young / truth[number] - 1):+.1f} %",
+                    "yes" if _holds(estimate, number, truth[number]) else "NO"]
         rows.append(row)
     return rows
+
+
+def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
+    """How many 95 % intervals hold the truth, in words; arguments of :func:`modulus_rows`."""
+    truth = pull["young_true_pa"]
+    held = sum(_holds(estimate, number, value) for number, value in enumerate(truth))
+    return f"{held} of {len(truth)} intervals of 95 % hold the true modulus."
 
 
 def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:
@@ -49,6 +57,7 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     """
     parts = estimate.get("young_deviation") or {}
     known = {"sensor": "by sensors", "geometry": "by the scan's shape", "mesh": "by the mesh",
+             **({"path": "by the gripper's path"} if parts.get("path") else {}),
              "total": "together"}
     if not any(parts.get(name) for name in known):
         return []
@@ -153,6 +162,11 @@ def doubt_rows(doubtful: Sequence[Mapping[str, Any]]) -> list[list[str]]:
                      f"{1e3 * part['length_m']:.0f}", f"{1e3 * part['radius_m']:.2f}",
                      told[part["kind"]].format(value) if part["kind"] in told else "no points"])
     return rows
+
+
+def _holds(estimate: Mapping[str, Any], number: int, truth: float) -> bool:
+    low, high = estimate["young_interval_pa"][number]
+    return low is not None and high is not None and bool(low <= truth <= high)
 
 
 def _mpa(value: float) -> str:

@@ -47,8 +47,8 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     branch.require("skeleton.swc", "reconstruct")
     key = f"pull:{name}"
     body = ("mesh.vtu",) if _is_meshed_body(branch) else ()
-    reads = [file for file in ("skeleton.swc", "truth/skeleton.swc", "truth/truth.json", *body)
-             if branch.has(file)]
+    reads = [file for file in ("skeleton.swc", "cloud.ply", "truth/skeleton.swc",
+                               "truth/truth.json", *body) if branch.has(file)]
     if not force and branch.is_current(key, settings, reads=reads):
         return branch.manifest.stages[key].result
     progress(0.02, "meshing the true branch")
@@ -72,7 +72,8 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
 
 
 def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
-    """The truth of a branch folder: its generator's, the body that was meshed, or its skeleton's.
+    """The truth of a branch folder: its generator's, the body that was meshed, or a branch that its
+    scan allows.
     """
     from limber.estimation.virtual_pull import true_branch
     from limber.geometry.skeleton.files import read_swc
@@ -86,7 +87,16 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
         where = "truth/skeleton.swc"
     body = load_mesh(branch) if _is_meshed_body(branch) else None
     return true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,
-                       body=body, **known)
+                       body=body, scan=_scan(branch, settings), **known)
+
+
+def _scan(branch: Branch, settings: VirtualPullSettings) -> np.ndarray | None:
+    """The points that a shape is drawn from; None where the truth is known, or no scan is."""
+    from limber.geometry.cloud.files import read_cloud
+
+    known = branch.has("truth/truth.json") or not branch.has("cloud.ply")
+    return None if known or settings.shape == "fitted" else read_cloud(
+        branch.path("cloud.ply")).points
 
 
 def _is_meshed_body(branch: Branch) -> bool:
