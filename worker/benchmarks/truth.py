@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import truth_branch, truth_states, truth_trials
+from benchmarks import truth_beam, truth_branch, truth_scans, truth_states, truth_trials
 from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.table import Row
+from benchmarks.truth_recordings import bad_recordings_row
 from benchmarks.truth_trials import Trial, trial
 from limber.progress import Progress
 from limber.recordings.calibration import CalibrationEntry
@@ -19,21 +20,25 @@ CALIBRATED = CalibrationEntry(pose_sigma_m=2e-4, pose_sigma_rad=3.5e-3)
 def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
     """Measure everything; ``seed`` is the base of all that is drawn.
 
-    With ``out`` each trial is kept in ``truth-trials.jsonl``: a run of the same seed that was
-    stopped goes on there.
+    With ``out`` each trial is kept in ``truth-trials.jsonl`` and ``truth-scans.jsonl``: a run of
+    the same seed that was stopped goes on there.
     """
     kept = out / "truth-trials.jsonl" if out else None
+    scans = out / "truth-scans.jsonl" if out else None
     source = source_digest(("estimation", "mechanics"), __file__, truth_trials.__file__,
                            truth_branch.__file__)
-    singles = _trials(4 if quick else 60, progress.part(0.0, 0.7), kept, source, (seed, 1),
+    singles = _trials(4 if quick else 60, progress.part(0.0, 0.4), kept, source, (seed, 1),
                       lambda each: trial(each, CELL, 1, source=source))
-    threes = _trials(2 if quick else 20, progress.part(0.7, 0.95), kept, source, (seed, 2),
+    threes = _trials(2 if quick else 20, progress.part(0.4, 0.6), kept, source, (seed, 2),
                      lambda each: trial(each, CALIBRATED, 3, source=source))
     return [*cell_rows("one pull; sensor noise, force gain 2 %, zero and drift 1 N, gripper 1 mm "
                        "and 1 degree, camera 1 mm, density 10 %, nu 0.05, another form of the "
                        "field", singles, 0.12, quick),
             *cell_rows("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees", threes, 0.06,
                        quick),
+            truth_scans.scan_row(2 if quick else 30, progress.part(0.6, 0.9), scans, seed),
+            bad_recordings_row(progress.part(0.9, 0.92), seed),
+            *truth_beam.rows(progress.part(0.92, 0.95), seed),
             *truth_states.rows(quick, progress.part(0.95, 1.0), seed)]
 
 
@@ -75,5 +80,5 @@ def cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> lis
             f"{100 * share:.1f} % of {covered.size}",
             bool(0.9 <= share <= 0.99) if enough else None),
         Row("median half width of the intervals, over the Cramer-Rao bound of the problem",
-            "1.5", f"{100 * width:.0f} %, {np.median(ratio):.2f} (worst {ratio.max():.2f})",
-            bool(np.median(ratio) <= 1.5))]
+            "1.5", f"{100 * width:.0f} %, {np.nanmedian(ratio):.2f} (worst {np.nanmax(ratio):.2f})",
+            bool(np.nanmedian(ratio) <= 1.5))]

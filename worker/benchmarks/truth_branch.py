@@ -32,6 +32,8 @@ GRAVITY = (0.0, 0.0, -9.80665)
 FORMS = ("straight", "monotone", "wavy")
 STATES, FRAMES = 16, 100
 """Solutions along a pull of the truth, and frames recorded of it (a spline through the former)."""
+LEVELS_OFF = 0.1
+"""Part of the length over which a monotone modulus goes on beyond the outer control points."""
 POSITION_NOISE_M, FORCE_NOISE = 1e-3, 0.02
 POISSON, DENSITY = 0.35, 900.0
 """What the fit is told."""
@@ -103,8 +105,10 @@ def log_field(form: str, mesh: TetMesh, branch: PaperBranch, rng: np.random.Gene
         return straight + 0.12 * rng.standard_normal() * np.sin(np.pi * along / 0.2)
     inside = PchipInterpolator(places, values)
     slopes = inside.derivative()(places[[0, -1]])
-    beyond = (np.minimum(along - places[0], 0) * slopes[0]
-              + np.maximum(along - places[-1], 0) * slopes[1])
+    before, after = np.maximum(places[0] - along, 0), np.maximum(along - places[-1], 0)
+    # It goes on as it ran, and levels off: straight on, a base came out at 50 GPa.
+    beyond = LEVELS_OFF * (slopes[1] * (1 - np.exp(-after / LEVELS_OFF))
+                           - slopes[0] * (1 - np.exp(-before / LEVELS_OFF)))
     return inside(np.clip(along, places[0], places[-1])) + beyond
 
 

@@ -19,7 +19,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 
 MIXTURE = (0.5, 0.5)
 """Mean and deviation of the part of the straight field in the mixture."""
-BUMP_BETWEEN, BUMP_BEYOND, BUMP_OF_ORDER = 0.1, 0.2, 0.3
+BUMP_BETWEEN, BUMP_BEYOND, BUMP_OF_ORDER = 0.1, 0.3, 0.3
 """Deviations of log E from the mixture: halfway between control points, at base and tip beyond
 the outer ones, and of side branches from the place they grow from."""
 

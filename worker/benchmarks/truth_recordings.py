@@ -1,0 +1,205 @@
+"""Bad recordings, each through the commands that a user runs: exit code 2 or 3, and the reason.
+
+A branch of one modulus is hung with a weight and filmed; what can be wrong with such a recording is
+made wrong, one thing at a time.
+"""
+
+import contextlib
+import io
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from tests.subjects.paper_branches import PaperBranch
+
+from benchmarks.table import Row
+from limber.cli import call
+from limber.geometry.tets.marks import mark
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.statics.solve import solve_static
+from limber.progress import Progress
+from limber.recordings.grasping import grasp_on
+from limber.recordings.recording import GraspEntry
+from limber.recordings.streams import Stream, write_stream
+from limber.store import Branch
+
+YOUNG, WEIGHT = 2.5e7, 0.4
+GRAVITY = (0.0, 0.0, -9.80665)
+LABELS = ("tip1", "tip2", "tip3", "base1", "base2")
+PLACES = ((80, (0.0, 0.012, 0.0)), (70, (0.0, -0.014, 0.0)), (60, (0.012, 0.0, 0.01)),
+          (4, (0.015, 0.0, 0.0)), (8, (0.0, 0.02, 0.0)))
+"""Of the markers: beside which node of the axis, and where beside it [m]."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """A branch folder, and what a camera saw of the branch under its weight.
+
+    Attributes:
+        folder: Of all files.
+        nominal: The markers' places on the branch [m], shape [5, 3].
+        grasp: Where the weight hangs [m].
+        times: [s], shape [n].
+        seen: Markers in the camera's frame [m], shape [n, 5, 3].
+    """
+
+    folder: Path
+    nominal: np.ndarray
+    grasp: np.ndarray
+    times: np.ndarray
+    seen: np.ndarray
+
+    @property
+    def branch(self) -> Path:
+        return self.folder / "hung.branch"
+
+
+def bad_recordings_row(progress: Progress, seed: int) -> Row:
+    """Every bad recording that the issue names, and a good one that must pass."""
+    with tempfile.TemporaryDirectory() as folder:
+        rig = made_rig(Path(folder), np.random.default_rng([seed, 31]))
+        good = _imported(rig)
+        wrong = [] if good[0] == 0 else [f"a good one: exit {good[0]}"]
+        for number, (name, words, run) in enumerate(CASES):
+            progress(number / len(CASES), name)
+            code, told = run(rig)
+            if code not in (2, 3) or not all(word in told for word in words):
+                wrong.append(f"{name}: exit {code}, {told[:60]!r}")
+    count = len(CASES) + 1
+    return Row("bad recordings: " + ", ".join(name for name, _, _ in CASES),
+               "exit 2 or 3 with the reason",
+               f"{count - len(wrong)} of {count} as asked" + "".join(f"; {each}" for each in wrong),
+               not wrong)
+
+
+def made_rig(folder: Path, rng: np.random.Generator) -> Rig:
+    """Make the branch folder, hang the weight, film it."""
+    shape = PaperBranch("rig", 4 * (YOUNG,), 0.36, 0.40, (0.010, 0.008), 0.4)
+    skeleton, mesh = shape.skeleton, shape.mesh(slice_length=2.0, sides=8)
+    branch = Branch.create(folder / "hung.branch")
+    with branch.stage("reconstruct") as stage:
+        mark(mesh, skeleton, young=2e7, poisson=0.36, density=900.0).write(
+            stage.path("mesh.vtu"))
+        skeleton.write_swc(stage.path("skeleton.swc"))
+    nominal = np.array([skeleton.nodes[node] + beside for node, beside in PLACES])
+    grasp = skeleton.nodes[78]
+    model = BranchModel(mesh, young=YOUNG, poisson=0.36, density=900.0, gravity=GRAVITY)
+    state = solve_static(
+        model, grasp=grasp_on(mesh, GraspEntry(point_m=tuple(grasp), radius_m=0.01, mode="pinned")),
+        grasp_force=(0.0, 0.0, -WEIGHT)).require()
+    moved = (point_operator(mesh, nominal) @ state.displacement.ravel()).reshape(-1, 3)
+    times = np.arange(450) / 100.0
+    since = np.maximum(times - 0.3, 0.0)
+    part = np.where(times > 0.3, 1 - np.exp(-3 * since) * np.cos(15 * since), 0.0)
+    turn = Rotation.from_rotvec(rng.uniform(-2, 2, 3)).as_matrix()
+    seen = (nominal + part[:, None, None] * moved) @ turn.T + rng.uniform(-1, 1, 3)
+    return Rig(folder, nominal, grasp, times, seen + 2e-5 * rng.standard_normal(seen.shape))
+
+
+def _imported(rig: Rig, *, seen: np.ndarray | None = None, labels: tuple[str, ...] = LABELS,
+              nominal: np.ndarray | None = None, grasp: np.ndarray | None = None,
+              times: np.ndarray | None = None, weight: float = WEIGHT,
+              own_weight: bool = True) -> tuple[int, str]:
+    """Write a recording and bring it in as a user does; the exit code and all that was said."""
+    seen = rig.seen if seen is None else seen
+    write_stream(rig.folder / "swing.csv", Stream(
+        rig.times if times is None else times, seen.reshape(len(seen), -1),
+        tuple(f"{label}_{axis}_m" for label in labels for axis in "xyz")))
+    places = rig.nominal if nominal is None else nominal
+    rows = [f"{label},{x:.6f},{y:.6f},{z:.6f}"
+            for label, (x, y, z) in zip(LABELS, places, strict=True)]
+    (rig.folder / "nominal.csv").write_text("\n".join(["label,x_m,y_m,z_m", *rows]) + "\n",
+                                            encoding="utf-8")
+    point = rig.grasp if grasp is None else grasp
+    return _called("import-pull", rig.branch, rig.folder / "swing.csv", "--name", "hung",
+                   "--weight", weight, *(["--own-weight"] if own_weight else []), "--nominal",
+                   rig.folder / "nominal.csv", "--grasp-point",
+                   *(f"{value:.6f}" for value in point), "--force")
+
+
+def _called(*words: object) -> tuple[int, str]:
+    """Call ``limber`` with these words."""
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        code = call([*map(str, words), "--json", "--progress", "none"])
+    return code, told.getvalue()
+
+
+def _mirrored(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, seen=rig.seen * [1, 1, -1])
+
+
+def _swapped(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, seen=rig.seen[:, [1, 0, 2, 3, 4]])
+
+
+def _collinear(rig: Rig) -> tuple[int, str]:
+    along = np.linspace(0.0, 1.0, 5)[:, None] * [0.0, 0.0, 0.35]
+    at_rest = rig.seen[:20].mean(axis=0)
+    return _imported(rig, seen=rig.seen - at_rest + along, nominal=along)
+
+
+def _missing(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, seen=rig.seen[:, :4], labels=LABELS[:4])
+
+
+def _unknown(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, labels=(*LABELS[:4], "hat"))
+
+
+def _beside(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, grasp=rig.grasp + [0.0, 0.2, 0.0])
+
+
+def _swinging(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, seen=rig.seen[:70], times=rig.times[:70])
+
+
+def _nothing_moves(rig: Rig) -> tuple[int, str]:
+    return _imported(rig, seen=rig.seen[:30], times=rig.times[:30])
+
+
+def _not_identified(rig: Rig) -> tuple[int, str]:
+    """Slow, led by its path, without force: soft and stiff look alike."""
+    still = np.zeros((len(rig.times), 6))
+    still[:, :3] = rig.grasp + np.linspace(0, 1, len(rig.times))[:, None] * [0.05, 0.0, 0.0]
+    write_stream(rig.folder / "robot.csv", Stream(rig.times, still, (
+        "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")))
+    seen = rig.nominal + np.linspace(0, 1, len(rig.times))[:, None, None] * (
+        rig.nominal[:, 2:] / rig.grasp[2])**2 * [0.05, 0.0, 0.0]
+    write_stream(rig.folder / "slow.csv", Stream(rig.times, seen.reshape(len(seen), -1), tuple(
+        f"{label}_{axis}_m" for label in LABELS for axis in "xyz")))
+    code, told = _called("import-pull", rig.branch, rig.folder / "slow.csv", "--name", "slow",
+                         "--robot", rig.folder / "robot.csv", "--nominal",
+                         rig.folder / "nominal.csv", "--time-offset", 0, "--force")
+    return (code, told) if code else _called("estimate", rig.branch, "--pull", "slow", "--force")
+
+
+def _at_a_bound(rig: Rig) -> tuple[int, str]:
+    """A weight in the wrong unit: the modulus that it asks for is none."""
+    code, told = _imported(rig, weight=4e-7, own_weight=False)
+    if code:
+        return code, told
+    code, told = _called("estimate", rig.branch, "--pull", "hung", "--fractions", 0.5, "--force")
+    last = next(line for line in reversed(told.splitlines()) if line.startswith("{"))
+    return code, "converged, it says" if "converged" in json.loads(last) else told
+
+
+CASES: tuple[tuple[str, tuple[str, ...], Callable[[Rig], tuple[int, str]]], ...] = (
+    ("mirrored markers", ("mirrored",), _mirrored),
+    ("swapped markers", ("tip1 and tip2",), _swapped),
+    ("markers on a line", ("on a line",), _collinear),
+    ("a marker missing", ("base2",), _missing),
+    ("an unknown label", ("base2",), _unknown),
+    ("a grasp point off the branch", ("from the branch",), _beside),
+    ("a swing that has not ended", ("at rest",), _swinging),
+    ("no load shows", ("no load shows",), _nothing_moves),
+    ("nothing that gives the scale", ("soft or stiff",), _not_identified),
+    ("a modulus at its bound", ("no estimate", "bound"), _at_a_bound),
+)
+"""What is wrong, words that the message has, and how it is made."""

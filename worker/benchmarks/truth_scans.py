@@ -1,0 +1,144 @@
+"""From a scan to moduli as a user goes: generate, reconstruct, import a pull, estimate.
+
+The pull is of the true branch, in a cell with all its errors; the scan is noisier than a laser's.
+A refusal counts as right where it says what the scan lacks.
+"""
+
+import json
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import truth_branch
+from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.table import Row
+from benchmarks.truth_branch import drawn_cell, recorded
+from limber.errors import LimberError
+from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.virtual_pull import simulate_pull
+from limber.geometry.generated import generate_branch
+from limber.progress import Progress
+from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.recording import write_pull
+from limber.recordings.settings import ImportSettings
+from limber.stages.estimate import estimate
+from limber.stages.generate import write_generated
+from limber.stages.import_pull import import_pull
+from limber.stages.reconstruct import reconstruct
+from limber.stages.virtual_pull import load_truth
+from limber.store import Branch
+
+VIEWS = ("round", "one-sided")
+NOISE_M = (1e-3, 3e-3)
+"""Of the scan's points, least and most."""
+YOUNG_PA = (1e9, 5e9)
+"""Mean modulus of a branch, least and most: wood, as in the other trials."""
+LACKS = ("scan", "cloud", "point")
+"""A refusal that helps names one of these."""
+
+
+@dataclass(frozen=True)
+class ScanTrial:
+    """One branch from scan to moduli.
+
+    Attributes:
+        seed: Of all that is drawn.
+        view: How it was scanned.
+        noise: Of the scan's points [m].
+        errors: Relative errors of the moduli; empty: there is no estimate.
+        covered: Whether each interval holds the truth.
+        widths: Half widths of the intervals in log E.
+        refusal: Why there is no estimate.
+        seconds: Of all.
+        source: Digest of the sources; another one's trials are not taken over.
+    """
+
+    seed: tuple[int, ...]
+    view: str
+    noise: float
+    errors: tuple[float, ...]
+    covered: tuple[bool, ...]
+    widths: tuple[float, ...]
+    refusal: str
+    seconds: float
+    source: str
+
+
+def scan_row(count: int, progress: Progress, kept: Path | None, seed: int) -> Row:
+    """Measure ``count`` branches, views in turn; with ``kept``, go on with its trials."""
+    source = source_digest(("estimation", "mechanics", "geometry"), __file__,
+                           truth_branch.__file__)
+    known = {each.seed: each for each in read_trials(ScanTrial, kept) if each.source == source}
+    trials = []
+    for number in range(count):
+        progress(number / count, f"scan {number + 1} of {count}")
+        each = known.get((seed, 3, number))
+        if each is None:
+            each = scan_trial((seed, 3, number), VIEWS[number % len(VIEWS)], source)
+            keep(each, kept)
+        trials.append(each)
+    return coverage_row(trials)
+
+
+def coverage_row(trials: list[ScanTrial]) -> Row:
+    """How many intervals hold the truth, and whether refusals help."""
+    fitted = [each for each in trials if not each.refusal]
+    refused = [each.refusal for each in trials if each.refusal]
+    mute = [text for text in refused if not any(word in text for word in LACKS)]
+    held = np.concatenate([each.covered for each in fitted]) if fitted else np.zeros(0)
+    share = float(held.mean()) if len(held) else 0.0
+    worst = [float(np.abs(each.errors).max()) for each in fitted]
+    size = f"; median of the worst error {100 * np.median(worst):.0f} %" if worst else ""
+    return Row(
+        "scan to moduli, round and one-sided, noise 1 to 3 mm: 95 % intervals that hold",
+        "88 to 99 %, or a refusal that says what the scan lacks",
+        f"{100 * share:.1f} % of {len(held)} ({len(trials)} branches, {len(refused)} refused, "
+        f"{len(mute)} of these do not say what lacks{size})"
+        + "".join(f"; {text[:100]}" for text in mute[:3]),
+        bool(not mute and (not fitted or 0.88 <= share <= 0.99)))
+
+
+def scan_trial(seed: tuple[int, ...], view: str, source: str = "") -> ScanTrial:
+    """Draw a branch, scan it, reconstruct it, pull it in a cell with errors, and estimate."""
+    rng = np.random.default_rng(seed)
+    noise = float(rng.uniform(*NOISE_M))
+    made = generate_branch(int(rng.integers(2**31)), view=view, noise=noise,
+                           young_mean=float(np.exp(rng.uniform(*np.log(YOUNG_PA)))))
+    started = time.perf_counter()
+    found, refusal = {}, ""
+    with tempfile.TemporaryDirectory() as temporary:
+        try:
+            found = _estimated(Path(temporary), made, rng)
+        except LimberError as error:
+            refusal = str(error)
+    seconds = round(time.perf_counter() - started, 1)
+    if refusal:
+        return ScanTrial(seed, view, noise, (), (), (), refusal, seconds, source)
+    log_truth = np.log(made.young)
+    low, high = np.log(np.array(found["young_interval_pa"])).T
+    return ScanTrial(seed, view, noise,
+                     tuple((np.array(found["young_pa"]) / made.young - 1).tolist()),
+                     tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
+                     tuple(((high - low) / 2).tolist()), "", seconds, source)
+
+
+def _estimated(folder: Path, made: object, rng: np.random.Generator) -> dict:
+    write_generated(made, folder / "scan")
+    branch = folder / "drawn.branch"
+    reconstruct(folder / "scan" / "cloud.ply", branch)
+    settings = VirtualPullSettings(young=tuple(made.young.tolist()), position_noise=0.0,
+                                   force_noise=0.0, frames=60, reach=0.3,
+                                   seed=int(rng.integers(2**31)))
+    exact = simulate_pull(load_truth(Branch.open(branch), settings), "pull-1", settings)[0]
+    pull = recorded(exact, drawn_cell(rng, CalibrationEntry()), rng)
+    write_pull(folder / "recorded", pull)
+    entry = pull.entry
+    import_pull(branch, folder / "recorded" / "markers.csv", "pull-1", ImportSettings(
+        robot=str(folder / "recorded" / "robot.csv"), time_offset=0.0,
+        grasp_point=entry.grasp.point_m, grasp_radius=entry.grasp.radius_m, grasp_mode="pinned",
+        position_sigma=entry.sensor.position_sigma_m, force_sigma=entry.sensor.force_sigma_n))
+    estimate(branch, EstimateSettings(hold_out=False))
+    return json.loads(Branch.open(branch).path("estimate.json").read_text(encoding="utf-8"))
