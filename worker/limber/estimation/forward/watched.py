@@ -50,14 +50,13 @@ class WatchedForward(QuasiStaticForward):
         """As of the base class; a force that was kept is kept on the new key frames."""
         known = None if self._good is None else self.spread @ np.array(self._good[0])
         super().set_key_count(count)
-        self._good = None
+        first = self.entry.grasp.point_m - self.frames.poses[0, :3]
         if known is not None:
             self._drives = list(known[self.keys])
-            return
-        first = self.entry.grasp.point_m - self.frames.poses[0, :3]
-        if np.linalg.norm(first) < AT_REST_M:
+        elif np.linalg.norm(first) < AT_REST_M:
             self._zero[:self._measured.shape[1]] = self._measured[0]
             self._drives = [drive - self._measured[0] for drive in self._drives]
+        self.keep()
 
     def simulate(self, values: Values, extra: tuple[str, ...], sensitivities: bool,
                  ) -> Simulated | None:
