@@ -15,7 +15,10 @@ from limber.recordings.alignment import Frames
 
 FAILED_OBJECTIVE = 1e12
 """Objective of parameters under which the simulation finds no equilibrium."""
-SETTLING_ROUNDS = 8
+SETTLING_ROUNDS = 12
+LONGEST_MOVE = 0.05
+"""So far, over the branch's size, the gripper is moved at once by a change of its force: a branch
+that is led farther along its first answer overshoots."""
 STILL_SETTLING = 0.6
 """A change of the force that moves the gripper by more than this part of the last one did leads
 nowhere."""
@@ -174,7 +177,9 @@ class Objective:
         settling = [index for index, forward in enumerate(self.forwards) if forward.watches_pose]
         if not settling:
             return self._compared(free, values, jacobian)
-        last = np.inf
+        last, longest = np.inf, LONGEST_MOVE * max(
+            float(np.linalg.norm(np.ptp(self.forwards[index].mesh.nodes, axis=0)))
+            for index in settling)
         for _ in range(SETTLING_ROUNDS):
             found = self._compared(free, values, False)
             if found is None:
@@ -187,11 +192,12 @@ class Objective:
                 found = self._compared(free, values, True) if jacobian else found
                 self.keep_forces()
                 return found
-            if moved > STILL_SETTLING * last:
+            part = min(1.0, longest / moved)
+            if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last:
                 break
             last = moved
             for index, change in zip(settling, changes, strict=True):
-                self.forwards[index].shift_force(change)
+                self.forwards[index].shift_force(part * change)
         # Parameters under which the force finds no rest are too far off: no step there.
         self.step_back()
         return None
