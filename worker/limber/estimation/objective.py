@@ -177,7 +177,7 @@ class Objective:
         settling = [index for index, forward in enumerate(self.forwards) if forward.watches_pose]
         if not settling:
             return self._compared(free, values, jacobian)
-        last, longest = np.inf, LONGEST_MOVE * max(
+        last, part, longest = np.inf, 1.0, LONGEST_MOVE * max(
             float(np.linalg.norm(np.ptp(self.forwards[index].mesh.nodes, axis=0)))
             for index in settling)
         for _ in range(SETTLING_ROUNDS):
@@ -192,10 +192,9 @@ class Objective:
                 found = self._compared(free, values, True) if jacobian else found
                 self.keep_forces()
                 return found
-            part = min(1.0, longest / moved)
             if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last:
                 break
-            last = moved
+            last, part = moved, min(1.0, longest / moved)
             for index, change in zip(settling, changes, strict=True):
                 self.forwards[index].shift_force(part * change)
         # Parameters under which the force finds no rest are too far off: no step there.
@@ -275,7 +274,7 @@ class Objective:
             kinds = ["noise of the points"] * (3 * int(seen.sum()))
             kinds += ["noise of the force"] * (3 * sum(
                 int(known.sum()) for known in (force, torque) if known is not None))
-            if forward.watches_pose:
+            if forward.compares_grasp:
                 kinds += ["single poses of the gripper"] * (3 * len(forward.frames))
             errors = (self._by_errors(index, simulated)[1] if self.cell_errors.count
                       else np.zeros((len(kinds), 0)))
@@ -303,7 +302,7 @@ class Objective:
         if torque is not None:
             off = simulated.torques - forward.frames.wrenches[:, 3:]
             residual.append((off / self._torque_sigma(index)[:, None])[torque].ravel())
-        if forward.watches_pose:
+        if forward.compares_grasp:
             off = simulated.grasps - forward.frames.poses[:, :3]
             residual.append((off / forward.pose_sigma).ravel())
         if simulated.d_positions is None:
@@ -324,7 +323,7 @@ class Objective:
         if torque is not None:
             slope = torques / self._torque_sigma(index)[:, None, None]
             rows.append(slope[torque].reshape(-1, slope.shape[-1]))
-        if self.forwards[index].watches_pose:
+        if self.forwards[index].compares_grasp:
             slope = grasps / self.forwards[index].pose_sigma
             rows.append(slope.reshape(-1, slope.shape[-1]))
         return np.vstack(rows)

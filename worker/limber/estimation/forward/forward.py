@@ -99,6 +99,11 @@ class Forward(ABC):
         return False
 
     @property
+    def compares_grasp(self) -> bool:
+        """Whether the simulated grasp point is compared with the recorded path."""
+        return self.watches_pose
+
+    @property
     def pose_sigma(self) -> float:
         """Of a recorded place of the gripper, beside what all of them have in common [m]."""
         return calibration_of(self.entry).pose_noise_m

@@ -23,6 +23,9 @@ from limber.mechanics.model import BranchModel
 AT_REST_M = 5e-3
 """A first pose so near the grasp point is the branch at rest: what the sensor then reads is its
 zero."""
+ROUGH_POSE_M = 5e-3
+"""Deviation of the recorded path in a first fit, where force and gripper frame are taken as they
+were read: without the path the branch beyond the last point might be anything."""
 TANGENT_RADII = 4.0
 SAME_RESPONSE = 0.02
 """After a smaller change over the branch's size it answers to its force as before."""
@@ -45,6 +48,14 @@ class WatchedForward(QuasiStaticForward):
     @property
     def watches_pose(self) -> bool:
         return self.is_watching
+
+    @property
+    def compares_grasp(self) -> bool:
+        return True
+
+    @property
+    def pose_sigma(self) -> float:
+        return super().pose_sigma if self.is_watching else ROUGH_POSE_M
 
     def set_key_count(self, count: int) -> None:
         """As of the base class; a force that was kept is kept on the new key frames."""
