@@ -31,7 +31,7 @@ def summary(found: Estimate, settings: EstimateSettings) -> dict[str, Any]:
                    else forward.drive for forward in found.objective.forwards},
         "density": values.density, "loss_m2": found.fit.evaluation.loss,
         "forward_count": found.objective.forward_count, "converged": found.fit.converged,
-        "stopped": found.stopped, "held_out": found.held_out,
+        "stopped": found.stopped, "is_weightless": found.is_weightless, "held_out": found.held_out,
         "variance_factor": sure.variance_factor, "warnings": found.warnings,
         "forward": settings.forward} | _reduced_error(found)
 

@@ -39,7 +39,9 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
     known = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
     entry = _entry(branch, settings.pull)
     subject = load_subject(branch, EstimateSettings(
-        fractions=tuple(known["fractions"]), gravity=settings.gravity,
+        fractions=tuple(known["fractions"]),
+        # A branch that could not carry its weight was estimated without it.
+        gravity=settings.gravity and not known.get("is_weightless"),
         field="open" if known.get("field_form") else "inverse_distance"))
     down = np.array(branch.gravity) / np.linalg.norm(branch.gravity)
     return plain(predict_rest(known, subject, entry, down, settings, progress))
