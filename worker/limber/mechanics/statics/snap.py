@@ -84,7 +84,9 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
             return None
         if increment is not None and norm <= 1e-4 * reference:
             left = float(np.linalg.norm(equations.free_part(out)))
-            return trial, count <= 4, left / reference, equations.tangent(model, trial)
+            # Unloaded there is nothing that the imbalance could be a part of.
+            part = left / max(reference, 1e-300)
+            return trial, count <= 4, part, equations.tangent(model, trial)
         path.iterations += 1
         try:
             tangent = equations.tangent(model, trial, increment=increment, drag=drag)
