@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError, WorkError
+from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
+from limber.planning.field.radial import RadialInterpolant
+from limber.planning.field.trust import TrustRegion
 
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
 
@@ -36,6 +39,57 @@ def test_held_out_error_tells_the_true_error(ridge, ridge_field):
                           ridge_field.force(fresh.positions))
     for name in ("energy_error", "force_error"):
         assert 0.2 < ridge_field.errors[name] / true[name] < 5.0
+
+
+def test_left_out_errors_are_those_of_fits_without_the_sample(ridge):
+    """The closed form agrees with fitting again without each of five samples, value and gradient,
+    and values alone."""
+    samples = ridge.samples(count=40)
+    options = {"kernel": "quintic", "smoothing": 1e-6}
+    missed = RadialInterpolant.leave_one_out(samples.positions, samples.energies, samples.forces,
+                                             **options)
+    alone = RadialInterpolant.leave_one_out(samples.positions, samples.tips[:, :2] ** 2, **options)
+    frame = np.ptp(samples.positions, axis=0)
+    for j in range(5, 40, 7):
+        if np.abs(samples.positions[j]).max() > 0.4 * frame.max():
+            continue  # it sets the scale of the fit, which smoothing knows
+        kept = samples.take(np.delete(np.arange(40), j))
+        here = samples.positions[j][None]
+        fit = RadialInterpolant.fit(kept.positions, kept.energies, kept.forces, **options)
+        assert samples.energies[j] - fit.value(here)[0, 0] == pytest.approx(
+            missed[j, 0, 0], rel=0.02, abs=1e-6)
+        assert np.allclose(samples.forces[j] - fit.gradient(here)[0, :, 0], missed[j, 1:, 0],
+                           rtol=0.02, atol=1e-4)
+        fit = RadialInterpolant.fit(kept.positions, kept.tips[:, :2] ** 2, **options)
+        assert np.allclose(samples.tips[j, :2] ** 2 - fit.value(here)[0], alone[j, 0], rtol=0.02,
+                           atol=1e-6)
+
+
+def test_region_along_a_shell():
+    """Flattened and bent back it is the same point; heights' slopes are those of differences;
+    nothing within reach lies lower than promised; the outline's box holds the region."""
+    generator = np.random.default_rng(3)
+    pivot, radius = np.array([0.01, -0.02, 0.1]), 0.3
+    chart = Chart.about(pivot, radius, pivot + [0.02, 0.01, 0.3])
+    flat = generator.uniform([-0.15, -0.15, -0.06], [0.15, 0.15, 0.001], (200, 3))
+    corners = np.array([[x, y, 0.001] for x in (-0.15, 0.15) for y in (-0.15, 0.15)])
+    flat = np.vstack([corners, flat])
+    points = chart.curved(np.vstack([np.zeros(3), flat]))
+    assert np.allclose(chart.map(points)[1:], flat, atol=1e-12)
+    region = TrustRegion.of(points, np.empty((0, 3)), pivot, radius)
+    _height, slope = region.height_and_slope(points[1:] + 1e-3)
+    step = 1e-7
+    for axis in range(3):
+        there, back = (region.height(points[1:] + 1e-3 + side * step * np.eye(3)[axis])
+                       for side in (1, -1))
+        assert np.allclose((there - back) / (2 * step), slope[:, axis], atol=1e-5)
+    off = generator.normal(size=points.shape)
+    off *= 0.02 / np.linalg.norm(off, axis=1, keepdims=True)
+    assert (region.height(points + off) >= region.least_height(points, 0.02) - 1e-12).all()
+    inside = region.draw(2000, generator)
+    assert (inside > region.low).all() and (inside < region.high).all()
+    on_top = chart.curved(np.array([[0.03, 0.02, 0.0], [0.0, 0.05, -0.0005]]))
+    assert region.contains(on_top).all(), "facets of points themselves would cut them off"
 
 
 def test_energy_below_that_of_the_hanging_state_is_clamped(well):

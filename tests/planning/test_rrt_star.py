@@ -1,5 +1,7 @@
 """Both engines of RRT* on a branch with a ridge: gentler, honest when there is no way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -109,9 +111,9 @@ def test_goal_above_the_limit_says_so(ridge_field):
 def test_goal_behind_a_wall(ridge_field):
     """A cap that parts the start from the goal ends in NoPathError and not in a path."""
     problem = make_problem(ridge_field, deformation=0.0, distance=1.0)
+    wall = np.random.default_rng(0).uniform([-0.03, -0.2, -0.2], [0.03, 0.2, 0.2], (2000, 3))
     start_and_goal_only = ridge_field.limited(max_energy=1.0)._replace(
-        rejected=np.random.default_rng(0).uniform([-0.03, -0.2, -0.2], [0.03, 0.2, 0.2],
-                                                  (2000, 3)))
+        region=replace(ridge_field.region, rejected=wall).arrays)
     walled = PathProblem(problem.start, problem.goals, problem.in_goal, ridge_field,
                      start_and_goal_only, problem.weights)
     with pytest.raises(NoPathError, match="500 iterations"):

@@ -8,9 +8,16 @@ from tests.planning.conftest import small_grasp_model
 
 from limber.errors import Cancelled, WorkError
 from limber.mechanics import Grasp, solve_static
-from limber.planning.field.chart import Chart
+from limber.planning.field.chart import Chart, pulled_back_size
+from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import Reach
-from limber.planning.field.sampling import sample_branch, sample_positions, without_taut
+from limber.planning.field.sampling import (
+    sample_branch,
+    sample_field,
+    sample_positions,
+    without_taut,
+)
+from limber.planning.field.valley import Valley, walk_valley
 from limber.progress import Progress
 from limber.stages.energy import EnergySettings
 from limber.stages.loading import load_grasp_model
@@ -18,36 +25,41 @@ from limber.store import Branch
 
 REACH = Reach(np.zeros(3), 0.4, 0.38, np.array([0.0, 0.0, 0.6]))
 REST = np.array([0.0, 0.0, 0.38])
+SHELL = Valley(np.array([0.0, 0.0, 0.08]), 0.3)
 
 
 def test_positions_stay_in_reach():
-    """Within the deflection of rest, above the base, no farther than the branch is long."""
-    points = sample_positions(REACH, REST, 200, deflection=0.4, stretch=0.5, seed=3)
+    """Within the deflection of rest, above the base, inside the shell."""
+    points = sample_positions(REACH, REST, 200, SHELL, deflection=0.4, seed=3)
     assert points.shape == (200, 3)
     assert np.linalg.norm(points - REST, axis=1).max() <= 0.4 * 0.4
-    assert np.linalg.norm(points, axis=1).max() <= 0.38 + 0.5 * 0.02 + 1e-12
+    away = np.linalg.norm(points - SHELL.pivot, axis=1)
+    assert away.max() <= SHELL.radius + 1e-12
     assert points[:, 2].min() >= 0.0
-    near_reach = np.linalg.norm(points, axis=1) > 0.94 * 0.39
-    assert 0.4 < near_reach.mean() < 0.95, "half of them lie where gentle paths run"
+    assert 0.4 < (away > 0.94 * SHELL.radius).mean() < 0.95, "half lie where gentle paths run"
 
 
 def test_positions_follow_the_seed():
     """The same seed gives the same positions, another seed others; a longer run only adds."""
-    first = sample_positions(REACH, REST, 50, deflection=0.4, seed=1)
-    assert np.array_equal(first, sample_positions(REACH, REST, 80, deflection=0.4, seed=1)[:50])
-    assert not np.allclose(first, sample_positions(REACH, REST, 50, deflection=0.4, seed=2))
+    def drawn(count, seed):
+        return sample_positions(REACH, REST, count, SHELL, deflection=0.4, seed=seed)
+
+    assert np.array_equal(drawn(50, 1), drawn(80, 1)[:50])
+    assert not np.allclose(drawn(50, 1), drawn(50, 2))
 
 
 def test_no_room_is_an_error():
     """A grasp at the base has nowhere to go, and the message says what to change."""
     with pytest.raises(WorkError, match="farther out"):
         sample_positions(Reach(np.zeros(3), 0.4, 0.38, REST), np.array([0, 0, -0.5]), 50,
-                         deflection=0.4)
+                         Valley(np.zeros(3), 0.5), deflection=0.4)
 
 
 @pytest.fixture(scope="module")
 def some(small_model):
-    targets = sample_positions(small_model.reach, small_model.rest_position, 14, deflection=0.3)
+    shell = Valley(small_model.reach.base, small_model.reach.chord)
+    targets = sample_positions(small_model.reach, small_model.rest_position, 14, shell,
+                               deflection=0.3)
     return targets, *sample_branch(small_model, targets)
 
 
@@ -115,6 +127,38 @@ def test_cancel_ends_sampling(small_model, some, workers):
         sample_branch(small_model, some[0], workers=workers, progress=progress)
 
 
+def test_grasp_moves_on_a_sphere_by_itself(small_model):
+    """States under forces across lie on the shell within 0.3 mm, those drawn outward beyond it."""
+    valley, states = walk_valley(small_model, 8, deflection=0.4)
+    away = np.array([np.linalg.norm(small_model.pose(state.displacement)[:3] - valley.pivot)
+                     for state in states]) - valley.radius
+    assert len(states) == 17 and np.abs(away[:8]).max() < 3e-4
+    assert (away[9:] > away[:8]).all()
+    assert 0.6 < valley.radius / small_model.reach.chord < 0.95
+
+
+def test_rest_lies_inside_the_sampled_region(small_model):
+    """Samples lie beyond rest on all sides, and so do those of the shell about it."""
+    sampled = sample_field(small_model, EnergySettings(samples=60), workers=1)
+    field = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius)
+    assert sampled.samples.energies[0] == 0.0
+    assert field.region.height(field.rest[None])[0] < -1e-4
+    around = field.rest + 1e-4 * np.concatenate([np.eye(3), -np.eye(3)])
+    assert field.region.contains(around).all()
+
+
+def test_slopes_of_the_shape_are_those_of_differences(small_model, some):
+    """Natural rotation and tip of states solved on both sides agree with the tangent's answer."""
+    place, step = some[0][3], 1e-5
+    here = small_model.follow(place[None], small_model.rest.displacement)[0].displacement
+    slopes = small_model.shape_slopes(here)
+    for axis in range(3):
+        there, back = (small_model.shape(small_model.follow(
+            (place + side * step * np.eye(3)[axis])[None], here)[0].displacement)
+            for side in (1, -1))
+        assert np.allclose((there - back) / (2 * step), slopes[axis], rtol=1e-3, atol=1e-4)
+
+
 def test_taut_poses_are_left_out(ridge):
     """Poses that take over twice the usual force go; the rest pose stays whatever it takes."""
     samples = ridge.samples()
@@ -128,7 +172,8 @@ def test_taut_poses_are_left_out(ridge):
 
 def test_chart_gradients_are_those_of_the_map():
     """Pulled back through the chart, a gradient is that of the composed function."""
-    chart = Chart(np.array([0.0, 0.01, -0.02]), 0.4, 2.5)
+    chart = replace(Chart.about(np.array([0.0, 0.01, -0.02]), 0.4, np.array([0.0, 0.02, 0.37])),
+                    stretch=2.5, depth=0.01)
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)) + [0, 0, 0.35]
     normal = np.array([0.3, -1.0, 0.6])
     gradient = np.tile(normal, (20, 1))
@@ -139,6 +184,8 @@ def test_chart_gradients_are_those_of_the_map():
     pulled = chart.pull_back(points, gradient)
     assert np.allclose(pulled, differences, atol=1e-7)
     assert np.allclose(chart.push_forward(points, pulled), gradient, atol=1e-9)
+    sizes = [pulled_back_size(point, normal, *chart.arrays) for point in points]
+    assert np.allclose(sizes, np.linalg.norm(pulled, axis=1))
 
 
 def test_weight_leaves_the_scan_as_the_rest_state(planned_branch, small_mesh):

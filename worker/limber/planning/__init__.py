@@ -5,8 +5,10 @@ Positions for the grasp within a branch's reach:
 >>> import numpy as np
 >>> from limber.planning import sample_positions
 >>> from limber.planning.field.grasp_model import Reach
+>>> from limber.planning.field.valley import Valley
 >>> reach = Reach(np.zeros(3), arc_length=0.5, chord=0.48, tip=np.array([0, 0, 0.6]))
->>> sample_positions(reach, np.array([0, 0, 0.48]), 32, deflection=0.4).shape
+>>> shell = Valley(np.array([0, 0, 0.1]), radius=0.38)
+>>> sample_positions(reach, np.array([0, 0, 0.48]), 32, shell, deflection=0.4).shape
 (32, 3)
 """
 
@@ -25,6 +27,7 @@ _PLACES = {
     "grasp_model_of": "field.grasp_model",
     "plan_motion": "plan",
     "sample_branch": "field.sampling",
+    "sample_field": "field.sampling",
     "sample_positions": "field.sampling",
 }
 

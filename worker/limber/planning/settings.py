@@ -11,17 +11,12 @@ class EnergySettings(Settings):
     """How the energy field is sampled."""
 
     groups: ClassVar[Groups] = {
-        "samples": ("samples", "deflection", "stretch", "seed"),
+        "samples": ("samples", "deflection", "seed"),
         "material": ("gravity",),
     }
-    experts = ("stretch",)
-
     samples: int = Field(150, ge=30, description="Grasp positions to solve.")
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
         "Largest distance from rest, as a share of the branch's length up to the grasp."))
-    stretch: float = Field(0.2, ge=0, le=1.0, description=(
-        "How far out of its curve the branch may be pulled straight: 0 the distance between base "
-        "and grasp at rest, 1 the length of branch between them."))
     gravity: bool = Field(True, description=(
         "The branch bears its own weight, and was scanned so. Otherwise it has no weight."))
     seed: int = Field(0, ge=0, description="Of the sampled positions.")
@@ -32,10 +27,11 @@ class PlanSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "goal_tolerance", "start", "start_seed"),
-        "weights and limits": ("deformation_weight", "distance_weight", "max_energy", "max_force"),
-        "solver": ("planner", "iterations", "engine", "seed"),
+        "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
+                               "max_force", "max_strain", "workspace_low", "workspace_high"),
+        "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
-    experts = ("start_seed", "iterations", "engine")
+    experts = ("start_seed", "iterations", "engine", "replans", "field_error")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
@@ -51,14 +47,29 @@ class PlanSettings(Settings):
         "Weight of deformation, the paper's alpha_def."))
     distance_weight: float = Field(1.5, gt=0, description=(
         "Weight of distance, the paper's alpha_dis."))
+    max_detour: float | None = Field(None, ge=0, le=1000, description=(
+        "The gentlest path that is at most so many percent longer than the shortest one; sets the "
+        "weight of distance."))
     max_energy: float | None = Field(None, gt=0, description=(
         "Deformation energy that no pose may exceed [J]."))
     max_force: float | None = Field(None, gt=0, description=(
         "Force of the gripper that no pose may exceed [N]."))
+    max_strain: float | None = Field(None, gt=0, lt=1, description=(
+        "Largest principal strain anywhere in the branch that no pose may exceed (0.01 is 1 %)."))
+    workspace_low: tuple[float, float, float] | None = Field(None, description=(
+        "Lower corner of the box that the grasp stays in, in the branch's frame [m]."))
+    workspace_high: tuple[float, float, float] | None = Field(None, description=(
+        "Upper corner of that box [m]."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
         "eikonal: the cheapest way on a grid, refined, mostly within 1 % of the best possible "
         "path; d-rrt-star: the paper's D-RRT*. Either comes with a proven bound."))
     iterations: int = Field(3000, ge=100, le=200_000, description="Samples of RRT* and D-RRT*.")
     engine: Literal["auto", "ompl", "own"] = Field("auto", description=(
         "For RRT* and D-RRT*: OMPL's or our own; auto: OMPL where it is installed."))
+    field_error: float = Field(3.0, gt=0, description=(
+        "Percent by which the field's energy may be off the full model's along the plan (root mean "
+        "square); where it is more, the states found are added to the field and it is planned "
+        "anew."))
+    replans: int = Field(3, ge=0, le=10, description=(
+        "How often at most to plan anew, where the full model breaks a limit or the field is off."))
     seed: int = Field(0, ge=0, description="Of both planners.")

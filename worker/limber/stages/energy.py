@@ -21,12 +21,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         WorkError: too few poses could be solved.
     """
     from limber.planning.field.energy_field import fit_field
-    from limber.planning.field.sampling import (
-        energy_inputs,
-        sample_branch,
-        sample_positions,
-        without_taut,
-    )
+    from limber.planning.field.sampling import energy_inputs, sample_field
     from limber.stages.loading import load_grasp_model
 
     branch = Branch.open(folder)
@@ -36,13 +31,10 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         return branch.manifest.stages["energy"].result
     with branch.stage("energy", settings, digests=digests) as stage:
         progress(0.0, "rest state")
-        targets = sample_positions(
-            grasp_model.reach, grasp_model.rest_position, settings.samples,
-            deflection=settings.deflection, stretch=settings.stretch, seed=settings.seed)
-        samples, reasons = sample_branch(grasp_model, targets, workers=workers,
-                                         progress=progress.part(0.02, 0.9))
-        samples, taut_count = without_taut(samples)
-        field = fit_field(samples, grasp_model.reach.base, seed=settings.seed,
+        sampled = sample_field(grasp_model, settings, workers=workers,
+                               progress=progress.part(0.02, 0.9))
+        samples, reasons = sampled.samples, sampled.reasons
+        field = fit_field(samples, sampled.valley.pivot, sampled.valley.radius,
                           progress=progress.part(0.9, 1.0))
         rejected = len(samples.rejected_poses)
         if rejected > 0.2 * settings.samples:
@@ -53,11 +45,10 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             "rest_pose": samples.poses[0], "arc_length_m": np.array(grasp_model.reach.arc_length)})
         stage.result.update(
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
-            taut_count=taut_count,
+            taut_count=sampled.taut_count,
             energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
             errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
-            chart_stretch=field.chart.stretch,
-            fitted_to_forces=len(field.energy_fit.gradient_weights) > 0,
+            chart_stretch=field.chart.stretch, chart_depth_m=field.chart.depth,
             max_energy_j=float(samples.energies.max()),
             max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
             rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)

@@ -34,11 +34,11 @@ from limber.planning.problem import GentleProblem
 from limber.progress import SILENT, Progress
 
 _FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
-_MOST_CELLS = 300_000  # of any grid's tube; the next refinement is left away
+_MOST_CELLS = 800_000  # of any grid's tube; the next refinement is left away
 _LEVELS = 5
 _CUT = 3  # of a cell's edge from one grid to the next
 _CHILDREN = _CUT**3
-_ENOUGH = 0.01  # gap below which no further refinement is worth its time
+_ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
 _BEYOND = 1.2  # on the steepest measured growth of the goal's distance
 
@@ -232,9 +232,8 @@ def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, point
     """Return the cells in which no point is allowed."""
     limits, region = problem.limits, problem.energy_field.region
     far = grid.spacing * np.sqrt(3.0)  # from a corner to any point of the cell
-    height = region.height(points)
-    # Heights above planes grow by at most a metre a metre: one corner speaks for its cell.
-    closed = _corners_of(grid, nodes, height - far).max(axis=0) > 0.0
+    # One corner speaks for its cell, if all within reach of it is above the same hull.
+    closed = _corners_of(grid, nodes, region.least_height(points, far)).max(axis=0) > 0.0
     if len(region.rejected):
         from scipy.spatial import cKDTree
 
@@ -244,6 +243,11 @@ def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, point
     if limits.max_energy < np.inf:
         energy = grid.spread(nodes, problem.energy_field.energy(points))
         closed |= _all_above(energy, limits.max_energy + problem.field_error)
+    if limits.max_strain < np.inf:
+        strain = grid.spread(nodes, problem.energy_field.strain(points))
+        closed |= _all_above(strain, limits.max_strain)
+    beyond = np.maximum(limits.low - points, points - limits.high).max(axis=1)
+    closed |= _corners_of(grid, nodes, beyond - far).max(axis=0) > 0.0
     if limits.max_force < np.inf:
         force = grid.spread(nodes, (problem.energy_field.force(points)**2).sum(axis=1))
         closed |= _all_above(force, limits.max_force**2)
@@ -263,7 +267,7 @@ def _first_grid(problem: GentleProblem) -> tuple[_Grid, np.ndarray]:
     """Return a grid over the sampled region, and the cell in whose centre the start lies."""
     region, start = problem.energy_field.region, problem.start
     axes = _axes(problem.goal.centre(problem.energy_field) - start)
-    corners = (region.accepted - start) @ axes.T
+    corners = (region.outline - start) @ axes.T
     low = np.minimum(corners.min(axis=0), 0.0)
     high = np.maximum(corners.max(axis=0), 0.0)
     spacing = float(np.cbrt(np.prod(high - low) / _FIRST_CELLS))
@@ -323,7 +327,8 @@ def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
 def _separated(problem: GentleProblem, grid: _Grid, open_cells: np.ndarray) -> NoPathError:
     limits = problem.limits
     kept = [f"{name} {value:.3g} {unit}" for name, value, unit in (
-        ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N")) if value < np.inf]
+        ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
+        ("strain", limits.max_strain, "")) if value < np.inf]
     what = (" at most " + " and ".join(kept)) if kept else ""
     share = 100.0 * open_cells.mean()
     return NoPathError(

@@ -23,24 +23,31 @@ from limber.progress import SILENT, Progress
 
 @dataclass(frozen=True)
 class FitChoice:
-    """How a field is fitted: kernel and shape, the chart's stretch, and whether to forces too."""
+    """How a field is fitted: kernel and shape; stretch and depth of the chart (in radii)."""
 
     kernel: str
     shape: float
-    stretch: float
-    with_forces: bool
+    stretch: float = 1.0
+    depth: float = np.inf
+
+    def on(self, chart: Chart) -> Chart:
+        """Return the chart with this stretch and depth."""
+        return replace(chart, stretch=self.stretch, depth=self.depth * (chart.radius or 1.0))
 
 
-# Tried in turn; the least held-out error wins.
+# Tried in turn; the least error on samples left out wins.
 CHOICES = tuple(
-    FitChoice(kernel, shape, stretch, with_forces)
+    FitChoice(kernel, shape, stretch, depth)
     for kernel, shape in (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0),
                           ("multiquadric", 2.0))
-    for stretch in (1.0, 2.0, 3.0)
-    for with_forces in (True, False))
+    for stretch, depth in ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
+                           (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005)))
 _SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites round-off
 _CHOSEN_BY = ("energy_error", "force_error", "energy_error_median", "force_error_median")
-_FOLDS_TO_CHOOSE, _FOLDS_TO_REPORT = 4, 10
+_OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
+             "strain_places": "strain_places_m", "stresses": "stresses_pa",
+             "shape_slopes": "shape_slopes"}
+_CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,13 @@ class GraspSamples:
         tips: Position of the branch's tip [m], shape [m, 3].
         min_det_f: Least determinant of the deformation gradient, shape [m].
         rejected_poses: Poses without an acceptable solution, shape [q, 6].
+        strains: Largest principal Green-Lagrange strain by magnitude, shape [m].
         targets: Positions of the named targets [m], shape [m, targets, 3].
+        torques: Torque that the gripper exerts about the pose's position [Nm], shape [m, 3].
+        strain_places: Where, in the rest shape [m], shape [m, 3].
+        stresses: Largest principal Cauchy stress by magnitude [Pa], shape [m].
+        shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
+            [m, 3, 6 + 3 targets].
     """
 
     poses: np.ndarray
@@ -63,17 +76,36 @@ class GraspSamples:
     tips: np.ndarray
     min_det_f: np.ndarray
     rejected_poses: np.ndarray
+    strains: np.ndarray
     targets: np.ndarray | None = None
+    torques: np.ndarray | None = None
+    strain_places: np.ndarray | None = None
+    stresses: np.ndarray | None = None
+    shape_slopes: np.ndarray | None = None
 
     @property
     def positions(self) -> np.ndarray:
         return self.poses[:, :3]
 
+    @property
+    def shape(self) -> np.ndarray:
+        """Natural rotation, tip and targets, shape [m, 6 + 3 targets]."""
+        known = [self.poses[:, 3:], self.tips]
+        if self.targets is not None:
+            known.append(self.targets.reshape(len(self.poses), -1))
+        return np.hstack(known)
+
+    def joined(self, other: "GraspSamples") -> "GraspSamples":
+        """Return these samples and those of ``other`` behind them."""
+        return replace(self, **{
+            name: np.concatenate([values, getattr(other, name)])
+            for name, values in vars(self).items()
+            if values is not None and getattr(other, name) is not None})
+
     def take(self, index: np.ndarray) -> "GraspSamples":
         """Return the samples of ``index``; rejected poses stay."""
-        names = ("poses", "energies", "forces", "tips", "min_det_f")
-        names = names if self.targets is None else (*names, "targets")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
+        return replace(self, **{name: values[index] for name, values in vars(self).items()
+                                if name != "rejected_poses" and values is not None})
 
 
 class FieldArrays(NamedTuple):
@@ -81,11 +113,13 @@ class FieldArrays(NamedTuple):
 
     chart: tuple
     energy: tuple
-    planes: np.ndarray
-    accepted: np.ndarray
-    rejected: np.ndarray
+    region: tuple
+    strain: tuple
     max_energy: float
     max_force: float
+    max_strain: float
+    low: np.ndarray
+    high: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -94,19 +128,25 @@ class EnergyField:
 
     Attributes:
         samples: What it was fitted to.
-        chart: The coordinates of the fits.
+        chart: The coordinates of the energy's fit.
+        shape_chart: Those of the other two.
         energy_fit: Interpolant of the energy (cut off at 0 by the methods).
-        shape_fit: Six channels: natural rotation vector and tip position.
+        shape_fit: Channels: natural rotation vector, position of the tip and of each target.
+        strain_fit: Of the largest strain anywhere in the branch.
         region: Where the field may be believed.
-        errors: Held-out errors; see :func:`held_out_errors`.
+        errors: On samples left out; see :func:`error_measures`.
+        missed: There, prediction less truth of energy [J], force [N] and strain, shape [m, 5].
     """
 
     samples: GraspSamples
     chart: Chart
+    shape_chart: Chart
     energy_fit: RadialInterpolant
     shape_fit: RadialInterpolant
+    strain_fit: RadialInterpolant
     region: TrustRegion
     errors: dict[str, float]
+    missed: np.ndarray
 
     @property
     def rest(self) -> np.ndarray:
@@ -128,29 +168,47 @@ class EnergyField:
 
     def poses(self, points: np.ndarray) -> np.ndarray:
         """Return positions with the rotation that the grasped piece takes there, [n, 6]."""
-        return np.hstack([_rows(points), self._value(self.shape_fit, points)[:, :3]])
+        return np.hstack([_rows(points), self._value(self.shape_fit, points, True)[:, :3]])
 
-    def tip(self, points: np.ndarray) -> np.ndarray:
-        """Return where the branch's tip is with the grasp at ``points`` [m], [n, 3]."""
-        return self._value(self.shape_fit, points)[:, 3:]
+    def tip(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
+        """Return where the branch's tip, or a target, is with the grasp at ``points`` [m], [n, 3].
+        """
+        first = 3 if target is None else 6 + 3 * target
+        return self._value(self.shape_fit, points, True)[:, first:first + 3]
 
-    def tip_gradient(self, points: np.ndarray) -> np.ndarray:
+    def tip_gradient(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
         """Return d tip_c / d x_k, shape [n, 3 (k), 3 (c)]."""
-        return np.stack([self._gradient(self.shape_fit, points, 3 + c) for c in range(3)], axis=2)
+        first = 3 if target is None else 6 + 3 * target
+        return np.stack([self._gradient(self.shape_fit, points, first + c, True)
+                         for c in range(3)], axis=2)
 
-    def _value(self, fit: RadialInterpolant, points: np.ndarray) -> np.ndarray:
-        return fit.value(self.chart.map(_rows(points)))
+    def _value(self, fit: RadialInterpolant, points: np.ndarray, shape: bool = False,
+               ) -> np.ndarray:
+        return fit.value((self.shape_chart if shape else self.chart).map(_rows(points)))
 
-    def _gradient(self, fit: RadialInterpolant, points: np.ndarray, channel: int) -> np.ndarray:
-        points = _rows(points)
-        gradient = fit.gradient(self.chart.map(points))[:, :, channel]
-        return self.chart.pull_back(points, gradient)
+    def _gradient(self, fit: RadialInterpolant, points: np.ndarray, channel: int,
+                  shape: bool = False) -> np.ndarray:
+        points, chart = _rows(points), self.shape_chart if shape else self.chart
+        return chart.pull_back(points, fit.gradient(chart.map(points))[:, :, channel])
 
-    def limited(self, max_energy: float = np.inf, max_force: float = np.inf) -> FieldArrays:
-        """Return the arrays for compiled loops, with limits on energy [J] and force [N]."""
-        return FieldArrays(self.chart.arrays, self.energy_fit.arrays,
-                           self.region.planes, self.region.accepted, self.region.rejected,
-                           float(max_energy), float(max_force))
+    def strain(self, points: np.ndarray) -> np.ndarray:
+        """Return the largest strain in the branch at ``points`` [n, 3], shape [n]."""
+        return self._value(self.strain_fit, points, True)[:, 0]
+
+    def strain_gradient(self, points: np.ndarray) -> np.ndarray:
+        """Return its gradient [1/m], shape [n, 3]."""
+        return self._gradient(self.strain_fit, points, 0, True)
+
+    def limited(self, max_energy: float = np.inf, max_force: float = np.inf, *,
+                max_strain: float = np.inf, low: np.ndarray | None = None,
+                high: np.ndarray | None = None) -> FieldArrays:
+        """Return the arrays for compiled loops, with limits on energy [J], force [N], strain and
+        the box from ``low`` to ``high`` [m] that the grasp stays in."""
+        return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.region.arrays,
+                           (self.shape_chart.arrays, self.strain_fit.arrays),
+                           float(max_energy), float(max_force), float(max_strain),
+                           np.full(3, -np.inf) if low is None else np.asarray(low, float),
+                           np.full(3, np.inf) if high is None else np.asarray(high, float))
 
     def write(self, path: Path, extra: dict[str, Any] | None = None) -> None:
         """Write ``energy.npz``: samples, weights, errors and ``extra`` arrays; nothing pickled."""
@@ -158,17 +216,19 @@ class EnergyField:
         arrays = {
             "poses": samples.poses, "energies_j": samples.energies,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
-            "rejected_poses": samples.rejected_poses,
-            "chart_base_m": self.chart.base, "chart_radius_m": np.array(self.chart.radius),
-            "chart_stretch": np.array(self.chart.stretch),
+            "strains": samples.strains, "rejected_poses": samples.rejected_poses,
+            "left_out_errors": self.missed,
+            "chart_pivot_m": self.chart.pivot, "chart_radius_m": np.array(self.chart.radius),
+            "chart_layers": np.array([[chart.stretch, chart.depth]
+                                      for chart in (self.chart, self.shape_chart)]),
             "error_names": np.array(list(self.errors)),
             "error_values": np.array(list(self.errors.values())),
             "energy_error": np.array(self.errors["energy_error"]),
             "force_error": np.array(self.errors["force_error"]),
         }
-        if samples.targets is not None:
-            arrays["targets_m"] = samples.targets
-        for name in ("energy_fit", "shape_fit"):
+        arrays |= {stored: getattr(samples, name) for name, stored in _OPTIONAL.items()
+                   if getattr(samples, name) is not None}
+        for name in ("energy_fit", "shape_fit", "strain_fit"):
             arrays |= getattr(self, name).to_arrays(f"{name}_")
         np.savez_compressed(path, **arrays, **(extra or {}))
 
@@ -185,29 +245,37 @@ class EnergyField:
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
-                arrays.get("targets_m"))
-            chart = Chart(arrays["chart_base_m"], float(arrays["chart_radius_m"]),
-                          float(arrays["chart_stretch"]))
+                # Older programs knew no strain: 1 everywhere, which no limit allows.
+                arrays.get("strains", np.ones(len(arrays["poses"]))),
+                **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
+            if "chart_layers" not in arrays:  # of an older program
+                return fit_field(samples, arrays["chart_base_m"])
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
-                    for name in ("energy_fit", "shape_fit")]
+                    for name in ("energy_fit", "shape_fit", "strain_fit")]
+            region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],
+                                    arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
+            charts = [replace(region.chart, stretch=float(stretch), depth=float(depth))
+                      for stretch, depth in arrays["chart_layers"]]
+            missed = arrays["left_out_errors"]
             errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                               strict=True))
         except (KeyError, ValueError, OSError, TypeError) as error:
             raise InputError(f"{path} is not an energy field ({error}).",
                              "It was not written by `limber energy`, or is damaged.",
                              "Run `limber energy` again with --force.") from error
-        return cls(samples, chart, *fits, TrustRegion.of(samples.positions,
-                                                  samples.rejected_poses[:, :3]), errors)
+            missed = arrays["left_out_errors"]
+        return cls(samples, *charts, *fits, region, errors, missed)
 
 
-def fit_field(samples: GraspSamples, base: np.ndarray | None = None, *, seed: int = 0,
-              progress: Progress = SILENT) -> EnergyField:
-    """Fit the field; of ``CHOICES`` the one with the least held-out error.
+def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
+              *, progress: Progress = SILENT) -> EnergyField:
+    """Fit the field; of ``CHOICES`` the one with the least error on samples left out.
 
     Args:
         samples: What the branch model says.
-        base: Where the branch is rooted [m]; None: no chart is tried.
-        seed: Of the folds.
+        base: Pivot of the shell along which the branch yields (:class:`~.valley.Valley`), or where
+            the branch is rooted [m]; None: no chart is tried.
+        radius: The shell's [m]; default the distance of the rest position.
 
     Raises:
         WorkError: too few samples, or they span no volume.
@@ -218,23 +286,102 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, *, seed: in
                         f"A field in three coordinates needs at least {needed}.",
                         "Sample more poses, or a smaller deflection.")
     choices = [choice for choice in CHOICES if base is not None or choice.stretch == 1.0]
-    base = np.zeros(3) if base is None else np.asarray(base, float)
+    if radius is None:
+        radius = 0.0 if base is None else float(np.linalg.norm(samples.positions[0] - base))
+    region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], base, radius)
+    chart = region.chart
+    some = _spread_out(region.is_face(), _CHOOSE_FROM)
     scores = []
     for number, choice in enumerate(choices):
         progress(number / len(choices), "choosing the interpolation")
-        errors = held_out_errors(samples, choice, base, folds=_FOLDS_TO_CHOOSE, seed=seed)
+        errors = left_out_errors(samples.take(some), choice.on(chart), choice,
+                                 region.is_face()[some])[0]
         # Their product: mean errors speak for the stiff poses, medians for the gentle ones.
         scores.append(np.prod([errors[name] for name in _CHOSEN_BY]))
     choice = choices[int(np.argmin(scores))]
-    return replace(_fitted(samples, choice, base),
-                   errors=held_out_errors(samples, choice, base, seed=seed))
+    shape = _shape_choice(samples.take(some), choices, chart, region.is_face()[some])
+    return _fitted(samples, choice, shape, region)
 
 
-def held_out_errors(samples: GraspSamples, choice: FitChoice, base: np.ndarray, *,
-                    folds: int = _FOLDS_TO_REPORT, seed: int = 0) -> dict[str, float]:
-    """Return errors on samples that the fit has not seen (``folds`` fits, each without a part).
+def _shape_choice(samples: GraspSamples, choices: list[FitChoice], chart: Chart, face: np.ndarray,
+                  ) -> FitChoice:
+    """Return the choice that misses the tips of samples left out by least."""
+    def missed(choice: FitChoice) -> float:
+        size = np.linalg.norm(_tips_missed(samples, choice, chart)[~face], axis=1)
+        return float(np.median(size) * size.mean())
+    return min(choices, key=missed)
 
-    Only held-out samples inside the hull of the others count: the planner never goes outside.
+
+def _tips_missed(samples: GraspSamples, choice: FitChoice, chart: Chart) -> np.ndarray:
+    """Return how far each sample's tip is off in the fit to all the others [m], shape [m, 3]."""
+    chart = choice.on(chart)
+    slopes = _slopes_on(chart, samples)
+    return RadialInterpolant.leave_one_out(
+        chart.map(samples.positions), samples.tips, None if slopes is None else slopes[:, :, 3:6],
+        kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, 0]
+
+
+def _slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
+    """Return the slopes of the shape to the chart's coordinates, [m, 3, channels], if all known."""
+    if samples.shape_slopes is None or not np.isfinite(samples.shape_slopes).all():
+        return None
+    return np.stack([chart.push_forward(samples.positions, samples.shape_slopes[:, :, c])
+                     for c in range(samples.shape_slopes.shape[2])], axis=2)
+
+
+def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
+    """Return the field fitted to ``added`` samples as well, in the same way."""
+    samples = field.samples.joined(added)
+    energy, shape = (FitChoice(fit.kernel, fit.shape, chart.stretch,
+                               chart.depth / (chart.radius or 1.0))
+                     for fit, chart in ((field.energy_fit, field.chart),
+                                        (field.shape_fit, field.shape_chart)))
+    region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], field.chart.pivot,
+                            field.chart.radius)
+    return _fitted(samples, energy, shape, region)
+
+
+def _spread_out(face: np.ndarray, count: int) -> np.ndarray:
+    """Return at most ``count`` indices, those on the hull's face and others at even steps."""
+    if len(face) <= count:
+        return np.arange(len(face))
+    inner = np.flatnonzero(~face)
+    left = max(count - int(face.sum()), count // 2)
+    picked = inner[np.linspace(0, len(inner) - 1, min(left, len(inner))).astype(int)]
+    return np.sort(np.concatenate([np.flatnonzero(face), picked]))
+
+
+def left_out_errors(samples: GraspSamples, chart: Chart, choice: FitChoice, face: np.ndarray,
+                    ) -> tuple[dict[str, float], np.ndarray]:
+    """Return errors on each sample of the fit to all the others, in closed form.
+
+    Only samples inside the hull count: the planner never goes outside.
+
+    Args:
+        face: Which samples lie on the hull's face, bool [m].
+
+    Returns:
+        The measures of :func:`error_measures`, and prediction less truth of energy [J] and force
+        [N], shape [m, 4].
+    """
+    if not (~face).any():
+        raise WorkError(f"{len(samples.poses)} grasp poses are too few to leave any out.",
+                        "Then the error of the energy field cannot be told.",
+                        "Sample more poses.")
+    places = chart.map(samples.positions)
+    missed = RadialInterpolant.leave_one_out(
+        places, samples.energies, chart.push_forward(samples.positions, samples.forces),
+        kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, :, 0]
+    energy = np.maximum(samples.energies - missed[:, 0], 0.0)
+    off = -chart.pull_back(samples.positions, missed[:, 1:])
+    inside = np.flatnonzero(~face)
+    measures = error_measures(samples.take(inside), energy[inside], (samples.forces + off)[inside])
+    return measures, np.column_stack([energy - np.maximum(samples.energies, 0.0), off])
+
+
+def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
+                   ) -> dict[str, float]:
+    """Return how far predictions at ``truth``'s poses are off.
 
     Returns:
         ``energy_error`` and ``force_error``: root mean square error over root mean square of the
@@ -242,27 +389,6 @@ def held_out_errors(samples: GraspSamples, choice: FitChoice, base: np.ndarray, 
         the error of each sample over its own value; ``gentle_energy_error``: as the first, over
         the half of the samples with the least energy, where gentle paths run; ``held_out_count``.
     """
-    order = np.random.default_rng(seed).permutation(len(samples.poses))
-    tested, energy, force = [], [], []
-    for fold in range(folds):
-        out = order[fold::folds]
-        kept = np.setdiff1d(order, out)
-        field = _fitted(samples.take(kept), choice, base)
-        inside = out[field.region.contains(samples.positions[out])]
-        tested.append(inside)
-        energy.append(field.energy(samples.positions[inside]))
-        force.append(field.force(samples.positions[inside]))
-    index = np.concatenate(tested)
-    if len(index) == 0:
-        raise WorkError(f"{len(samples.poses)} grasp poses are too few to hold any out.",
-                        "Then the error of the energy field cannot be told.",
-                        "Sample more poses.")
-    return error_measures(samples.take(index), np.concatenate(energy), np.concatenate(force))
-
-
-def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
-                   ) -> dict[str, float]:
-    """Return the measures of :func:`held_out_errors` for predictions at ``truth``'s poses."""
     wanted = np.maximum(truth.energies, 0.0)
     energy_off = np.abs(energy - wanted)
     force_off = np.linalg.norm(force - truth.forces, axis=1)
@@ -279,16 +405,26 @@ def error_measures(truth: GraspSamples, energy: np.ndarray, force: np.ndarray,
     }
 
 
-def _fitted(samples: GraspSamples, choice: FitChoice, base: np.ndarray) -> EnergyField:
-    chart = Chart(base, float(np.linalg.norm(samples.positions[0] - base)), choice.stretch)
+def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: TrustRegion,
+            ) -> EnergyField:
+    chart = choice.on(region.chart)
+    errors, missed = left_out_errors(samples, chart, choice, region.is_face())
     places = chart.map(samples.positions)
-    forces = chart.push_forward(samples.positions, samples.forces) if choice.with_forces else None
-    options = {"kernel": choice.kernel, "shape": choice.shape, "smoothing": _SMOOTHING}
-    energy = RadialInterpolant.fit(places, samples.energies, forces, **options)
-    shape = RadialInterpolant.fit(places, np.hstack([samples.poses[:, 3:], samples.tips]),
+    forces = chart.push_forward(samples.positions, samples.forces)
+    energy = RadialInterpolant.fit(places, samples.energies, forces, kernel=choice.kernel,
+                                   shape=choice.shape, smoothing=_SMOOTHING)
+    shape_chart = bent.on(region.chart)
+    places = shape_chart.map(samples.positions)
+    options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": _SMOOTHING}
+    shape = RadialInterpolant.fit(places, samples.shape, _slopes_on(shape_chart, samples),
                                   **options)
-    region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3])
-    return EnergyField(samples, chart, energy, shape, region, {})
+    strain = RadialInterpolant.fit(places, samples.strains, **options)
+    off = -RadialInterpolant.leave_one_out(places, samples.strains, **options)[:, 0]
+    tips = _tips_missed(samples, bent, region.chart)
+    inside = ~region.is_face()
+    errors["tip_error_median_m"] = float(np.median(np.linalg.norm(tips[inside], axis=1)))
+    return EnergyField(samples, chart, shape_chart, energy, shape, strain, region, errors,
+                       np.column_stack([missed, off]))
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
@@ -310,8 +446,15 @@ def allowed_at(point, energy, field):
     """Return whether ``point``, whose energy is known, is trusted and within the limits."""
     if energy > field.max_energy:
         return False
-    if not trusted_at(point, field.planes, field.accepted, field.rejected):
+    for k in range(3):
+        if not field.low[k] <= point[k] <= field.high[k]:
+            return False
+    if not trusted_at(point, field.region):
         return False
+    if field.max_strain < np.inf:
+        chart, fit = field.strain
+        if value_at(mapped(point, *chart), 0, *fit) > field.max_strain:
+            return False
     if field.max_force == np.inf:
         return True
     slope = np.empty(len(point))

@@ -24,9 +24,11 @@ from limber.mechanics import (
 from limber.mechanics.loaded import LoadedBranch
 from limber.mechanics.status import Status
 from limber.mechanics.strain import strain_state
+from limber.sparse import NotPositiveDefiniteError
 
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
 _SETTINGS = StaticSettings(min_step=1 / 64)
+_DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differentiated
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,37 @@ class GraspModel:
     def peak_strain(self, displacement: np.ndarray) -> float:
         """Return the largest principal Green-Lagrange strain of any tetrahedron, by magnitude."""
         return float(np.abs(strain_state(self.model, displacement).principal_strain).max())
+
+    def peak_load(self, displacement: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """Return the largest principal strain by magnitude, where it is [m] at rest, shape [3], and
+        the largest principal Cauchy stress by magnitude [Pa]."""
+        state = strain_state(self.model, displacement)
+        size = np.abs(state.principal_strain).max(axis=1)
+        tet = int(size.argmax())
+        return (float(size[tet]), self.mesh.centroids[tet],
+                float(np.abs(state.principal_stress).max()))
+
+    def shape(self, displacement: np.ndarray) -> np.ndarray:
+        """Return natural rotation [rad], tip and named targets [m] in one row, [6 + 3 targets]."""
+        return np.concatenate([self.pose(displacement)[3:], self.tip(displacement),
+                               self.branch.target_positions(displacement).ravel()])
+
+    def shape_slopes(self, displacement: np.ndarray) -> np.ndarray:
+        """Return how :meth:`shape` changes with the grasp's position, [3, 6 + 3 targets].
+
+        By the tangent stiffness with the pin moved; the tangent is not positive definite at a
+        snap, where these are not known: NaN.
+        """
+        equations = self.model.equations((self.grasp,))
+        at = self.shape(displacement)
+        try:
+            tangent = equations.tangent(self.model, displacement)
+        except NotPositiveDefiniteError:
+            return np.full((3, len(at)), np.nan)
+        nothing = np.zeros_like(displacement)
+        return np.stack([
+            (self.shape(displacement + _DIFFERENCE * tangent.solve(nothing, axis[None])) - at)
+            / _DIFFERENCE for axis in np.eye(3)])
 
     @cached_property
     def _tip_node(self) -> int:

@@ -66,8 +66,7 @@ class RadialInterpolant:
         points = np.asarray(points, float)
         values = np.asarray(values, float).reshape(len(points), -1)
         count, dimension = points.shape
-        shift = points.mean(axis=0)
-        scale = float(np.abs(points - shift).max()) or 1.0
+        shift, scale = _frame(points)
         centres = np.ascontiguousarray((points - shift) / scale)
         powers = _monomials(dimension, _DEGREE[kernel])
         with_gradients = gradients is not None
@@ -85,6 +84,45 @@ class RadialInterpolant:
                    np.ascontiguousarray(value_weights),
                    gradient_weights.reshape(-1, dimension, values.shape[1]).copy(),
                    np.ascontiguousarray(polynomial), powers)
+
+    @staticmethod
+    def leave_one_out(points: np.ndarray, values: np.ndarray,
+                      gradients: np.ndarray | None = None, *, kernel: str,
+                      shape: float = 1.0, smoothing: float = 0.0) -> np.ndarray:
+        """Return what a fit without a sample would miss there, in closed form.
+
+        With ``A`` the system, ``b`` its right side and ``B`` the rows of one sample, the truth less
+        the prediction of the fit to all others is ``((A^-1)_BB)^-1 (A^-1 b)_B`` (Rippa 1999, here
+        for blocks of value and gradient).
+
+        Args:
+            points: Shape [m, dimension].
+            values: Shape [m] or [m, channels].
+            gradients: Shape [m, dimension] or [m, dimension, channels], where they are matched.
+
+        Returns:
+            Shape [m, 1 + dimension, channels]: value, gradient; [m, 1, channels] without gradients.
+        """
+        points = np.asarray(points, float)
+        count, dimension = points.shape
+        shift, scale = _frame(points)
+        centres = np.ascontiguousarray((points - shift) / scale)
+        both = gradients is not None
+        right = np.asarray(values, float).reshape(count, -1)
+        if both:
+            slopes = np.asarray(gradients, float).reshape(count * dimension, -1)
+            right = np.concatenate([right, scale * slopes])
+        full = _bordered(centres, _monomials(dimension, _DEGREE[kernel]), kernel, shape, smoothing,
+                         both)
+        inverse = np.linalg.inv(full)
+        weights = inverse[:, :len(right)] @ right
+        rows = np.arange(count)[:, None]
+        if both:
+            rows = np.hstack([rows, count + dimension * rows + np.arange(dimension)])
+        blocks = inverse[rows[:, :, None], rows[:, None, :]]
+        missed = np.linalg.solve(blocks, weights[rows])
+        missed[:, 1:] /= scale
+        return missed
 
     def value(self, points: np.ndarray) -> np.ndarray:
         """Return the field at ``points`` [n, dimension], shape [n, channels]."""
@@ -117,6 +155,22 @@ class RadialInterpolant:
         return cls(**plain, **{name: np.ascontiguousarray(value) for name, value in part.items()})
 
 
+def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return shift and scale that bring points within a box of half edge 1."""
+    shift = points.mean(axis=0)
+    return shift, float(np.abs(points - shift).max()) or 1.0
+
+
+def _bordered(centres: np.ndarray, powers: np.ndarray, kernel: str, shape: float, smoothing: float,
+              with_gradients: bool) -> np.ndarray:
+    """Return the system with the polynomial's rows and columns beside it."""
+    system = _system(centres, KERNELS[kernel], shape, with_gradients)
+    system[np.diag_indices(len(system))] += smoothing
+    basis = _polynomial_rows(centres, powers, with_gradients)
+    terms = basis.shape[1]
+    return np.block([[system, basis], [basis.T, np.zeros((terms, terms))]])
+
+
 def _monomials(dimension: int, degree: int) -> np.ndarray:
     rows = [[0] * dimension]
     for total in range(1, degree + 1):
@@ -127,11 +181,8 @@ def _monomials(dimension: int, degree: int) -> np.ndarray:
 
 def _solve(centres: np.ndarray, right: np.ndarray, powers: np.ndarray, kernel: str, shape: float,
            smoothing: float, with_gradients: bool) -> np.ndarray:
-    system = _system(centres, KERNELS[kernel], shape, with_gradients)
-    system[np.diag_indices(len(system))] += smoothing
-    basis = _polynomial_rows(centres, powers, with_gradients)
-    terms = basis.shape[1]
-    full = np.block([[system, basis], [basis.T, np.zeros((terms, terms))]])
+    full = _bordered(centres, powers, kernel, shape, smoothing, with_gradients)
+    terms = len(powers)
     padded = np.concatenate([right, np.zeros((terms, right.shape[1]))])
     try:
         weights = np.linalg.solve(full, padded)

@@ -1,25 +1,31 @@
 """Energy of the branch at sampled grasp positions, by the full model.
 
-Positions come from a Sobol sequence in the ball about the rest position that the deflection
-allows, cut by the paper's hemisphere. They are solved along a nearest-neighbour tree: next is the
-position nearest to any that has been solved, and it starts from that solution. So every step is
-short, also where a tour would have to jump, and the branch stays in the equilibrium that bends
-out of rest.
+Some poses follow the shell on which the grasp moves by itself, and go a little beyond
+(:mod:`limber.planning.field.valley`). The positions of the others come from a Sobol sequence in the
+ball about the rest position that the deflection allows, inside that shell, cut by the paper's
+hemisphere. They are solved along a nearest-neighbour tree: next is the position nearest to any that
+has been solved, and it starts from that solution. So every step is short, also where a tour would
+have to jump, and the branch stays in the equilibrium that bends out of rest.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from limber.errors import WorkError
 from limber.jobs import run_tasks
+from limber.mechanics import StaticResult
 from limber.mechanics.status import Status
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach, refusal
+from limber.planning.field.valley import Valley, walk_valley
+from limber.planning.settings import EnergySettings
 from limber.progress import SILENT, Progress
 
-_LAYER = 0.06  # share of the reach
+_LAYER = 0.06  # share of the shell's radius
+_WALK = 1 / 8  # directions along the shell for each sample that is asked for
+_FEWEST_DIRECTIONS = 8
 _TAUT = 2.0  # times the median force
 _SHARE_POSES = 40
 """Poses of one tree. How many trees there are must not depend on how many processes work on
@@ -39,16 +45,68 @@ class _Solved:
     min_det_f: float
     trouble: Status | None
     targets: np.ndarray
+    torque: np.ndarray
+    strain: float
+    strain_place: np.ndarray
+    stress: float
+    shape_slopes: np.ndarray
 
 
-def sample_positions(reach: Reach, rest: np.ndarray, count: int, *, deflection: float,
-                     stretch: float = 0.2, seed: int = 0) -> np.ndarray:
+def _taken(grasp_model: GraspModel, result: StaticResult, target: int) -> _Solved:
+    moved, at_rest = result.displacement, result is grasp_model.rest
+    strain, place, stress = grasp_model.peak_load(moved)
+    return _Solved(
+        target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
+        np.zeros(3) if at_rest else result.reaction_force, grasp_model.tip(moved),
+        float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
+        np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
+        grasp_model.shape_slopes(moved))
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """What the branch model said.
+
+    Attributes:
+        samples: Those to fit to, the rest pose first.
+        valley: The shell that they follow.
+        reasons: How many poses were rejected for which reason.
+        taut_count: How many were left out as taut.
+    """
+
+    samples: GraspSamples
+    valley: Valley
+    reasons: dict[str, int]
+    taut_count: int
+
+
+def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: int | None = None,
+                 progress: Progress = SILENT) -> Sampled:
+    """Solve the branch at ``settings.samples`` poses spread over where its grasp may be taken.
+
+    Raises:
+        WorkError: the grasp has hardly any room. ConvergenceError: the branch has no rest state.
+    """
+    directions = max(_FEWEST_DIRECTIONS, round(settings.samples * _WALK))
+    valley, walked = walk_valley(grasp_model, directions, deflection=settings.deflection,
+                                 seed=settings.seed, progress=progress.part(0.0, 0.1))
+    targets = sample_positions(
+        grasp_model.reach, grasp_model.rest_position, max(settings.samples - len(walked), 1),
+        valley, deflection=settings.deflection, seed=settings.seed)
+    samples, reasons = sample_branch(grasp_model, targets, walked, workers=workers,
+                                     progress=progress.part(0.1, 1.0))
+    drawn = max((float(np.linalg.norm(state.reaction_force)) for state in walked), default=0.0)
+    samples, taut_count = without_taut(samples, drawn)
+    return Sampled(samples, valley, reasons, taut_count)
+
+
+def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley, *,
+                     deflection: float, seed: int = 0) -> np.ndarray:
     """Return ``count`` positions [m] to which the grasp may be taken, shape [count, 3].
 
-    They lie within ``deflection`` times the arc length of ``rest``, above the base, and no
-    farther from it than the branch reaches. Half of them lie in a layer just inside that reach:
-    there the branch bends without being pushed together or pulled taut, the energy is least and
-    changes fastest, and gentle paths run.
+    They lie within ``deflection`` times the arc length of ``rest``, above the base, and inside the
+    shell. Half of them lie in a layer just inside it: there the branch bends without being pushed
+    together or pulled taut, the energy is least and changes fastest, and gentle paths run.
 
     Raises:
         WorkError: the grasp has hardly any room.
@@ -56,27 +114,28 @@ def sample_positions(reach: Reach, rest: np.ndarray, count: int, *, deflection: 
     from scipy.stats import qmc
 
     radius = deflection * reach.arc_length
-    taut = reach.chord + stretch * (reach.arc_length - reach.chord)
-    taut = max(taut, float(np.linalg.norm(rest - reach.base)))
     sequence = qmc.Sobol(4, seed=seed)
     found: list[np.ndarray] = []
     for _ in range(64):
         draw = sequence.random(512)
         points = rest + radius * (2.0 * draw[:, :3] - 1.0)
-        arm = points[1::2] - reach.base
+        arm = points[1::2] - valley.pivot
         depth = 1.0 - _LAYER * draw[1::2, 3:]
-        points[1::2] = reach.base + arm * (
-            taut * depth / np.linalg.norm(arm, axis=1, keepdims=True))
+        points[1::2] = valley.pivot + arm * (
+            valley.radius * depth / np.linalg.norm(arm, axis=1, keepdims=True))
         inside = np.linalg.norm(points - rest, axis=1) <= radius
-        inside &= np.linalg.norm(points - reach.base, axis=1) <= taut
+        inside &= np.linalg.norm(points - valley.pivot, axis=1) <= valley.radius
+        # The sphere's other half is no shell: nothing is sampled beyond the pivot.
+        inside &= (points - valley.pivot) @ (rest - valley.pivot) > 0.0
         inside &= points[:, 2] >= reach.base[2]
         bulk, layer = points[::2][inside[::2]], points[1::2][inside[1::2]]
         found.append(_alternating(bulk, layer))
         if sum(map(len, found)) >= count:
             return np.concatenate(found)[:count]
     raise WorkError("The grasp has nearly no room to move.",
-                    f"Within {radius:.3f} m of rest the branch, {taut:.3f} m long, reaches little.",
-                    "Grasp the branch farther out, or allow more --deflection or --stretch.")
+                    f"Within {radius:.3f} m of rest the branch, held {reach.arc_length:.3f} m from "
+                    "its base, reaches little above that.",
+                    "Grasp the branch farther out, or allow more --deflection.")
 
 
 def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -84,9 +143,12 @@ def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([first[:shared], second[:shared]], axis=1).reshape(-1, 3)
 
 
-def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int | None = None,
+def sample_branch(grasp_model: GraspModel, targets: np.ndarray,
+                  known: Sequence[StaticResult] = (), *, workers: int | None = None,
                   progress: Progress = SILENT) -> tuple[GraspSamples, dict[str, int]]:
     """Solve the branch with its grasp at each of ``targets`` [n, 3].
+
+    ``known`` are states that become samples as they are.
 
     Returns:
         The accepted samples, the rest pose first; and how many were rejected for which reason.
@@ -97,11 +159,9 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
     found = run_tasks(_solve_share, [(grasp_model, targets[share], share) for share in shares],
                       workers=workers, progress=progress, message="solving grasp poses")
     solved = [one for share in found for one in share]
-    rest = grasp_model.rest
-    at_rest = _Solved(-1, grasp_model.pose(rest.displacement), 0.0, np.zeros(3),
-                      grasp_model.tip(rest.displacement), rest.min_det_f, None,
-                      grasp_model.branch.target_positions(rest.displacement))
-    good = [at_rest, *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
+    at_rest = _taken(grasp_model, grasp_model.rest, -1)
+    good = [at_rest, *(_taken(grasp_model, state, -1) for state in known),
+            *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
     bad = sorted((s for s in solved if s.trouble), key=lambda s: s.target)
     reasons = [s.trouble for s in bad]
     rejected = np.zeros((len(bad), 6))
@@ -110,7 +170,12 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int 
         poses=np.array([s.pose for s in good]), energies=np.array([s.energy for s in good]),
         forces=np.array([s.force for s in good]),
         tips=np.array([s.tip for s in good]), min_det_f=np.array([s.min_det_f for s in good]),
-        rejected_poses=rejected, targets=np.array([s.targets for s in good]))
+        rejected_poses=rejected, strains=np.array([s.strain for s in good]),
+        targets=np.array([s.targets for s in good]),
+        torques=np.array([s.torque for s in good]),
+        strain_places=np.array([s.strain_place for s in good]),
+        stresses=np.array([s.stress for s in good]),
+        shape_slopes=np.array([s.shape_slopes for s in good]))
     return samples, {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
 
 
@@ -126,11 +191,7 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
 
     def attempt(target: int, source: int) -> _Solved:
         result = grasp_model.follow(targets[target][None], states[source])[0]
-        found = _Solved(
-            int(numbers[target]), grasp_model.pose(result.displacement),
-            grasp_model.energy(result), result.reaction_force,
-            grasp_model.tip(result.displacement), float(result.min_det_f), refusal(result),
-            grasp_model.branch.target_positions(result.displacement))
+        found = _taken(grasp_model, result, int(numbers[target]))
         if not found.trouble:
             positions.append(targets[target])
             states.append(result.displacement)
@@ -164,17 +225,16 @@ def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarr
     return _solve_tree(grasp_model, targets, numbers, report)
 
 
-
-
-def without_taut(samples: GraspSamples) -> tuple[GraspSamples, int]:
+def without_taut(samples: GraspSamples, drawn: float = 0.0) -> tuple[GraspSamples, int]:
     """Return the samples without those that pull the branch taut, and how many those were.
 
     Bending a branch, even double, takes about the same force anywhere; pulled taut it takes many
     times that within millimetres. Such a wall spoils the field around it, and no gentle path
-    goes there: poses over twice the median force stay out, and so out of the trusted region.
+    goes there: poses over twice the median force stay out, and so out of the trusted region; but
+    none that takes no more than ``drawn`` [N], the force that the branch was drawn outward with.
     """
     size = np.linalg.norm(samples.forces, axis=1)
-    slack = size <= _TAUT * np.median(size)
+    slack = size <= max(_TAUT * np.median(size), drawn * (1.0 + 1e-9))
     slack[0] = True
     return samples.take(np.flatnonzero(slack)), int((~slack).sum())
 

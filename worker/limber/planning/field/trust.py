@@ -1,7 +1,9 @@
 """Where a field that was fitted to samples may be believed.
 
 Radial functions extrapolate freely, and wrongly. A point is trusted inside the convex hull of the
-accepted samples, unless a pose that the branch model refused lies nearer than any it accepted.
+accepted samples, unless a pose that the branch model refused lies nearer than any it accepted. The
+samples lie along a curved shell, whose flat facets would cut off the very poses that gentle paths
+take: the hull is taken in coordinates that flatten it (:mod:`limber.planning.field.chart`).
 """
 
 from dataclasses import dataclass
@@ -11,58 +13,88 @@ from scipy.spatial import ConvexHull, QhullError
 
 from limber.compiled import compiled
 from limber.errors import WorkError
+from limber.planning.field.chart import Chart, mapped
 
 _EDGE = 1e-9  # [m] a sample on the hull belongs to it in spite of rounding
+_OUTLINE = 24  # points a side of the grid that tells how far the region reaches
 
 
 @dataclass(frozen=True)
 class TrustRegion:
-    """Attributes: ``planes`` [k, d + 1] with ``n . x + c <= 0`` inside, ``accepted`` [m, d] and
-    ``rejected`` [q, d] sample positions [m]."""
+    """Where a field is trusted.
+
+    Attributes:
+        planes: With ``n . y + c <= 0`` inside, in coordinates of ``chart``, shape [k, 4].
+        accepted, rejected: Sample positions [m], shapes [m, 3] and [q, 3].
+        chart: Plain.
+        low, high: Corners of a box that holds the region [m], shape [3].
+        outline: Points whose bounding box along any axes holds the region [m], shape [o, 3].
+    """
 
     planes: np.ndarray
     accepted: np.ndarray
     rejected: np.ndarray
+    chart: Chart
+    low: np.ndarray
+    high: np.ndarray
+    outline: np.ndarray
 
     @classmethod
-    def of(cls, accepted: np.ndarray, rejected: np.ndarray) -> "TrustRegion":
-        """Make the region of samples; raises WorkError if they span no volume."""
+    def of(cls, accepted: np.ndarray, rejected: np.ndarray, pivot: np.ndarray | None = None,
+           radius: float = 0.0) -> "TrustRegion":
+        """Make the region of samples, the rest pose first, along the sphere where one is given.
+
+        Raises:
+            WorkError: the samples span no volume.
+        """
         accepted = np.ascontiguousarray(accepted, float)
-        rejected = np.ascontiguousarray(rejected, float).reshape(-1, accepted.shape[1])
+        rejected = np.ascontiguousarray(rejected, float).reshape(-1, 3)
+        chart = Chart.about(pivot, radius, accepted[0])
+        flat = chart.map(accepted)
         try:
-            planes = np.unique(ConvexHull(accepted).equations.round(12), axis=0)
+            planes = np.unique(ConvexHull(flat).equations.round(12), axis=0)
         except (QhullError, ValueError) as error:
             raise WorkError(
                 f"{len(accepted)} accepted grasp poses span no volume.",
                 "The energy is known only between them.",
                 "Sample more poses, or a larger deflection.") from error
-        return cls(np.ascontiguousarray(planes), accepted, rejected)
+        outline = _outline(flat, planes, chart) if chart.radius > 0.0 else accepted
+        return cls(np.ascontiguousarray(planes), accepted, rejected, chart,
+                   outline.min(axis=0), outline.max(axis=0), outline)
+
+    @property
+    def arrays(self) -> tuple:
+        """What :func:`trusted_at` takes after the point."""
+        return self.chart.arrays, self.planes, self.accepted, self.rejected
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return whether each of ``points`` [n, d] is trusted, bool [n]."""
-        return _contain(np.ascontiguousarray(points, float).reshape(-1, self.accepted.shape[1]),
-                        self.planes, self.accepted, self.rejected)
+        """Return whether each of ``points`` [n, 3] is trusted, bool [n]."""
+        return _contain(_rows(points), self.arrays)
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Return how far ``points`` [n, d] are above the hull's highest plane [m], [n].
+        """Return how far ``points`` [n, 3] are above the hull's highest plane [m], [n].
 
-        Negative inside; nowhere does it grow faster than a metre a metre.
+        In flattened coordinates, negative inside.
         """
-        return _heights(np.ascontiguousarray(points, float).reshape(-1, self.accepted.shape[1]),
-                        self.planes)
+        return _heights(self.chart.map(points), self.planes)
 
-    @property
-    def low(self) -> np.ndarray:
-        """Lower corner of the bounding box [m], shape [d]."""
-        return self.accepted.min(axis=0)
+    def least_height(self, points: np.ndarray, reach: float) -> np.ndarray:
+        """Return what the height is at least anywhere within ``reach`` [m] of ``points``, [n]."""
+        return self.height(points) - reach * self.chart.growth(points, reach)
 
-    @property
-    def high(self) -> np.ndarray:
-        """Upper corner of the bounding box [m], shape [d]."""
-        return self.accepted.max(axis=0)
+    def height_and_slope(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return heights [m], shape [n], and their gradients to the point, [n, 3]."""
+        heights = self.chart.map(points) @ self.planes[:, :3].T + self.planes[:, 3]
+        top = heights.argmax(axis=1)
+        return (heights[np.arange(len(points)), top],
+                self.chart.pull_back(points, self.planes[top, :3]))
+
+    def is_face(self) -> np.ndarray:
+        """Return which accepted samples lie on the hull's face, bool [m]."""
+        return self.height(self.accepted) > -1e-7
 
     def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
-        """Return ``count`` trusted points, uniformly distributed, shape [count, d]."""
+        """Return ``count`` trusted points, uniformly distributed, shape [count, 3]."""
         found: list[np.ndarray] = []
         missing = count
         while missing > 0:
@@ -73,14 +105,38 @@ class TrustRegion:
         return np.concatenate(found)
 
 
+def _outline(flat: np.ndarray, planes: np.ndarray, chart: Chart) -> np.ndarray:
+    """Return points [n, 3] whose bounding box, along any axes, holds the region.
+
+    A grid over the hull's box, and about each of its points that may be near the hull the corners
+    of a box as large as a cell becomes at most when it is bent back.
+    """
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    ticks = [np.linspace(a, b, _OUTLINE) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    half = 0.5 * float(np.linalg.norm((high - low) / (_OUTLINE - 1)))
+    near = grid[_heights(grid, planes) <= half]
+    # Bent back, a length grows by r / R at most.
+    reach = half * max(1.0, 1.0 + (high[2] + half) / chart.radius)
+    sides = reach * np.concatenate([np.eye(3), -np.eye(3)]) * np.sqrt(3.0)
+    points = chart.curved(near)
+    hull = points[ConvexHull(points).vertices]
+    return (hull[:, None] + sides[None]).reshape(-1, 3)
+
+
+def _rows(points: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(points, float).reshape(-1, 3)
+
+
 @compiled
-def trusted_at(point, planes, accepted, rejected):
-    """Return whether ``point`` [d] is in the region."""
-    dimension = len(point)
+def trusted_at(point, region):
+    """Return whether ``point`` [3] is in the region; see :attr:`TrustRegion.arrays`."""
+    chart, planes, accepted, rejected = region
+    flat = mapped(point, *chart)
     for i in range(len(planes)):
-        height = planes[i, dimension]
-        for k in range(dimension):
-            height += planes[i, k] * point[k]
+        height = planes[i, 3]
+        for k in range(3):
+            height += planes[i, k] * flat[k]
         if height > _EDGE:
             return False
     if len(rejected) == 0:
@@ -113,8 +169,8 @@ def _heights(points, planes):
 
 
 @compiled
-def _contain(points, planes, accepted, rejected):
+def _contain(points, region):
     inside = np.empty(len(points), np.bool_)
     for i in range(len(points)):
-        inside[i] = trusted_at(points[i], planes, accepted, rejected)
+        inside[i] = trusted_at(points[i], region)
     return inside

@@ -85,13 +85,11 @@ def _excesses(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
               ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield excesses [n] and their gradients [n, 3] of each kind of limit, relative."""
     field, limits = problem.energy_field, problem.limits
-    planes = field.region.planes
-    heights = points @ planes[:, :3].T + planes[:, 3] + margin
     # The highest plane only, and never at the start, which may lie on it and stays.
-    top = heights.argmax(axis=1)
-    height = heights[np.arange(len(points)), top]
+    height, slope = field.region.height_and_slope(points)
+    height += margin
     height[0] = 0.0
-    yield height / scale, planes[top, :3] / scale
+    yield height / scale, slope / scale
     if len(field.region.rejected):
         accepted, toward = _nearest(points, field.region.accepted)
         rejected, away = _nearest(points, field.region.rejected)
@@ -102,6 +100,14 @@ def _excesses(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
     if limits.max_energy < np.inf:
         yield (field.energy(points) / limits.max_energy - 1.0 + reserve,
                field.energy_gradient(points) / limits.max_energy)
+    if limits.max_strain < np.inf:
+        yield (field.strain(points) / limits.max_strain - 1.0 + reserve,
+               field.strain_gradient(points) / limits.max_strain)
+    for axis in range(3):
+        for bound, side in ((limits.low[axis], -1.0), (limits.high[axis], 1.0)):
+            if np.isfinite(bound):
+                yield ((side * (points[:, axis] - bound) + margin) / scale,
+                       np.tile(side * np.eye(3)[axis] / scale, (len(points), 1)))
     if limits.max_force < np.inf:
         size, slope = _force_size(points, field)
         yield size / limits.max_force - 1.0 + reserve, slope / limits.max_force
