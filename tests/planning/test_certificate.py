@@ -12,6 +12,7 @@ from limber.planning.compare import plan_pair
 from limber.planning.cost import CostWeights
 from limber.planning.field.trust import TrustRegion
 from limber.planning.goals import GraspGoal, TipGoal
+from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine, violation
 from limber.planning.planners.smoothing import smooth_cost
@@ -193,3 +194,27 @@ def test_costs_of_two_seeds_compare(ridge_field):
     assert set(found[0].compared) == {
         "straight line", "eikonal", "RRT*", "RRT*, not smoothed", "D-RRT*",
         "D-RRT*, not smoothed"}
+
+
+def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
+    """Within 3 % of the shortest length: kept, dearer than without, and no bulge that is as short
+    has less energy than the dual's bound says."""
+    problem = problem_on(ridge_field)
+    shortest, _ = refine(np.linspace(START, GOAL.position, 40), replace(
+        problem, weights=problem.weights._replace(energy=0.0)))
+    free = plan_gentle(problem)
+    held = plan_detour(problem, shortest, 0.03, [free.points])
+    length = np.linalg.norm(np.diff(held.found.points, axis=0), axis=1).sum()
+    assert length <= 1.03 * held.shortest * (1 + 1e-9)
+    assert length > 1.01 * held.shortest, "the detour that is allowed is of use here"
+    assert held.energy_bound <= held.energy_integral
+    assert held.energy_integral <= 1.1 * held.energy_bound
+    curve = sorted(held.curve, key=lambda point: point.weight)
+    assert curve[0].length_m >= curve[-1].length_m
+    assert curve[0].energy_integral_jm <= curve[-1].energy_integral_jm
+    for path in bulges(problem, 40):
+        length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+        if length <= held.longest:
+            middles = (path[1:] + path[:-1]) / 2
+            pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
+            assert ridge_field.energy(middles) @ pieces >= held.energy_bound

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
+from limber.planning.limits import Limits
 from limber.planning.plan_file import (
     SPEED,
     limits_of_motion,
@@ -27,13 +28,20 @@ def solved(xs):
     poses = np.zeros((len(xs), 6))
     poses[:, 0] = xs
     vector = np.stack([xs, 0 * xs, 1 + xs], axis=1)
-    return SolvedPoses(poses, xs**2, vector, 0.1 * vector, 0.01 * xs, 2 * vector,
-                       np.stack([vector, 3 * vector], axis=1), np.zeros((len(xs), 4, 3)))
+    return SolvedPoses(
+        poses=poses, energies=xs**2, forces=vector, torques=0.1 * vector, strains=0.01 * xs,
+        strain_places=vector, stresses=1e6 * xs, min_det_f=1.0 + 0 * xs, tips=2 * vector,
+        targets=np.stack([vector, 3 * vector], axis=1),
+        shape_slopes=np.zeros((len(xs), 3, 12)), displacements=np.zeros((len(xs), 4, 3)))
+
+
+def resolved(path, approach):
+    return ResolvedPath(solved(path), solved(approach), np.empty((0, 3)), (), True)
 
 
 @pytest.fixture
 def path():
-    return ResolvedPath(solved([0.1, 0.15, 0.2]), solved([0.0, 0.05]), 0)
+    return resolved([0.1, 0.15, 0.2], [0.0, 0.05])
 
 
 def test_motion_goes_there_and_back(path):
@@ -50,14 +58,14 @@ def test_motion_goes_there_and_back(path):
 
 def test_motion_from_rest_has_no_approach():
     """A path that begins at rest is not preceded by the same pose again."""
-    motion = whole_motion(ResolvedPath(solved([0.0, 0.1]), solved([0.0]), 0))
+    motion = whole_motion(resolved([0.0, 0.1], [0.0]))
     np.testing.assert_allclose(motion.poses[:, 0], [0, 0.1, 0])
     assert motion.phases == ("path", "path", "return")
 
 
 def test_limits_tell_their_margin(path):
     """Over the whole motion; what was not asked for is not there."""
-    limits = limits_of_motion(whole_motion(path), None, 2.0)
+    limits = limits_of_motion(whole_motion(path), Limits(force=2.0))
     assert set(limits) == {"force_n"}
     assert limits["force_n"]["peak"] == pytest.approx(np.hypot(0.2, 1.2))
     assert limits["force_n"]["margin"] == pytest.approx(2.0 - np.hypot(0.2, 1.2))
@@ -68,7 +76,7 @@ def written(path, folder):
     motion = whole_motion(path, ("flower", "leaf"))
     summary = {"seed": 3, "baseline": {"length_m": 0.1}, "plan": {"length_m": 0.1}}
     file = folder / "plan.json"
-    file.write_text(plan_text(summary, *ways, motion, limits_of_motion(motion, 0.1, None)))
+    file.write_text(plan_text(summary, *ways, motion, limits_of_motion(motion, Limits(energy=0.1))))
     return file
 
 

@@ -1,6 +1,6 @@
 """Two paths to the same goal region on one field: the shortest, and the gentle one."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -8,7 +8,9 @@ from limber.errors import InputError, NoPathError
 from limber.planning.bound.certificate import Certificate
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.goals import Goal, allowed_points, goal_points
+from limber.planning.goals import Goal, GraspGoal, allowed_points, goal_points, over_limits
+from limber.planning.limits import Limits
+from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
@@ -18,6 +20,9 @@ from limber.planning.problem import GentleProblem
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
 
+_SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
+_AT_START = 1e-4  # [m] the approach ends that near
+
 
 @dataclass(frozen=True)
 class PathPair:
@@ -26,7 +31,8 @@ class PathPair:
     ``approach`` [k, 3] leads gently from the rest pose to the start: a branch that is pushed
     there straight may buckle on the way and be another branch when it arrives. ``certificate``
     says how close the plan is to the best possible path on the field; ``compared`` has the
-    polylines [n, 3] of all paths that were found, by name.
+    polylines [n, 3] of all paths that were found, by name. ``margins`` is by how much the limits
+    were tighter than asked; ``detour`` what a limit on the length did.
     """
 
     baseline: FoundPath
@@ -35,27 +41,72 @@ class PathPair:
     cost: CostWeights
     certificate: Certificate
     compared: dict[str, np.ndarray]
+    margins: dict[str, float] = field(default_factory=dict)
+    detour: DetourPath | None = None
 
 
-def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings, *,
-              progress: Progress = SILENT) -> PathPair:
-    """Plan both paths under the same limits, and bound the cost of any path from below.
+def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
+                limits: Limits, *, progress: Progress = SILENT) -> PathPair:
+    """Plan both paths within ``limits``, tighter by what the field may be wrong by where it can be.
+
+    Where no path keeps the margins, one that keeps the limits on the field alone is planned: the
+    full model decides whether it holds. That no path exists is said without margins only.
 
     Raises:
         InputError: the start is not allowed.
         NoPathError: the goal cannot be reached; says why, and whether that is proven.
     """
-    limits = limits_of(field, settings)
+    margins = limits.margins(field)
+    _check_start(field, start, limits.on(field))
+    none = dict.fromkeys(margins, 0.0)
+    # A start near its limit leaves room for a part of the margins only.
+    parts = [{name: share * value for name, value in margins.items()} for share in _SHARES]
+    parts = [part for part in parts if allowed_points(start[None], limits.on(field, part))[0]]
+    if any(margins.values()) and parts:
+        try:
+            return replace(plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
+                                     progress=progress.part(0.0, 0.5)), margins=parts[0])
+        except NoPathError:
+            progress.warn("No path keeps the limits with margins for the error of the energy "
+                          f"field ({_told(parts[0])}): planned without; the full model decides.")
+    return replace(plan_pair(field, start, goal, settings, limits.on(field),
+                             progress=progress.part(0.5, 1.0)), margins=none)
+
+
+def _told(margins: dict[str, float]) -> str:
+    units = {"energy": " J", "force": " N", "strain": ""}
+    return ", ".join(f"{name} {value:.2g}{units[name]}" for name, value in margins.items() if value)
+
+
+def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
+              limits: FieldArrays | None = None, *, progress: Progress = SILENT) -> PathPair:
+    """Plan both paths under the same limits, and bound the cost of any path from below.
+
+    ``limits`` are those of the settings where not given.
+
+    Raises:
+        InputError: the start is not allowed.
+        NoPathError: the goal cannot be reached; says why, and whether that is proven.
+    """
+    limits = limits or limits_of(field, settings)
     _check_start(field, start, limits)
     goals = goal_points(goal, field, limits, seed=settings.seed)
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
-    trees = _trees(field, start, goal, goals, settings, weighed, progress.part(0.0, 0.5))
+    trees = _trees(limits, field, start, goal, goals, settings, weighed,
+                   progress.part(0.0, 0.5))
     problem = GentleProblem(field, limits, weighed.weights, start, goal)
     known = [path.points for path in trees.values()]
-    gentle = plan_gentle(problem, known, progress=progress.part(0.5, 1.0))
+    detour = None
+    if settings.max_detour is None:
+        gentle = plan_gentle(problem, known, progress=progress.part(0.5, 1.0))
+    else:
+        detour = _detour(problem, known, settings, progress.part(0.5, 1.0))
+        gentle = detour.found
+        weighed = replace(weighed, distance=detour.weight * weighed.distance)
+        problem = replace(problem, weights=weighed.weights)
     if settings.planner == "d-rrt-star":
         if "D-RRT*" not in trees:
             raise NoPathError(
@@ -75,12 +126,31 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     for name, path in trees.items():
         compared[name] = path.points
         compared[f"{name}, not smoothed"] = path.raw
-    return PathPair(baseline, plan, _approach(field, start, settings), weighed, certificate,
-                    compared)
+    return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
+                    detour=detour)
 
 
-def _trees(field: EnergyField, start: np.ndarray, goal: Goal, goals: np.ndarray,
-           settings: PlanSettings, weighed: CostWeights, progress: Progress,
+def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
+            progress: Progress) -> DetourPath:
+    """Return the gentlest path within the length that the settings allow."""
+    if settings.planner != "eikonal":
+        raise InputError("--max-detour is given with --planner d-rrt-star.",
+                         "A tree keeps no limit on the length of its path.",
+                         "Leave --planner away.")
+    if settings.deformation_weight == 0.0:
+        raise InputError("--max-detour is given with a --deformation-weight of 0.",
+                         "Without a weight on energy the shortest path is asked for.",
+                         "Leave one of them away.")
+    rough = known or [plan_gentle(problem, progress=progress.part(0.0, 0.3)).points]
+    paths = [_shortest(problem, path) for path in rough]
+    shortest = min((path for path in paths if np.isfinite(path.cost)),
+                   key=lambda path: path.cost).points
+    return plan_detour(problem, shortest, settings.max_detour / 100.0, rough,
+                       progress=progress.part(0.3, 1.0))
+
+
+def _trees(limits: FieldArrays, field: EnergyField, start: np.ndarray, goal: Goal,
+           goals: np.ndarray, settings: PlanSettings, weighed: CostWeights, progress: Progress,
            ) -> dict[str, FoundPath]:
     """Return what RRT* and D-RRT* find: either, both or nothing."""
     def in_goal(points: np.ndarray) -> np.ndarray:
@@ -93,8 +163,7 @@ def _trees(field: EnergyField, start: np.ndarray, goal: Goal, goals: np.ndarray,
     for number, (name, cost) in enumerate([("RRT*", shortest), ("D-RRT*", weighed)]):
         part = progress.part(0.5 * number, 0.5 * (number + 1))
         part(0.0, name)
-        problem = PathProblem(start, goals, in_goal, field, limits_of(field, settings),
-                              cost.weights)
+        problem = PathProblem(start, goals, in_goal, field, limits, cost.weights)
         try:
             found[name] = plan_path(problem, search, engine=engine, progress=part)
         except NoPathError as error:
@@ -110,19 +179,32 @@ def _shortest(problem: GentleProblem, path: np.ndarray) -> FoundPath:
     return FoundPath(points, cost, cost, engine="refined")
 
 
-def _approach(field: EnergyField, start: np.ndarray, settings: PlanSettings) -> np.ndarray:
+def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
+    """Return a gentle way [k, 3] from rest to the start, within the same limits.
+
+    Raises:
+        NoPathError: there is none.
+    """
+    field, start = problem.energy_field, problem.start
     if np.linalg.norm(start - field.rest) < STEP:
         return field.rest[None]
     cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
                                deformation=max(settings.deformation_weight, 1.0))
-    problem = PathProblem(field.rest, start[None], lambda points: np.linalg.norm(
-        points - start, axis=1) < 1e-9, field, field.limited(), cost.weights)
-    return plan_path(problem, Search(iterations=1500, seed=settings.seed)).points
+    there = GraspGoal(tuple(map(float, start)), _AT_START)
+    way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there)
+    line = np.linspace(field.rest, start, 40)
+    points, least = refine(line, way)
+    if not np.isfinite(least):
+        rough = plan_path(PathProblem(
+            field.rest, start[None], lambda points: np.linalg.norm(points - start, axis=1) < 1e-9,
+            field, problem.limits, cost.weights), Search(iterations=1500, seed=settings.seed))
+        points, _ = refine(rough.points, way)
+    return np.concatenate([points, start[None]])
 
 
 def limits_of(field: EnergyField, settings: PlanSettings) -> FieldArrays:
     """Return the field's arrays with the settings' limits; none given means no limit."""
-    return field.limited(settings.max_energy or np.inf, settings.max_force or np.inf)
+    return Limits.of(settings).on(field)
 
 
 def chosen_engine(engine: str) -> str:
@@ -167,8 +249,5 @@ def _check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> 
                          "The branch's energy is not known there.",
                          "Choose a start nearer to rest, or sample farther (`limber energy "
                          "--deflection`).")
-    energy = float(field.energy(start)[0])
-    force = float(np.linalg.norm(field.force(start)))
-    raise InputError(f"At the start the energy is {energy:.3g} J and the force {force:.3g} N.",
-                     f"Allowed are {limits.max_energy:.3g} J and {limits.max_force:.3g} N.",
-                     "Raise the limit, or choose another start.")
+    raise InputError(f"At the start {over_limits(field, start[None], limits)}.",
+                     "A start must keep the limits.", "Raise the limit, or choose another start.")

@@ -98,14 +98,25 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
         raise _out_of_reach(goal, field, seed)
     allowed = trusted[allowed_points(trusted, limits)]
     if len(allowed) == 0:
-        energy = float(field.energy(trusted).min())
-        force = float(np.linalg.norm(field.force(trusted), axis=1).min())
         raise NoPathError(
-            f"No pose in the goal region keeps the limits: there the energy is at least "
-            f"{energy:.3g} J and the force at least {force:.3g} N.",
-            f"Allowed are {limits.max_energy:.3g} J and {limits.max_force:.3g} N.",
-            "Raise --max-energy or --max-force, or choose a goal nearer to the rest pose.")
+            f"No pose in the goal region keeps the limits: {over_limits(field, trusted, limits)}.",
+            "All of the region was sampled.",
+            "Raise the limit (--max-energy, --max-force, --max-strain, the workspace), or choose a "
+            "goal nearer to the rest pose.")
     return np.ascontiguousarray(allowed)
+
+
+def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> str:
+    """Return in words which limits none of ``points`` [n, 3] keeps, and by how much."""
+    outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
+    found = [("energy", field.energy(points), limits.max_energy, " J"),
+             ("force", np.linalg.norm(field.force(points), axis=1), limits.max_force, " N"),
+             ("strain", field.strain(points), limits.max_strain, "")]
+    told = [f"the {name} is at least {values.min():.3g}{unit} where {limit:.3g}{unit} is allowed"
+            for name, values, limit, unit in found if values.min() > limit]
+    if outside.min() > 0.0:
+        told.append(f"the workspace is {outside.min():.3f} m away")
+    return " and ".join(told) or "each pose breaks one or the other"
 
 
 @compiled

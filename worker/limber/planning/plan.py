@@ -5,22 +5,25 @@ elements along the found paths; how far the field was off is reported beside the
 """
 
 from dataclasses import asdict, dataclass
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from limber.errors import InputError
+from limber.errors import InputError, NoPathError
 from limber.planning.compare import (
     PathPair,
     PlanSettings,
     chosen_engine,
-    plan_pair,
+    plan_within,
     random_start,
 )
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
-from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.full_check import broken_on_full_model, field_error, learnt
 from limber.planning.goals import Goal, GraspGoal, TipGoal, default_goal
+from limber.planning.limits import Limits
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread
@@ -35,33 +38,69 @@ class PlannedMotion:
     Attributes:
         summary: The stage's result.
         baseline, plan: The shortest path (RRT*), and the gentle one.
+        field: With what was learnt from plans that were refused.
     """
 
     summary: dict[str, Any]
     baseline: ResolvedPath
     plan: ResolvedPath
+    field: EnergyField
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
                 workers: int | None = None, progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
+    A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
+    on: the states found there join the field's samples and it is planned anew, at most
+    ``settings.replans`` times. So is one along which the field is too far off to have been the
+    gentlest; the last of those is passed on with a warning.
+
     Raises:
         InputError: the start is not allowed, or two goals are given.
-        NoPathError: no path; the message says why.
+        NoPathError: no path, or none that keeps the limits on the full model; says why and where.
+        ConvergenceError: the branch cannot be solved along the shortest path.
     """
     one_thread()
     goal = _goal(field, settings)
     start = _start(field, goal, settings)
-    pair = plan_pair(field, start, goal, settings, progress=progress.part(0.0, 0.3))
-    progress(0.3, "both paths on the full model")
-    baseline, plan = resolve_side_by_side(
-        grasp_model, [pair.baseline.points, pair.plan.points], pair.approach, workers,
-        progress.part(0.3, 0.95))
-    summary = _summary(field, goal, start, pair, baseline, plan, settings)
+    limits = Limits.of(settings)
+    rounds: list[dict[str, Any]] = []
+    for number in range(settings.replans + 1):
+        ahead = progress.part(number / (settings.replans + 1), (number + 1) / (
+            settings.replans + 1))
+        began = perf_counter()
+        pair = plan_within(field, start, goal, settings, limits, progress=ahead.part(0.0, 0.3))
+        planned = perf_counter()
+        ahead(0.3, "both paths on the full model")
+        baseline, plan = resolve_side_by_side(
+            grasp_model, [pair.baseline.points, pair.plan.points], pair.approach, workers,
+            ahead.part(0.3, 0.95))
+        broken = broken_on_full_model(plan, limits, goal)
+        off = field_error(field, plan.solved)
+        rounds.append({"broken": broken, "sample_count": len(field.samples.poses),
+                       "margins": pair.margins, "field_energy_error": off,
+                       "plan_seconds": planned - began, "check_seconds": perf_counter() - planned})
+        is_last = number == settings.replans
+        if not broken and (is_last or off <= settings.field_error / 100.0):
+            break
+        if is_last:
+            raise _refused(broken, settings)
+        field = refit(field, learnt(field, plan, limits))
+    summary = _summary(field, goal, start, pair, baseline.require(), plan, settings)
+    summary["rounds"] = rounds
     for message in _doubts(summary, baseline, plan):
         progress.warn(message)
-    return PlannedMotion(summary, baseline, plan)
+    return PlannedMotion(summary, baseline, plan, field)
+
+
+def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:
+    return NoPathError(
+        f"No plan keeps the limits on the full model: {'; '.join(broken)}.",
+        f"Planned {settings.replans + 1} times, each time with the states found there added to the "
+        "energy field.",
+        "Raise the limit, choose a gentler goal, sample more poses with `limber energy --samples`, "
+        "or allow more --replans.")
 
 
 def _goal(field: EnergyField, settings: PlanSettings) -> Goal:
@@ -98,8 +137,10 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
         "certificate": pair.certificate.describe(),
         "paths_on_field": {name: asdict(_on_field(field, points))
                            for name, points in pair.compared.items()},
+        "margins": pair.margins,
+        "detour": pair.detour and pair.detour.describe(),
         "weights": {"deformation": settings.deformation_weight,
-                    "distance": settings.distance_weight,
+                    "distance": pair.cost.distance,
                     "energy_scale_j": pair.cost.energy_scale,
                     "length_scale_m": pair.cost.length_scale},
         "zero_of_energy": "the hanging state: the branch as scanned, the gripper open; an energy "
@@ -117,10 +158,9 @@ def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:
     """Return the peak strain, and how far the field was from the full model along the path."""
     solved = path.solved
     off = field.energy(solved.poses[:, :3]) - np.maximum(solved.energies, 0.0)
-    size = float(np.sqrt(np.mean(solved.energies**2)))
     return {"peak_strain": float(solved.strains.max()),
             "tip_end_m": solved.tips[-1],
-            "field_energy_error": float(np.sqrt(np.mean(off**2))) / size if size else 0.0,
+            "field_energy_error": field_error(field, solved),
             "field_energy_error_max_j": float(np.abs(off).max()),
             "unsolved_count": path.unsolved_count}
 
@@ -143,8 +183,8 @@ def _doubts(summary: dict[str, Any], *paths: ResolvedPath) -> list[str]:
                       "`--planner eikonal`, the default, comes closest.")
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
-        doubts.append(f"{unsolved} poses along the paths had no acceptable solution and are left "
-                      "out of the measures.")
+        doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution and "
+                      "are left out of its measures.")
     return doubts
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from limber.errors import InputError
 from limber.plain import plain
 from limber.planning.cost import arc_lengths
+from limber.planning.limits import Limits
 from limber.planning.resolve import ResolvedPath, SolvedPoses
 
 FORMAT = 2
@@ -118,13 +119,14 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = ()) -> Way:
     return way_of(ahead.joined(ahead.take(back)), targets, phases=phases)
 
 
-def limits_of_motion(motion: Way, max_energy: float | None,
-                     max_force: float | None) -> dict[str, dict[str, float]]:
+def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]:
     """Return value, peak along the motion and margin of each limit that was asked for."""
-    asked = {"energy_j": (max_energy, motion.energies), "force_n": (max_force, motion.force_sizes)}
+    asked = {"energy_j": (limits.energy, motion.energies),
+             "force_n": (limits.force, motion.force_sizes),
+             "strain": (limits.strain, motion.strains)}
     return {name: {"limit": limit, "peak": float(values.max()),
                    "margin": limit - float(values.max())}
-            for name, (limit, values) in asked.items() if limit is not None}
+            for name, (limit, values) in asked.items() if limit < np.inf}
 
 
 def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,

@@ -24,8 +24,12 @@ class SolvedPoses:
         energies: Potential of strain and weight above the hanging state [J], shape [n].
         forces, torques: Of the gripper on the branch [N, Nm], shape [n, 3].
         strains: Largest principal Green-Lagrange strain anywhere in the branch, shape [n].
+        strain_places: Where, in the rest shape [m], shape [n, 3].
+        stresses: Largest principal Cauchy stress by magnitude [Pa], shape [n].
+        min_det_f: Least determinant of the deformation gradient, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].
         targets: Positions of the named targets [m], shape [n, targets, 3].
+        shape_slopes: See :meth:`GraspModel.shape_slopes`, shape [n, 3, 6 + 3 targets].
         displacements: Of all nodes [m], shape [n, node_count, 3].
     """
 
@@ -34,22 +38,30 @@ class SolvedPoses:
     forces: np.ndarray
     torques: np.ndarray
     strains: np.ndarray
+    strain_places: np.ndarray
+    stresses: np.ndarray
+    min_det_f: np.ndarray
     tips: np.ndarray
     targets: np.ndarray
+    shape_slopes: np.ndarray
     displacements: np.ndarray
 
     @classmethod
     def of(cls, grasp_model: GraspModel, results: list[StaticResult]) -> "SolvedPoses":
         """Return what solutions say."""
         moved = [result.displacement for result in results]
+        strains, places, stresses = zip(*map(grasp_model.peak_load, moved), strict=True)
         return cls(
             poses=np.array([grasp_model.pose(u) for u in moved]),
             energies=np.array([grasp_model.energy(result) for result in results]),
             forces=np.array([result.reaction_force for result in results]),
             torques=np.array([result.reaction_torque for result in results]),
-            strains=np.array([grasp_model.peak_strain(u) for u in moved]),
+            strains=np.array(strains), strain_places=np.array(places),
+            stresses=np.array(stresses),
+            min_det_f=np.array([float(result.min_det_f) for result in results]),
             tips=np.array([grasp_model.tip(u) for u in moved]),
             targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
+            shape_slopes=np.array([grasp_model.shape_slopes(u) for u in moved]),
             displacements=np.array(moved))
 
     @property
@@ -74,45 +86,65 @@ class ResolvedPath:
     Attributes:
         solved: The states along it.
         approach: Those on the way from rest, the hanging state first, to before the path.
-        unsolved_count: Poses of the planned path that had no acceptable solution.
+        unsolved: Positions on approach and path without an acceptable solution [m], shape [k, 3].
+        reasons: Why, k of them.
+        is_whole: Whether the end was reached; over a tenth unsolved ends the way early.
     """
 
     solved: SolvedPoses
     approach: SolvedPoses
-    unsolved_count: int
+    unsolved: np.ndarray
+    reasons: tuple[str, ...]
+    is_whole: bool
 
     @property
     def measures(self) -> PathMeasures:
         return measure_path(self.solved.poses[:, :3], self.solved.energies,
                             self.solved.force_sizes)
 
+    @property
+    def unsolved_count(self) -> int:
+        return len(self.reasons)
+
+    def require(self) -> "ResolvedPath":
+        """Return this.
+
+        Raises:
+            ConvergenceError: over a tenth of the poses has no acceptable solution, or the last.
+        """
+        if self.is_whole:
+            return self
+        kinds = ", ".join(f"{self.reasons.count(kind)} {kind}"
+                          for kind in sorted(set(self.reasons)))
+        raise ConvergenceError(
+            f"Along a path {len(self.reasons)} poses have no acceptable solution ({kinds}).",
+            "The energy field promised more than the branch can do.",
+            "Sample more poses with `limber energy --samples`, or choose a gentler goal.")
+
 
 def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray,
                  progress: Progress = SILENT) -> ResolvedPath:
-    """Solve the branch at each point of ``path`` [n, 3], coming from rest by ``approach`` [k, 3].
-
-    Raises:
-        ConvergenceError: over a tenth of the poses has no acceptable solution, or the last.
-    """
-    before = [grasp_model.rest]
-    for point in resample(approach, _APPROACH_STEP)[1:-1]:
-        result = grasp_model.follow(point[None], before[-1].displacement)[0]
-        before += [] if refusal(result) else [result]
-    good, reasons, state = [], [], before[-1].displacement
-    for number, point in enumerate(path):
-        progress(number / len(path), "path on the full model")
+    """Solve the branch along ``path`` [n, 3], coming from rest by ``approach`` [k, 3]."""
+    before, unsolved, reasons = [grasp_model.rest], [], []
+    good, state = [], grasp_model.rest.displacement
+    ahead = resample(approach, _APPROACH_STEP)[1:-1]
+    is_whole = True
+    for number, point in enumerate(np.concatenate([ahead, path])):
+        progress(number / (len(ahead) + len(path)), "path on the full model")
         result = grasp_model.follow(point[None], state)[0]
         if reason := refusal(result):
-            reasons.append(reason)
-        else:
-            good.append(result)
-            state = result.displacement
-        if len(reasons) > _MOST_UNSOLVED * len(path):
-            raise _unsolved(reasons, len(path))
-    if reason:
-        raise _unsolved(reasons, len(path))
-    return ResolvedPath(SolvedPoses.of(grasp_model, good), SolvedPoses.of(grasp_model, before),
-                        len(reasons))
+            unsolved.append(point)
+            reasons.append(str(reason))
+            is_whole = number < len(ahead) + len(path) - 1 and (
+                len(reasons) <= _MOST_UNSOLVED * len(path))
+            if not is_whole:
+                break
+            continue
+        (before if number < len(ahead) else good).append(result)
+        state = result.displacement
+    return ResolvedPath(
+        SolvedPoses.of(grasp_model, good or before[-1:]), SolvedPoses.of(grasp_model, before),
+        np.array(unsolved).reshape(-1, 3), tuple(reasons), is_whole)
 
 
 def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], approach: np.ndarray,
@@ -121,11 +153,3 @@ def resolve_side_by_side(grasp_model: GraspModel, paths: list[np.ndarray], appro
     """Solve several paths with the same approach, each in a process where cores allow."""
     return run_tasks(resolve_path, [(grasp_model, path, approach) for path in paths],
                      workers=workers, progress=progress, message="both paths on the full model")
-
-
-def _unsolved(reasons: list[str], count: int) -> ConvergenceError:
-    kinds = ", ".join(f"{reasons.count(kind)} {kind}" for kind in sorted(set(reasons)))
-    return ConvergenceError(
-        f"Of {count} poses of the planned path {len(reasons)} have no acceptable solution "
-        f"({kinds}).", "The energy field promised more than the branch can do.",
-        "Sample more poses with `limber energy --samples`, or choose a gentler goal.")

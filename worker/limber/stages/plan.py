@@ -26,7 +26,6 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
-    from limber.planning.field.energy_field import EnergyField
     from limber.planning.field.grasp_model import GraspModel
     from limber.planning.plan import PlannedMotion
     from limber.planning.plan_file import Way
@@ -87,24 +86,25 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
         field = EnergyField.read(field_path)
         found = plan_motion(field, grasp_model, settings, workers=workers, progress=progress)
         progress(0.95, "writing")
-        _write(stage, name, settings, grasp_model, field, found)
+        _write(stage, name, settings, grasp_model, found)
         stage.result.update(found.summary)
     progress(1.0, "planned")
     return branch.manifest.stages[key].result
 
 
 def _write(stage: Stage, name: str, settings: PlanSettings, grasp_model: GraspModel,
-           field: EnergyField, found: PlannedMotion) -> None:
+           found: PlannedMotion) -> None:
     from limber.mechanics.frames import surface_fields, write_pc2
     from limber.mechanics.strain import strain_state
+    from limber.planning.limits import Limits
     from limber.planning.plan_file import limits_of_motion, plan_text, way_of, whole_motion
 
     names = tuple(target.name for target in grasp_model.branch.targets)
     baseline, plan = (way_of(path.solved, names,
-                             field_energies=field.energy(path.solved.poses[:, :3]))
+                             field_energies=found.field.energy(path.solved.poses[:, :3]))
                       for path in (found.baseline, found.plan))
     motion = whole_motion(found.plan, names)
-    limits = limits_of_motion(motion, settings.max_energy, settings.max_force)
+    limits = limits_of_motion(motion, Limits.of(settings))
     stage.path(f"plans/{name}.json").write_text(
         plan_text(found.summary, baseline, plan, motion, limits), encoding="utf-8")
     stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")

@@ -1,0 +1,120 @@
+"""What no pose of a motion may exceed, with margins for the field, and its check on the full model.
+
+A planner sees the field, which is wrong by its measured error. It therefore plans with limits that
+are tighter by a margin: what 95 % of the samples near the limit, each left out of the fit in turn,
+are missed by at most. Whether a limit is kept is decided on the full model alone.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.resolve import SolvedPoses
+from limber.planning.settings import PlanSettings
+
+_COVERED = 0.95  # of the samples near a limit
+_NEAR = (0.5, 1.3)  # times the limit
+_FEWEST = 12  # samples near it; else all are asked
+_MOST = 0.3  # of the limit: where the field is worse, the check on the full model has to tell
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A limit that a state of the full model does not keep.
+
+    Attributes:
+        name: Which, with its unit.
+        value, limit: The state's and what was asked.
+        position: Of the grasp there [m], shape [3].
+    """
+
+    name: str
+    value: float
+    limit: float
+    position: np.ndarray
+
+    def __str__(self) -> str:
+        place = ", ".join(f"{x:.3f}" for x in self.position)
+        return f"{self.name} {self.value:.4g} where {self.limit:.4g} is allowed, at ({place}) m"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits as asked; infinite where nothing was.
+
+    Attributes:
+        energy: Above the hanging state [J].
+        force: Magnitude of the gripper's [N].
+        strain: Largest principal anywhere in the branch.
+        low, high: Box that the grasp stays in [m], shape [3].
+    """
+
+    energy: float = np.inf
+    force: float = np.inf
+    strain: float = np.inf
+    low: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
+    high: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
+
+    @classmethod
+    def of(cls, settings: PlanSettings) -> "Limits":
+        """Return the settings' limits.
+
+        Raises:
+            InputError: the workspace is empty.
+        """
+        low = np.array(settings.workspace_low or [-np.inf] * 3, float)
+        high = np.array(settings.workspace_high or [np.inf] * 3, float)
+        if not (low < high).all():
+            raise InputError(f"The workspace from {low} to {high} m is empty.",
+                             "Its lower corner must be below the upper one in x, y and z.",
+                             "Correct --workspace-low and --workspace-high.")
+        return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
+                   settings.max_strain or np.inf, low, high)
+
+    def margins(self, known: EnergyField) -> "dict[str, float]":
+        """Return how much tighter than asked to plan on a field: by limit, 0 for none asked."""
+        samples = known.samples
+        missed = {"energy": np.abs(known.missed[:, 0]),
+                  "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
+                  "strain": np.abs(known.missed[:, 4])}
+        values = {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
+                  "strain": samples.strains}
+        inner = ~known.region.is_face()
+        found = {}
+        for name, off in missed.items():
+            limit = getattr(self, name)
+            if not limit < np.inf:
+                found[name] = 0.0
+                continue
+            near = inner & (values[name] > _NEAR[0] * limit) & (values[name] < _NEAR[1] * limit)
+            near = near if near.sum() >= _FEWEST else inner
+            found[name] = min(float(np.quantile(off[near], _COVERED)), _MOST * limit)
+        return found
+
+    def on(self, known: EnergyField, margins: dict[str, float] | None = None) -> FieldArrays:
+        """Return the field with these limits for compiled loops, tighter by ``margins``."""
+        less = margins or {"energy": 0.0, "force": 0.0, "strain": 0.0}
+        return known.limited(self.energy - less["energy"], self.force - less["force"],
+                             max_strain=self.strain - less["strain"], low=self.low,
+                             high=self.high)
+
+    def broken(self, states: SolvedPoses) -> list[Broken]:
+        """Return the limits that states of the full model break, each where it is worst."""
+        places = states.poses[:, :3]
+        outside = np.maximum(self.low - places, places - self.high).max(axis=1)
+        asked = [("energy [J]", states.energies, self.energy),
+                 ("force [N]", states.force_sizes, self.force),
+                 ("strain", states.strains, self.strain),
+                 ("distance outside the workspace [m]", outside, 1e-6)]
+        return [Broken(name, float(values.max()), limit, places[values.argmax()])
+                for name, values, limit in asked if values.max() > limit]
+
+    def kept(self, states: SolvedPoses) -> np.ndarray:
+        """Return which states keep all limits, bool [n]."""
+        places = states.poses[:, :3]
+        return ((states.energies <= self.energy) & (states.force_sizes <= self.force)
+                & (states.strains <= self.strain)
+                & (places >= self.low - 1e-6).all(axis=1)
+                & (places <= self.high + 1e-6).all(axis=1))
