@@ -1,0 +1,69 @@
+"""The six branches of the planning bench: the paper's three arcs and three forked ones."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from tests.subjects.paper_branches import BRANCHES, FRACTIONS, PaperBranch
+
+from limber.geometry.generated import generate_branch
+from limber.geometry.settings import GRASP_FRACTION
+from limber.geometry.skeleton.control_points import control_points
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.tets.marks import mark
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.geometry.tets.tetrahedra import mesh_branch
+from limber.mechanics import BranchModel, young_weights
+from limber.mechanics.loaded import hang
+from limber.planning.field.grasp_model import GraspModel, grasp_model_of
+from limber.progress import SILENT, Progress
+
+_GRAVITY = (0.0, 0.0, -9.80665)
+_DENSITY = 900.0
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A branch to plan on."""
+
+    name: str
+    model: GraspModel
+
+
+def arcs() -> list[Subject]:
+    """Return the paper's branches: its moduli, too soft to stand under their own weight."""
+    return [Subject(branch.name, _arc(branch)) for branch in BRANCHES]
+
+
+def forked(seed: int, count: int, progress: Progress = SILENT) -> list[Subject]:
+    """Return ``count`` drawn branches of wood, 0.4 to 0.7 m long with one to three twigs."""
+    found = []
+    for number in range(count):
+        rng = np.random.default_rng([seed, number])
+        length = rng.uniform(0.4, 0.7)
+        root = rng.uniform(0.010, 0.013) * length
+        drawn = generate_branch(
+            int(rng.integers(1 << 31)), length=length, radius_root=root, bend=rng.uniform(0.2, 0.7),
+            radius_tip=rng.uniform(0.45, 0.7) * root, fork_count=int(rng.integers(1, 4)),
+            young_mean=10 ** rng.uniform(8.5, 9.5))
+        mesh = mesh_branch(drawn.skeleton).mesh
+        found.append(Subject(f"forked {number + 1}", _grasp_model(
+            mesh, drawn.skeleton, drawn.young, 0.35, _GRAVITY, progress)))
+    return found
+
+
+def _arc(branch: PaperBranch) -> GraspModel:
+    skeleton = branch.skeleton
+    return _grasp_model(branch.mesh(slice_length=2.0, sides=6), skeleton,
+                        np.array(branch.young), branch.poisson, None)
+
+
+def _grasp_model(mesh: TetMesh, skeleton: Skeleton, young: np.ndarray, poisson: float,
+                 gravity: tuple[float, float, float] | None, progress: Progress = SILENT,
+                 ) -> GraspModel:
+    mesh = mark(mesh, skeleton, young=1.0, poisson=poisson, density=_DENSITY)
+    values = young_weights(mesh, control_points(skeleton, FRACTIONS)) @ young
+    mesh = mesh.with_data(cell_data={"young": values})
+    model = BranchModel(mesh, young=values, poisson=poisson, density=_DENSITY, gravity=gravity)
+    loaded = replace(hang(model, progress=progress),
+                     grasp_point=tuple(map(float, skeleton.point_at(GRASP_FRACTION))))
+    return grasp_model_of(loaded, skeleton)
