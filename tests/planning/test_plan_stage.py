@@ -171,7 +171,7 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
         field = real(path)
         samples = replace(field.samples, energies=0.5 * field.samples.energies,
                           forces=0.5 * field.samples.forces)
-        return fit_field(samples, field.chart.base, field.chart.radius)
+        return fit_field(samples, field.chart.pivot, field.chart.radius)
 
     monkeypatch.setattr(EnergyField, "read", promising)
     with pytest.raises(NoPathError, match=r"force \[N\] .* is allowed, at \(.*\) m") as refused:
