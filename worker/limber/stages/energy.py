@@ -42,7 +42,8 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
                           "paths keep away from them.")
         field.write(stage.path("energy.npz"), {
             "target_names": np.array([t.name for t in grasp_model.branch.targets], "U64"),
-            "rest_pose": samples.poses[0], "arc_length_m": np.array(grasp_model.reach.arc_length)})
+            "rest_pose": samples.poses[0], "chart_base_m": grasp_model.reach.base,
+            "arc_length_m": np.array(grasp_model.reach.arc_length)})
         stage.result.update(
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
             taut_count=sampled.taut_count,
