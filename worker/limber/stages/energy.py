@@ -49,7 +49,8 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             taut_count=sampled.taut_count,
             energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
             errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
-            chart_stretch=field.chart.stretch, chart_depth_m=field.chart.depth,
+            chart_stretch=field.chart.stretch,
+            chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,
             max_energy_j=float(samples.energies.max()),
             max_force_n=float(np.linalg.norm(samples.forces, axis=1).max()),
             rest_position_m=samples.poses[0, :3], arc_length_m=grasp_model.reach.arc_length)
