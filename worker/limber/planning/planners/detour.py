@@ -12,6 +12,7 @@ just short enough; there the bound is nearly met.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from limber.errors import NoPathError
 from limber.planning.cost import arc_lengths, resample
@@ -149,4 +150,4 @@ def _weighed(problem: GentleProblem, weight: float) -> GentleProblem:
 def _measured(path: np.ndarray, problem: GentleProblem) -> tuple[float, float]:
     fine = resample(path, _SPACING)
     along = arc_lengths(fine)
-    return float(along[-1]), float(np.trapezoid(problem.energy_field.energy(fine), along))
+    return float(along[-1]), float(trapezoid(problem.energy_field.energy(fine), along))
