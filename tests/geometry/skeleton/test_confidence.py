@@ -5,7 +5,15 @@ import pytest
 
 from limber.geometry.skeleton.confidence import assessed, shares
 from limber.geometry.skeleton.files import read_fitted, write_cylinders
-from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, UNRESOLVED, Skeleton
+from limber.geometry.skeleton.radii.axis_fit import tapered
+from limber.geometry.skeleton.skeleton import (
+    BRIDGED,
+    INTERPOLATED,
+    LIMITED,
+    MEASURED,
+    UNRESOLVED,
+    Skeleton,
+)
 
 
 def _tube(low, high, radius, count, seed=0):
@@ -95,3 +103,14 @@ def test_an_unresolved_radius_goes_by_the_resolved_part_of_its_branch() -> None:
     top = told.nodes[:, 2] > 0.3
     assert set(told.radius_state[top]) == {UNRESOLVED}
     assert (np.abs(told.radius - 0.008) < 1.96 * told.radius_sigma)[top].all()
+
+
+def test_what_is_filled_in_limits_no_radius() -> None:
+    """A stem that starts thin, where there were no points, may be thicker where it was measured;
+    one that was measured thin may not."""
+    stem = _stem(0.008, 0.004).subset(np.arange(61) < 41)
+    radius = np.where(np.arange(41) < 12, 0.002, 0.006)
+    for first, limited in ((INTERPOLATED, False), (MEASURED, True)):
+        state = np.where(np.arange(41) < 12, first, MEASURED).astype(np.int8)
+        told = tapered(Skeleton.from_edges(stem.nodes, stem.parent, radius, radius_state=state))
+        assert (told.radius_state == LIMITED).any() == limited

@@ -231,20 +231,22 @@ def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
 def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
     """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
 
-    A run is no thicker than its carrier where it starts, nor ``growth`` times its own median so
-    far, nor at its tip than that median: a bunch of twigs that the scan did not resolve would
-    otherwise become a fat cylinder.
+    A run is no thicker than its carrier where it starts, nor ``growth`` times the median of what
+    was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
+    not resolve would otherwise become a fat cylinder.
     """
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
+    measured = state == MEASURED
     for run, members in enumerate(skeleton.runs()):
         own = members if run == 0 else members[1:]
         carrier = members[0]
         cap = np.inf if run == 0 else max(radius[carrier], radius[skeleton.parent[carrier]])
         for place, node in enumerate(own):
+            before = own[:place][measured[own[:place]]]
             # The first few are too few to speak for the run: a cut stem starts with a ragged end.
-            if place >= max(6, len(own) // 8):
+            if len(before) >= max(6, len(own) // 8):
                 allowed = growth + (1 - growth) * place / len(own)
-                cap = min(cap, allowed * float(np.median(radius[own[:place]])))
+                cap = min(cap, allowed * float(np.median(radius[before])))
             if radius[node] > cap:
                 radius[node], state[node] = cap, LIMITED
     return replace(skeleton, radius=radius, radius_state=state)
