@@ -125,7 +125,7 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
 def unsaid_length(aligned: Skeleton, branch: Path) -> float:
     """Length of axes [m] that is neither near the mesh nor on a branch named as left out."""
     masses = branch / "point_masses.json"
-    named = {mass["branch"] for mass in json.loads(masses.read_text())} if (
+    named = {mass["branch"] for mass in json.loads(masses.read_text()) if "branch" in mass} if (
         masses.is_file()) else set()
     distance, _ = cKDTree(TetMesh.read(branch / "mesh.vtu").nodes).query(aligned.nodes)
     bare = (distance > _FAR * aligned.radius) & ~np.isin(aligned.branch, list(named))

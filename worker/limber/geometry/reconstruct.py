@@ -10,7 +10,9 @@ from limber.alignment import Alignment
 from limber.constants import STANDARD_GRAVITY, UNIT_METRES
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.cloud.preparation import Prepared, prepare
+from limber.geometry.leafy import leaf_mask, leaf_masses, leaves_text, without_leaves
 from limber.geometry.left_out import (
     leave_out_twigs,
     tell_left_out,
@@ -99,12 +101,17 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     for text in prepared.warnings:
         progress.warn(text)
     found = _skeleton(prepared, settings, own, progress.part(0.02, 0.55))
+    wood, leaves = prepared, []
+    if own is None and settings.leaves == "cut" and not _is_explained(found, settings):
+        wood, leaves = without_leaves(prepared)
+        if leaves:
+            found = _skeleton(wood, settings, own, progress.part(0.3, 0.55))
     whole = found
-    if prepared.view is not None and own is None:
-        found, text = seen_skeleton(found, prepared, settings.silhouette_reach)
+    if wood.view is not None and own is None:
+        found, text = seen_skeleton(found, wood, settings.silhouette_reach)
         if text:
             progress.warn(text)
-    alignment, cloud, found = _aligned(prepared, found, settings)
+    alignment, cloud, found = _aligned(wood, found, settings)
     if keep is not None:
         keep(alignment, found.skeleton)
     if own is None:
@@ -119,7 +126,16 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         cloud = labelled(cloud, found.skeleton)
     meshed = mesh_skeleton(found.skeleton, settings, progress.part(0.55, 0.98))
     gravity = gravity_after(alignment, settings.up)
+    hung: list[dict[str, Any]] = []
+    if leaves:
+        cloud = _with_leaves(prepared, leaves, alignment, found.skeleton)
+        hung = leaf_masses(leaves, cloud.points, found.skeleton, settings.leaf_density)
+        meshed = replace(meshed, masses=[*meshed.masses, *hung])
+        told.append(leaves_text(hung, float(cloud.attributes["leaf"].mean())))
+        progress.warn(told[-1])
     numbers = meshed.numbers | found.report() | {
+        "leaf_count": len(hung), "leaf_mass_kg": sum(leaf["mass_kg"] for leaf in hung),
+        "leaf_area_m2": sum(leaf["area_m2"] for leaf in hung),
         "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,
         "skeleton_warnings": told}
     return Reconstruction(alignment, cloud, meshed, gravity, numbers)
@@ -130,6 +146,27 @@ def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
     node, residual = nearest_cylinders(skeleton, cloud.points)
     return Cloud(cloud.points, cloud.attributes | {
         "skeleton_node": node.astype(np.int32), "residual": residual.astype(np.float32)})
+
+
+def _is_explained(found: SkeletonResult, settings: ReconstructSettings) -> bool:
+    """Whether a scan is taken with its axes as they are."""
+    try:
+        check_explained(found, settings.unexplained)
+    except InputError:
+        return False
+    return True
+
+
+def _with_leaves(prepared: Prepared, leaves: list[Leaf], alignment: Alignment, skeleton: Skeleton,
+                 ) -> Cloud:
+    """The whole aligned scan, with ``leaf`` 1 where its points lie on leaves."""
+    turn = np.array(alignment.rotation)
+    points = alignment.apply((prepared.cloud.points + prepared.origin) / alignment.scale)
+    attributes = dict(prepared.cloud.attributes)
+    if "normal" in attributes:
+        attributes["normal"] = (attributes["normal"] @ turn.T).astype(np.float32)
+    attributes["leaf"] = leaf_mask(leaves, len(points)).astype(np.uint8)
+    return labelled(Cloud(points, attributes), skeleton)
 
 
 def _edited(found: SkeletonResult, edits: Sequence[Edit], progress: Progress) -> SkeletonResult:

@@ -103,8 +103,8 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
 
     groups: ClassVar[Groups] = {
         "input": ("unit", "up", "root", "upright"),
-        "shape": ("twig_radius", "twig_order", "unexplained", "leave_out"),
-        "material": ("young", "poisson", "density"),
+        "shape": ("twig_radius", "twig_order", "leaves", "unexplained", "leave_out"),
+        "material": ("young", "poisson", "density", "leaf_density"),
         "mesh": ("grasp_fraction",),
     }
 
@@ -116,6 +116,9 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     upright: bool = Field(
         False, description="As in the paper, turn the branch so that it grows along z, and gravity "
         "with it; else the scan's own up stays up.")
+    leaves: Literal["cut", "keep"] = Field(
+        "cut", description="cut: of a scan that would be refused (--unexplained), leaves are told "
+        "from stems by their shape and hang on them as mass; keep: all is taken as wood.")
     unexplained: float = Field(
         0.3, ge=0, le=1, description="Refuse a scan of whose points a larger share lies on no "
         "round axis (leaves); 1 takes all.")
@@ -129,6 +132,8 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     young: float = Field(1e8, gt=0, description="Young's modulus to start from [Pa].")
     poisson: float = Field(0.35, ge=0, lt=0.5, description="Poisson's ratio.")
     density: float = Field(900.0, gt=0, description="Density of the living wood [kg/m^3].")
+    leaf_density: float = Field(
+        0.2, ge=0, description="Mass of leaves over their area, one side [kg/m^2].")
     grasp_fraction: float = Field(
         GRASP_FRACTION, gt=0, le=1, description="Where the branch is held, along its main path.")
 

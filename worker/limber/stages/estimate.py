@@ -192,7 +192,11 @@ def _followed(branch: Branch, settings: EstimateSettings) -> str:
 def _cloud(branch: Branch) -> np.ndarray | None:
     from limber.geometry.cloud.files import read_cloud
 
-    return read_cloud(branch.path("cloud.ply")).points if branch.has("cloud.ply") else None
+    if not branch.has("cloud.ply"):
+        return None
+    cloud = read_cloud(branch.path("cloud.ply"))
+    # Leaves say nothing of axes and radii.
+    return cloud.points[cloud.attributes.get("leaf", np.zeros(len(cloud))) == 0]
 
 
 def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: Estimate,

@@ -50,18 +50,22 @@ def load_skeleton(branch: Branch) -> Skeleton:
     return read_swc(branch.require("skeleton.swc", "reconstruct"))
 
 
+def load_masses(branch: Branch) -> list[dict[str, Any]]:
+    """Return what reconstruct found beside the mesh: twigs left out of it, and leaves."""
+    if not branch.has("point_masses.json"):
+        return []
+    return json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
+
+
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
     """Return what hung on the branch when it was scanned, and its mesh leaves out.
 
-    Twigs, as stiff bodies that go with the section they grow from, and targets.
+    Twigs and leaves, as stiff bodies that go with the section they grow from, and targets.
     """
-    twigs: list[dict[str, Any]] = []
-    if branch.has("point_masses.json"):
-        twigs = json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
     return (*(HungTwig(tuple(m.get("centre_m", m["attached_m"])), m["mass_kg"],
                        tuple(m["attached_m"]),
                        tuple(map(tuple, m.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))))
-              for m in twigs), *target_masses(load_targets(branch)))
+              for m in load_masses(branch)), *target_masses(load_targets(branch)))
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -145,6 +146,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
     from limber.geometry.skeleton.files import read_skeleton
+    from limber.stages.loading import load_masses
 
     known = branch.manifest.stages
     made, early = known.get("reconstruct"), known.get("skeleton")
@@ -162,9 +164,11 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     skeleton = edited(found, [edit.aligned(alignment) for edit in edits])
     cloud = read_points(branch.require("cloud.ply", "reconstruct"))
     warnings = list(made.result.get("skeleton_warnings", []))
+    leaves = [mass for mass in load_masses(branch) if mass.get("kind") == "leaf"]
     with branch.stage("reconstruct", settings, digests=digests | edits_digest(edits)) as stage:
         meshed = mesh_skeleton(skeleton, settings, progress.keeping(warnings))
-        write_branch(stage, labelled(cloud, skeleton), meshed)
+        write_branch(stage, labelled(cloud, skeleton),
+                     replace(meshed, masses=[*meshed.masses, *leaves]))
         if edits:
             stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
         else:

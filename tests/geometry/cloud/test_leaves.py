@@ -1,0 +1,80 @@
+"""Leaves are told from stems by shape, cut off, and hang on the stems as mass."""
+
+import json
+
+import numpy as np
+import pytest
+
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.files import read_cloud
+from limber.geometry.cloud.leaves import find_leaves
+from limber.geometry.generated import generate_branch
+from limber.geometry.settings import ReconstructSettings
+from limber.stages.loading import load_point_masses
+from limber.stages.reconstruct import reconstruct
+from limber.stages.skeleton import review_skeleton
+from limber.store import Branch
+
+LONG, WIDE = 0.07, 0.02
+
+
+def _leaf(foot: np.ndarray, way: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A drooping blade, bent along and across, of noisy points 1 mm apart."""
+    way = way / np.linalg.norm(way)
+    across = np.cross(way, [0.0, 0.3, 1.0])
+    across /= np.linalg.norm(across)
+    u, v = rng.uniform(0, 1, 4400), rng.uniform(-1, 1, 4400)
+    inside = np.abs(v) < np.sin(np.pi * u)
+    u, v = u[inside, None], v[inside, None]
+    blade = (foot + LONG * u * way + WIDE * v * across
+             - (0.3 * LONG * u**2 - 0.1 * WIDE * v**2) * np.cross(across, way))
+    return blade + rng.normal(0, 3e-4, blade.shape)
+
+
+@pytest.fixture(scope="module")
+def seedling():
+    """Stems of 2 to 4 mm radius with a leaf at each tip; which points are leaf; area of leaves."""
+    rng = np.random.default_rng(11)
+    branch = generate_branch(31, length=0.3, radius_root=0.004, radius_tip=0.002, bend=0.4,
+                             fork_count=2, noise=3e-4, point_spacing=0.0012, occlusion=0.05)
+    stems = branch.skeleton
+    leaves = [_leaf(stems.nodes[tip], stems.nodes[tip] - stems.nodes[stems.parent[tip]], rng)
+              for tip in stems.tips()]
+    points = np.vstack([branch.cloud.points, *leaves])
+    on_leaf = np.arange(len(points)) >= len(branch.cloud)
+    return branch, points, on_leaf, len(leaves) * LONG * WIDE * 4 / np.pi
+
+
+def test_leaves_are_told_from_stems(seedling) -> None:
+    """Nearly all of the leaves, of the stems little but at their feet; number and area."""
+    branch, points, on_leaf, area = seedling
+    leaves = find_leaves(points)
+    found = np.zeros(len(points), bool)
+    for leaf in leaves:
+        found[leaf.points] = True
+    assert found[on_leaf].mean() > 0.97 and found[~on_leaf].mean() < 0.2
+    assert len(branch.skeleton.tips()) <= len(leaves) <= len(branch.skeleton.tips()) + 2
+    assert sum(leaf.area for leaf in leaves) == pytest.approx(area, rel=0.3)
+
+
+def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> None:
+    """Stems found, none in leaves; leaves weigh on the model, also after edits."""
+    branch, points, on_leaf, area = seedling
+    scan, folder = tmp_path / "scan.ply", tmp_path / "a.branch"
+    Cloud(points).write_ply(scan)
+    result = reconstruct(scan, folder, ReconstructSettings(leave_out=True))
+    assert result["length_m"] == pytest.approx(branch.skeleton.length, rel=0.15)
+    assert any("leaves" in text and "cut off" in text for text in result["warnings"])
+    assert result["leaf_mass_kg"] == pytest.approx(0.2 * area, rel=0.3)
+    opened = Branch.open(folder)
+    cloud = read_cloud(opened.path("cloud.ply"))
+    assert len(cloud) == result["point_count"] > 0.95 * len(points)
+    assert cloud.attributes["leaf"].mean() == pytest.approx(on_leaf.mean(), abs=0.1)
+    hung = sum(mass.mass for mass in load_point_masses(opened))
+    assert hung == pytest.approx(result["leaf_mass_kg"] + result["left_out_mass_kg"])
+    edits = tmp_path / "edits.json"
+    edits.write_text("[]")
+    review_skeleton(folder, edits_path=edits)
+    again = json.loads((folder / "point_masses.json").read_text())
+    assert sum(mass["mass_kg"] for mass in again if mass.get("kind") == "leaf") == (
+        pytest.approx(result["leaf_mass_kg"]))

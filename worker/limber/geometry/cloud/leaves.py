@@ -1,0 +1,115 @@
+"""Leaves told from stems by shape alone: planarity, thickness and curvature at several scales.
+
+Around a point of a leaf the scan is a sheet: wide in two directions, thin in the third. On a stem
+it is so only within a part of the stem's own radius; from there on it is round, or, where one side
+alone was seen, as curved as it is wide, and farther out it is a line. So what is flat and wide
+at one scale, and neither round nor a line at the next ones, is a leaf.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from limber.geometry.cloud.preparation import voxel_thinned
+
+_CELL = 0.25  # of a scale: as finely is the cloud looked at there
+_FINEST = 4.0  # spacings of points
+_STEP = 1.5  # from scale to scale
+_SCALES = 8
+_WIDE = 0.3  # second over first variance, from which a neighbourhood is no line
+_FLAT = 0.06  # third over second, up to which it is flat
+_CURVED = 0.12  # likewise, at the scales after the one where it is wide and flat
+_AFTER = 3  # scales that are looked at after it
+_LEAST = 8  # points of a neighbourhood that tell anything
+_SMALLEST = 40  # points of a leaf
+_PATCH = 0.1  # of the largest leaf's area, up to which a piece is a patch of a stem
+_AGREE = 0.5  # of the neighbours, that make a point one of a leaf
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One leaf, or several that touch.
+
+    Attributes:
+        points: Indices of its points.
+        area: Of its blade [m^2], one side.
+    """
+
+    points: np.ndarray
+    area: float
+
+
+def find_leaves(points: np.ndarray) -> list[Leaf]:
+    """Find the leaves of a scan.
+
+    Args:
+        points: [m], shape [n, 3].
+    """
+    spacing = float(np.median(cKDTree(points).query(points[::max(1, len(points) // 5000)], k=2)[0][
+        :, 1]))
+    on_leaf = _on_sheets(points, spacing)
+    tree = cKDTree(points)
+    near = tree.query(points, k=min(16, len(points)))[1]
+    for _ in range(2):
+        on_leaf = on_leaf[near].mean(axis=1) > _AGREE
+    return _pieces(points, on_leaf, 3 * spacing)
+
+
+def _on_sheets(points: np.ndarray, spacing: float) -> np.ndarray:
+    """Which points lie on a sheet, shape [n]."""
+    wide, flat = [], []
+    for step in range(_SCALES + _AFTER):
+        scale = _FINEST * spacing * _STEP**step
+        chosen = voxel_thinned(points, _CELL * scale)
+        values, count = _variances(points[chosen], scale)
+        nearest = cKDTree(points[chosen]).query(points)[1]
+        told = count >= _LEAST
+        wide.append((told & (values[:, 1] > _WIDE * values[:, 2]))[nearest])
+        flat.append(np.where(told, values[:, 0] / np.maximum(values[:, 1], 1e-300), 1.0)[nearest])
+    wide, flat = np.array(wide), np.array(flat)
+    found = np.zeros(len(points), bool)
+    for step in range(_SCALES):
+        after = flat[step + 1:step + 1 + _AFTER]
+        found |= wide[step] & (flat[step] < _FLAT) & (after < _CURVED).all(axis=0)
+    return found
+
+
+def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Variances of each point's neighbourhood [m^2], smallest first, [n, 3]; and its size [n]."""
+    pairs = cKDTree(points).query_pairs(scale, output_type="ndarray")
+    one, other = np.concatenate([pairs, pairs[:, ::-1]]).T
+    total = len(points)
+    count = 1 + np.bincount(one, minlength=total)
+    way = points[other] - points[one]
+    first = np.stack([np.bincount(one, way[:, k], total) for k in range(3)], axis=1)
+    first /= count[:, None]
+    second = np.empty((total, 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            moment = np.bincount(one, way[:, i] * way[:, j], total) / count
+            second[:, i, j] = second[:, j, i] = moment - first[:, i] * first[:, j]
+    return np.maximum(np.linalg.eigvalsh(second), 0.0), count
+
+
+def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]:
+    """Connected points of leaves, without specks and patches of stems."""
+    own = np.flatnonzero(on_leaf)
+    if len(own) < _SMALLEST:
+        return []
+    tree = cKDTree(points[own])
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (len(own), len(own)))
+    label = connected_components(graph, directed=False)[1]
+    k = min(9, len(own))
+    around = tree.query(points[own], k=k)[0][:, -1]
+    area = np.pi * around**2 / (k - 1)
+    leaves = []
+    for piece in np.flatnonzero(np.bincount(label) >= _SMALLEST):
+        members = np.flatnonzero(label == piece)
+        # The median: at a leaf's edge neighbours are missing on one side.
+        leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
+    largest = max((leaf.area for leaf in leaves), default=0.0)
+    return [leaf for leaf in leaves if leaf.area > _PATCH * largest]
