@@ -128,6 +128,27 @@ def test_from_one_load_to_another_by_commands(rig, tmp_path, capsys):
     assert np.linalg.norm(found - true) < 0.05 * np.linalg.norm(true)
 
 
+def test_a_swing_comes_in_whole_and_estimate_points_on(rig, tmp_path, capsys):
+    """--motion swing keeps all frames, load and mass; dynamic, and `limber estimate`, say where."""
+    write_nominal(tmp_path / "nominal.csv", rig.nominal)
+    times, seen = rig.recording(WEIGHTS[0])
+    write_csv(tmp_path / "swing.csv", times, seen)
+    common = ["import-pull", str(rig.folder), str(tmp_path / "swing.csv"), "--name", "swing",
+              "--weight", str(WEIGHTS[0]), "--own-weight", "--nominal",
+              str(tmp_path / "nominal.csv"), "--grasp-point", *map(str, rig.grasp),
+              "--progress", "none"]
+    assert call([*common, "--motion", "dynamic"]) == 2
+    assert "limber swing" in capsys.readouterr().err
+    assert call([*common, "--motion", "swing"]) == 0
+    pull = read_pull(rig.folder / "pulls" / "swing")
+    assert pull.entry.motion == "swing" and pull.entry.swing.start == "held"
+    assert pull.entry.swing.load_mass_kg == pytest.approx(WEIGHTS[0] / 9.80665, rel=1e-6)
+    assert len(pull.observations.times) == len(times)
+    assert call(["estimate", str(rig.folder), "--pull", "swing", "--progress", "none"]) == 2
+    assert "limber swing" in capsys.readouterr().err
+    assert call(["swing", str(rig.folder), "--pull", "other", "--progress", "none"]) == 2
+
+
 def test_what_a_load_needs(rig, tmp_path):
     """No point, two loads, clouds instead of markers: each is said."""
     times, seen = rig.recording(0.25)

@@ -149,6 +149,10 @@ def require_scale_in_principle(forwards: list[Forward]) -> None:
 
 def _forward(name: str, entry: PullEntry, frames: Frames, rest: np.ndarray, subject: Subject,
              settings: EstimateSettings) -> Forward:
+    if entry.motion == "swing":
+        raise InputError(f"{name} is a swing: nothing led the branch or held it.",
+                         "Its release, load and damping are fitted together, in time.",
+                         f"Use `limber swing --pull {name}`, or name other pulls with --pull.")
     if entry.motion == "dynamic":
         from limber.estimation.forward.dynamic import DynamicForward
 

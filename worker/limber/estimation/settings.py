@@ -70,6 +70,26 @@ class EstimateSettings(Settings):
         "how they differ enters the interval. 0: the radii's deviation alone, the axis as exact.")
 
 
+class SwingSettings(Settings):
+    """How Young's modulus and damping are found from a free swing."""
+
+    groups: ClassVar[Groups] = {
+        "input": ("pull", "periods"),
+        "material": ("poisson", "density", "gravity"),
+        "uncertainty": ("density_sigma",),
+    }
+
+    pull: str | None = Field(None, description="Name of the swing; without it the only one.")
+    periods: float = Field(6.0, ge=2, le=30, description="So many periods after the release.")
+    poisson: float | None = Field(None, ge=0, lt=0.495, description="Poisson's ratio.")
+    density: float | None = Field(None, gt=0, description="Density [kg/m^3].")
+    gravity: bool = Field(
+        True, description="The branch bears its own weight, and was scanned so.")
+    density_sigma: float = Field(
+        0.1, ge=0, description="Relative standard deviation of the density: inertia tells the "
+        "modulus, so it enters as it is.")
+
+
 class VirtualPullSettings(Settings):
     """A simulated pull."""
 

@@ -88,7 +88,8 @@ def settled(seen: Observations, name: str) -> Settled:
         raise InputError(
             f"{name}: the recording ends before the branch is at rest (it still moves by "
             f"{swing * 1e3:.2g} mm).", "A static fit needs the branch at rest under its load.",
-            "Record until it has settled, or import it as a dynamic pull.")
+            "Record until it has settled, or import it with --motion swing and fit the swing "
+            "(`limber swing`).")
     blocks = np.array_split(np.arange(first, len(times)), FRAMES)
     means = np.array([_mean(positions[block]) for block in blocks])
     middle = np.array([times[block].mean() for block in blocks])
@@ -99,6 +100,31 @@ def settled(seen: Observations, name: str) -> Settled:
                     f"displacement over {times[-1] - times[first]:.1f} s. Young's modulus is that "
                     "of this moment.",)
     return Settled(rest, middle, means, noise, moved, float(times[-1] - times[first]), warnings)
+
+
+def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]:
+    """Return the markers in the branch's shape at rest [m], shape [m, 3], and their noise [m].
+
+    Args:
+        start: "held": at rest before it is let go; "loaded": at rest when the swing is over.
+
+    Raises:
+        InputError: no marker stays in view, or a loaded one still swings at the end.
+    """
+    whole = seen.visible.mean(axis=0) > 0.5
+    if not whole.any():
+        raise InputError(f"{name}: no marker stays in view.", "A swing is followed in time.",
+                         "Record again, with the markers towards the cameras.")
+    noise = _noise(seen.positions[:, whole])
+    if start == "held":
+        return _rest(seen.positions, noise), noise
+    last = seen.positions[-max(len(seen.times) // 10, 5):]
+    way = np.nanmax(np.ptp(seen.positions[:, whole], axis=0))
+    if np.nanmax(np.ptp(last[:, whole], axis=0)) > 0.05 * way + 6 * noise:
+        raise InputError(f"{name}: the recording ends while the branch still swings.",
+                         "Where it rests without the load is then not known.",
+                         "Record until it has settled.")
+    return _mean(last), noise
 
 
 def _noise(positions: np.ndarray) -> float:

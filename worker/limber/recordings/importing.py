@@ -17,7 +17,7 @@ from limber.recordings.calibration import WITHOUT_GRIPPER
 from limber.recordings.checks import clean
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
 from limber.recordings.frames import copy_clouds, copy_rgbd
-from limber.recordings.hung_load import settled
+from limber.recordings.hung_load import settled, swung
 from limber.recordings.recording import (
     POSE_COLUMNS,
     WRENCH_COLUMNS,
@@ -26,6 +26,7 @@ from limber.recordings.recording import (
     Pull,
     PullEntry,
     SensorEntry,
+    SwingEntry,
     read_pull,
     write_entry,
     write_pull,
@@ -199,9 +200,16 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     if settings.grasp_point is None:
         raise InputError("A load was given, but not where it hangs.",
                          "How far it bends the branch depends on that.", "Give --grasp-point.")
+    if settings.motion == "dynamic":
+        raise InputError("A steady load was given for a dynamic pull.",
+                         "It shows a branch that is let go and swings, or that rests.",
+                         "Give --motion swing and run `limber swing`; or leave --motion out, for "
+                         "the place of rest.")
     seen, labels = _markers(kind, source, settings)
     for message in seen.warnings:
         progress.warn(message)
+    if settings.motion == "swing":
+        return _import_swing(seen, labels, source, folder, name, settings, branch, progress)
     still = settled(Observations(seen.times, seen.values.reshape(len(seen), -1, 3)), name)
     placed = _registered(still.rest, labels, name, settings, branch)
     used = placed.used if placed else np.flatnonzero(np.isfinite(still.rest).all(axis=1))
@@ -229,6 +237,40 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
             "labels": [labels[k] for k in used], "load_n": load.tolist(),
             "displacement_m": moved.tolist(), "settled_s": still.duration,
             "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
+
+
+def _import_swing(stream: Stream, labels: list[str], source: Path, folder: Path, name: str,
+                  settings: ImportSettings, branch: BranchFrame, progress: Progress,
+                  ) -> dict[str, Any]:
+    """A branch that is let go: all frames, the load, and what swings with it."""
+    seen = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
+    rest, noise = swung(seen, settings.swing_start, name)
+    placed = _registered(rest, labels, name, settings, branch)
+    used = placed.used if placed else np.flatnonzero(np.isfinite(rest).all(axis=1))
+    rest, positions = rest[used], seen.positions[:, used]
+    if placed:
+        rest, positions = placed.apply(rest), placed.apply(positions)
+    for message in placed.warnings if placed else ():
+        progress.warn(message)
+    _require_near(rest, name, branch.nodes)
+    load = _load(settings, branch)
+    hung = settings.weight is not None and settings.swing_start == "held"
+    mass = settings.weight / float(np.linalg.norm(branch.gravity)) if hung else 0.0
+    entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
+                   grasp=_place(settings.grasp_point, settings, branch),
+                   sigma=settings.position_sigma or noise)
+    entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER, "swing": SwingEntry(
+        start=settings.swing_start, load_mass_kg=mass, noise_m=noise,
+        registration_m=placed.rms if placed else None)})
+    _require_on_branch(entry.grasp, name, branch.nodes)
+    poses = np.zeros((2, 6))
+    poses[:, :3] = entry.grasp.point_m
+    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
+    write_pull(folder, Pull(name, entry, seen.times[[0, -1]], poses, wrenches,
+                            Observations(seen.times, positions)))
+    return {"frame_count": len(seen.times), "point_count": len(used), "time_offset_s": 0.0,
+            "labels": [labels[k] for k in used], "load_n": load.tolist(), "load_mass_kg": mass,
+            "registration_rms_m": placed.rms if placed else None}
 
 
 def _require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) -> None:

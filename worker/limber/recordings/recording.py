@@ -47,6 +47,20 @@ class SensorEntry(BaseModel):
     tared: bool = True
 
 
+class SwingEntry(BaseModel):
+    """How a branch that swings was let go; its load is the force in ``robot.csv``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    start: Literal["held", "loaded"] = Field(
+        "held", description="held: in its shape at rest, until its weight and the load act; "
+        "loaded: bent by the load, until that is gone.")
+    load_mass_kg: float = Field(0.0, ge=0, description="Mass that swings with the branch.")
+    noise_m: float = Field(gt=0, description="Of one reading of a marker.")
+    registration_m: float | None = Field(
+        None, gt=0, description="RMS distance of the markers from their places on the branch.")
+
+
 class PullEntry(BaseModel):
     """Content of ``pull.toml``."""
 
@@ -55,7 +69,8 @@ class PullEntry(BaseModel):
     format_version: Literal[1] = 1
     observation: Literal["markers", "clouds", "depth", "none"] = "markers"
     drive: Literal["pose", "force"] = "pose"
-    motion: Literal["quasi_static", "dynamic"] = "quasi_static"
+    motion: Literal["quasi_static", "dynamic", "swing"] = "quasi_static"
+    swing: SwingEntry | None = Field(None, description="Of motion \"swing\".")
     gravity_m_s2: Vector | None = Field(
         None, description="Gravity that bends the branch out of its rest shape; absent where the "
         "scanned shape already carries it.")

@@ -17,7 +17,7 @@ class ImportSettings(Settings):
             "time_offset", "yolo_weights", "yolo_prompt", "yolo_class"),
         "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "weight", "load",
             "own_weight"),
-        "simulation": ("drive", "motion"),
+        "simulation": ("drive", "motion", "swing_start"),
         "noise": ("position_sigma", "force_sigma", "torque_sigma"),
     }
     experts = ("yolo_weights", "yolo_prompt", "yolo_class", "torque_sigma")
@@ -53,8 +53,12 @@ class ImportSettings(Settings):
         "or scanned lying): it acts as well.")
     drive: Literal["pose", "force"] = Field(
         "pose", description="What drives the simulation; the other is compared with it.")
-    motion: Literal["quasi_static", "dynamic"] = Field(
-        "quasi_static", description="dynamic where inertia matters.")
+    motion: Literal["quasi_static", "dynamic", "swing"] = Field(
+        "quasi_static", description="dynamic where inertia matters; swing: let go without a robot "
+        "(with --weight or --load), for `limber swing`.")
+    swing_start: Literal["held", "loaded"] = Field(
+        "held", description="A swing starts held in the shape at rest, until weight and load act; "
+        "or loaded: bent by the load until that is gone.")
     time_offset: float | None = Field(
         None, description="Added to SOURCE's time stamps [s]; without it, it is estimated.")
     position_sigma: float | None = Field(

@@ -1,0 +1,91 @@
+"""A branch that is let go: Young's modulus and damping of virtual swings on another mesh."""
+
+import numpy as np
+import pytest
+from tests.subjects.meshes import box_mesh
+
+from limber.errors import InputError
+from limber.estimation.swing import SwingSeen, first_guess, fit_swing
+from limber.mechanics import (
+    BranchModel,
+    EnergyMomentumSettings,
+    Grasp,
+    PointMass,
+    RayleighDamping,
+    simulate_dynamics,
+    solve_static,
+)
+from limber.mechanics.points import point_operator
+
+SIZE, YOUNG, DENSITY, DAMPING = (0.02, 0.02, 0.2), 3.2e6, 1000.0, RayleighDamping(1.5, 0.0012)
+GRAVITY = (-9.81, 0.0, 0.0)
+MARKERS = np.array([[0.0, 0.013, 0.196], [0.012, 0.0, 0.15], [0.0, -0.013, 0.1]])
+LOAD = 0.15
+
+
+def beam(cells):
+    mesh = box_mesh(SIZE, cells)
+    end = Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > 0.2 - 1e-9), "pinned")
+    return mesh, end
+
+
+def virtual_swing(start, seed=0):
+    """Markers of a true beam at 100 Hz: still, then let go after 0.2 s; noise 20 um."""
+    mesh, end = beam((2, 2, 14))
+    gravity = GRAVITY if start == "held" else None
+    model = BranchModel(mesh, young=YOUNG, poisson=0.4, density=DENSITY, gravity=gravity,
+                        damping=DAMPING)
+    operator = point_operator(mesh, MARKERS)
+    times, release, fine = np.arange(110) / 100.0, 0.2034, 0.002
+    if start == "held":
+        model = model.with_point_masses([
+            PointMass(tuple(mesh.nodes[node]), LOAD / 9.81 / len(end.nodes)) for node in end.nodes])
+        begin = "rest"
+    else:
+        begin = solve_static(model, grasp=end, grasp_force=[-2 * LOAD, 0, 0]).require()
+    run = simulate_dynamics(model, times=fine * np.arange(460), start=begin,
+                            settings=EnergyMomentumSettings(max_step=fine))
+    track = (operator @ run.require().displacement.reshape(len(run.times), -1).T).T.reshape(
+        -1, 3, 3)
+    since = np.clip(times - release, 0, None)
+    moved = np.stack([np.interp(since, run.times, column) for column in
+                      track.reshape(len(track), -1).T], axis=1).reshape(-1, 3, 3)
+    moved = moved + 2e-5 * np.random.default_rng(seed).standard_normal(moved.shape)
+    load = np.array([-LOAD if start == "held" else -2 * LOAD, 0.0, 0.0])
+    return SwingSeen(times, moved, MARKERS, start, load,
+                     LOAD / 9.81 if start == "held" else 0.0, 2e-5, 2e-4)
+
+
+@pytest.mark.parametrize("start", ["held", "loaded"])
+def test_a_virtual_swing_gives_modulus_damping_and_release(start):
+    """From twice too stiff: E within 3 %, covered; damping ratio within 5 %; release to 2 ms."""
+    mesh, end = beam((1, 1, 10))
+    model = BranchModel(mesh, young=2 * YOUNG, poisson=0.4, density=DENSITY,
+                        gravity=GRAVITY if start == "held" else None)
+    seen = virtual_swing(start)
+    found = fit_swing(model, end, seen, periods=2.5, density_sigma=0.02)
+    young = 2 * YOUNG * found.factor
+    low, high = 2 * YOUNG * found.factor_interval
+    assert found.converged
+    assert young == pytest.approx(YOUNG, rel=0.03) and low < YOUNG < high
+    assert high / low < 1.2
+    assert found.release == pytest.approx(0.2034, abs=2e-3)
+    omega = 2 * np.pi * found.frequency
+    ratio = DAMPING.mass / (2 * omega) + DAMPING.stiffness * omega / 2
+    assert found.damping_ratio == pytest.approx(ratio, rel=0.05)
+    within = found.damping_ratio_interval
+    assert within[0] < ratio < within[1]
+    assert found.relative_residual < 0.02
+
+
+def test_what_is_no_swing_is_refused():
+    """Nothing moves, or it creeps to its place without swinging: it says so."""
+    times = np.arange(100) / 100.0
+    still = np.zeros((100, 3, 3)) + 1e-6 * np.random.default_rng(0).standard_normal((100, 3, 3))
+    seen = SwingSeen(times, still, MARKERS, "held", np.zeros(3), 0.0, 1e-5)
+    with pytest.raises(InputError, match="Nothing swings"):
+        first_guess(seen)
+    creep = still.copy()
+    creep[:, 0, 0] -= 0.01 * (1 - np.exp(-5 * times))
+    with pytest.raises(InputError, match="to and fro"):
+        first_guess(SwingSeen(times, creep, MARKERS, "held", np.zeros(3), 0.0, 1e-5))
