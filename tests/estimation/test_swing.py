@@ -56,6 +56,7 @@ def virtual_swing(start, seed=0):
                      LOAD / 9.81 if start == "held" else 0.0, 2e-5, 2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["held", "loaded"])
 def test_a_virtual_swing_gives_modulus_damping_and_release(start):
     """From twice too stiff: E within 3 %, covered; damping ratio within 5 %; release to 2 ms."""

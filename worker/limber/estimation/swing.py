@@ -128,7 +128,8 @@ def fit_swing(model: BranchModel, grasp: Grasp, seen: SwingSeen, *, periods: flo
     for number, share in enumerate((_FIRST_PERIODS, periods)):
         progress(number / 2, "fitting the swing", periods=share)
         found = swing.fitted(released, share * period, found)
-    return swing.judged(found)
+    # Once more, what is known beforehand weighed against what the model really leaves over.
+    return swing.judged(swing.fitted(released, periods * period, found))
 
 
 def first_guess(seen: SwingSeen) -> tuple[float, float]:
@@ -305,7 +306,8 @@ class _Swing:
         if start is None:
             free[1], free[2:4] = released, np.log(self.ratio0)
         known = np.isfinite(seen.moved[chosen])
-        sigma = max(seen.noise, 1e-3 * float(np.nanmax(np.abs(seen.moved))))
+        sigma = (max(seen.noise, 1e-3 * float(np.nanmax(np.abs(seen.moved)))) if start is None
+                 else self.left_over(start)[2])
         priors = np.r_[np.inf, np.inf, np.inf, np.inf, self.density_sigma,
                        np.full(count - 5, self.gain_sigma)]
 
@@ -326,15 +328,20 @@ class _Swing:
                               loss="linear", max_nfev=25)
         return _Found(found.x, chosen, duration, found.success, known, sigma, priors)
 
+    def left_over(self, found: "_Found") -> tuple[float, float, float]:
+        """Return the residual's RMS [m], how many readings count as one, and the deviation [m]
+        that each reading has if they are to count as independent."""
+        model, _ = self.rows(found.free, found.chosen, found.duration + self.period)
+        left = np.where(found.known, model - self.seen.moved[found.chosen], np.nan)
+        rms, stretch = float(np.sqrt(np.nanmean(left**2))), _correlated(left)
+        return rms, stretch, max(rms, self.seen.noise) * float(np.sqrt(stretch))
+
     def judged(self, found: "_Found") -> SwingFit:
         """Return the fit with the intervals that what is left over allows."""
         seen, free = self.seen, found.free
         model, slopes = self.rows(free, found.chosen, found.duration + self.period)
-        left = np.where(found.known, model - seen.moved[found.chosen], np.nan)
         columns = slopes[found.known]
-        rms = float(np.sqrt(np.nanmean(left**2)))
-        stretch = _correlated(left)
-        sigma = np.sqrt(max(rms, seen.noise) ** 2 * stretch)
+        rms, stretch, sigma = self.left_over(found)
         information = columns.T @ columns / sigma**2 + np.diag(1 / found.priors**2)
         # Alpha and beta cannot both be told from one vibration: what is open stays wide.
         information[[2, 3], [2, 3]] += 1 / np.log(_DAMPING_BOUNDS[1] / _DAMPING_BOUNDS[0]) ** 2
