@@ -286,7 +286,7 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
-                       progress=progress)
+                       camera=prepared.view is not None, progress=progress)
 
 
 def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,

@@ -113,7 +113,7 @@ class SkeletonResult:
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 root: np.ndarray | None = None, up: np.ndarray | None = None,
-               progress: Progress = SILENT) -> SkeletonResult:
+                camera: bool = False, progress: Progress = SILENT) -> SkeletonResult:
     """Find the rooted skeleton of a cloud.
 
     Args:
@@ -121,6 +121,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
         settings: How.
         root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
         up: Which way is up, shape [3]; None: z.
+        camera: The points are a depth camera's, and scatter along its sight alone.
         progress: Called as it goes.
 
     Raises:
@@ -152,7 +153,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     if (graph.owner < 0).any():
         # What was left away must not draw the rest towards it.
         some = some[graph.owner[cKDTree(points[thin]).query(some)[1]] >= 0]
-    fitted, more = _fit(first, some, settings, diagonal, progress.part(0.65, 0.95))
+    fitted, more = _fit(first, some, settings, diagonal, camera, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
     leafy = float(np.mean(residual > fitted.skeleton.radius[segment])) > LEAF_SHARE
@@ -267,23 +268,25 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
 
 
 def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
-         progress: Progress):
+         camera: bool, progress: Progress):
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
     skeleton = resampled(skeleton, 1.5)
-    fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.0, 0.5))
+    fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
+                   progress=progress.part(0.0, 0.5))
     skeleton = _with_full_tips(_without_bare_ends(attached(fit.skeleton), points), points, fit)
     # Noise makes a carrier look thicker, and its outliers look like twigs.
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
     skeleton, strands = _without_strands(skeleton.subset(keep))
     skeleton = resampled(limited(skeleton, low, high), 1.0)
-    fit = fit_axes(skeleton, points, uncertainty=False, progress=progress.part(0.5, 0.8))
+    fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
+                   progress=progress.part(0.5, 0.8))
     skeleton, late = _without_strands(fit.skeleton)
     # Noise leaves little information a round.
     noisy = fit.noise > _NOISY * float(np.median(skeleton.radius))
     rounds = 18 if noisy else 6 if late else 0
     fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late,
-                   progress=progress.part(0.8, 1.0))
+                   along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
     return replace(fit, skeleton=assessed(tapered(limited(fit.skeleton, low, high)), points,
                                           fit.noise)), pruned

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from limber.geometry.skeleton.radii.fit_kernels import nearest_of, normal_blocks
 from limber.geometry.skeleton.radii.noisy_rings import (
+    SCATTERED_ALONG_SIGHT,
     SeenSides,
     mean_places,
     seen_sides,
@@ -55,7 +56,8 @@ class AxisFit:
 
 
 def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
-             settled: bool = False, uncertainty: bool = True, progress: Progress = SILENT,
+             settled: bool = False, along_sight: bool = False, uncertainty: bool = True,
+             progress: Progress = SILENT,
              ) -> AxisFit:
     """Fit axes and radii of a skeleton's runs to points.
 
@@ -64,6 +66,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         points: Scanned points [m], shape [m, 3].
         rounds: Gauss-Newton rounds; points choose their cylinder anew in each.
         settled: The axes are where they belong: what is left to find is fine.
+        along_sight: The points are a depth camera's: they scatter along its sight alone.
         uncertainty: Find each radius's standard deviation too; without, it and the states stay
             as they were.
         progress: Called each round.
@@ -72,6 +75,8 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     spread = 0.35 * float(np.median(radius))
     floor = 0.05 * float(np.median(radius))
     near, found_at = None, nodes
+    # Once a fit is too thin, scatter along the sight no longer shows as such: what is known counts.
+    known = SCATTERED_ALONG_SIGHT if along_sight else None
     for number in range(rounds):
         # The cylinders around a point are looked up anew once axes have moved.
         moved = np.linalg.norm(nodes - found_at, axis=1)
@@ -86,7 +91,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         trusted = noise if settled or number > rounds // 2 else 0.0
         place = match.normal
         if trusted:
-            place, _ = _places(skeleton.parent, nodes, match, weight, noise)
+            place, _ = _places(skeleton.parent, nodes, match, weight, noise, known)
         system = _system(skeleton, nodes, radius, match, weight, trusted, place)
         step = system.solve()
         limit = 0.5 * radius
@@ -104,7 +109,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     if uncertainty:
         weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
         sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
-        _, seen = _places(skeleton.parent, nodes, match, weight, noise)
+        _, seen = _places(skeleton.parent, nodes, match, weight, noise, known)
         sigma = np.hypot(sigma, side_doubt(seen, radius, noise))
         state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     fitted = replace(skeleton, nodes=nodes, radius=np.maximum(radius, 0.1 * floor),
@@ -118,14 +123,14 @@ def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
 
 
 def _places(parent: np.ndarray, nodes: np.ndarray, match: "_Match", weight: np.ndarray,
-            noise: float) -> tuple[np.ndarray, SeenSides]:
+            noise: float, known: SeenSides | None) -> tuple[np.ndarray, SeenSides]:
     """Mean direction to where on its cylinder each point comes from, shape [m, 3]; what was seen.
     """
     axis = nodes[match.segment] - nodes[parent[match.segment]]
     axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
     sharpness = match.thick * (match.residual + match.thick) / max(noise, 1e-12)**2
     stout = (match.thick / max(noise, 1e-12))**2
-    seen = seen_sides(match.normal, axis, match.residual, sharpness, stout, weight)
+    seen = known or seen_sides(match.normal, axis, match.residual, sharpness, stout, weight)
     return mean_places(match.normal, axis, sharpness, stout, seen), seen
 
 

@@ -51,6 +51,9 @@ class SeenSides:
     share: np.ndarray
     along_sight: bool = False
 
+SCATTERED_ALONG_SIGHT = SeenSides(np.array([0.0, 0.0, 1.0]), np.ones(_PLACES), along_sight=True)
+"""What a depth camera is known to have seen; from where does not matter to places then."""
+
 
 def seen_sides(out: np.ndarray, axis: np.ndarray, residual: np.ndarray, sharpness: np.ndarray,
                stout: np.ndarray, weight: np.ndarray) -> SeenSides:
