@@ -6,6 +6,8 @@ import pytest
 from limber.errors import InputError
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.skeleton.files import read_cylinders, read_swc, write_cylinders
+from limber.geometry.skeleton.radii.axis_fit import attached
+from limber.geometry.skeleton.skeleton import Skeleton
 
 
 def test_runs_orders_and_main_path(y_skeleton):
@@ -57,3 +59,21 @@ def test_broken_skeleton_files_are_named(tmp_path, lines, complaint):
     path.write_text(lines)
     with pytest.raises(InputError, match=complaint):
         read_swc(path)
+
+
+def test_a_twig_that_hangs_on_a_long_way_across_is_led_back_along_its_own_axis() -> None:
+    """Where the scan lacks a twig's base, it does not start at a right angle far from its fork."""
+    way = np.array([0.5, 0.0, np.sqrt(0.75)])
+    carrier = np.stack([np.zeros(80), np.zeros(80), 0.005 * np.arange(80)], axis=1)
+    begin = np.array([0.0, 0.0, 0.1]) + 0.07 * way
+    across = np.stack([np.arange(1, 7) * begin[0] / 7, np.zeros(6), np.full(6, begin[2])], axis=1)
+    own = begin + 0.005 * np.arange(30)[:, None] * way
+    hangs = int(np.argmin(np.abs(carrier[:, 2] - begin[2])))
+    parent = np.concatenate([np.arange(80) - 1, [hangs], 80 + np.arange(35)])
+    skeleton = Skeleton.from_edges(np.vstack([carrier, across, own]), parent,
+                                   np.concatenate([np.full(80, 0.007), np.full(36, 0.003)]))
+    mended = attached(skeleton)
+    fork = mended.nodes[mended.forks()]
+    assert len(fork) == 1 and abs(fork[0, 2] - 0.1) < 0.01
+    first = mended.nodes[mended.runs()[1][1]] - fork[0]
+    assert first @ way > np.cos(np.deg2rad(15)) * np.linalg.norm(first)

@@ -34,6 +34,8 @@ _PROBE = 128  # nodes between two whose radii are taken as independent of each o
 _TUKEY = 4.685  # 95 % efficiency for normal noise
 _HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and that tell where
 _KINK = np.deg2rad(50.0)
+# A twig's start may be as long as so many radii of its carrier, and end in such a kink.
+_HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
 _ENOUGH = 200  # points that tell the noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
@@ -211,16 +213,34 @@ def attached(skeleton: Skeleton) -> Skeleton:
 
 
 def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
-    """The place in a twig from which it goes the way that it goes on: its start may be a hook."""
+    """The place in a twig from which it goes the way that it goes on: its start may be a hook.
+
+    Where the scan lacks a twig's base, it hangs on its carrier by a short way across, and kinks
+    where its own axis begins.
+    """
     nodes = skeleton.nodes
     last = min(first + _HOOK, len(members) - _AHEAD)
+    start = max(first, last)
     for place in range(first, last):
         step = nodes[members[place + 1]] - nodes[members[place]]
         ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place + 1]]
         size = np.linalg.norm(step) * np.linalg.norm(ahead)
         if size > 0 and step @ ahead > np.cos(_KINK) * size:
-            return place
-    return max(first, last)
+            start = place
+            break
+    reach = _HOOK_REACH * skeleton.radius[skeleton.parent[members[0]]]
+    length = 0.0
+    for place in range(start + 1, len(members) - _AHEAD):
+        step = nodes[members[place]] - nodes[members[place - 1]]
+        length += float(np.linalg.norm(step))
+        if length > reach:
+            break
+        before = nodes[members[place]] - nodes[members[max(place - _BESIDE, start)]]
+        ahead = nodes[members[place + _AHEAD - 1]] - nodes[members[place]]
+        size = np.linalg.norm(before) * np.linalg.norm(ahead)
+        if size > 0 and before @ ahead < np.cos(_SHARP_KINK) * size:
+            start = place
+    return start
 
 
 def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
