@@ -181,8 +181,8 @@ def _not_identified(rig: Rig) -> tuple[int, str]:
 
 
 def _at_a_bound(rig: Rig) -> tuple[int, str]:
-    """A weight in the wrong unit: the modulus that it asks for is none."""
-    code, told = _imported(rig, weight=4e-7, own_weight=False)
+    """A weight in the wrong unit: no modulus is as large as it asks for."""
+    code, told = _imported(rig, weight=4e6, own_weight=False)
     if code:
         return code, told
     code, told = _called("estimate", rig.branch, "--pull", "hung", "--fractions", 0.5, "--force")

@@ -16,7 +16,7 @@ from benchmarks import truth_branch
 from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.table import Row
 from benchmarks.truth_branch import drawn_cell, recorded
-from limber.errors import LimberError
+from limber.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
 from limber.estimation.virtual_pull import simulate_pull
 from limber.geometry.generated import generate_branch
@@ -112,6 +112,9 @@ def scan_trial(seed: tuple[int, ...], view: str, source: str = "") -> ScanTrial:
     with tempfile.TemporaryDirectory() as temporary:
         try:
             found = _estimated(Path(temporary), made, rng)
+        except Cancelled:
+            # Stopped from outside: no trial.
+            raise
         except LimberError as error:
             refusal = str(error)
     seconds = round(time.perf_counter() - started, 1)

@@ -22,7 +22,7 @@ from benchmarks.truth_branch import (
     exact_pull,
     recorded,
 )
-from limber.errors import LimberError
+from limber.errors import Cancelled, LimberError
 from limber.estimation.doubt.causes import variance_parts
 from limber.estimation.doubt.model_error import total_interval
 from limber.estimation.field_form import open_field
@@ -86,6 +86,9 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
     subject = fitting_subject(truth)
     try:
         found = _estimated(pulls, subject, settings)
+    except Cancelled:
+        # Stopped from outside: no trial.
+        raise
     except LimberError as error:
         return Trial(seed, truth.form, seconds=time.perf_counter() - started, message=str(error),
                      source=source)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import Cancelled, WorkError
+from limber.errors import Cancelled, InputError, WorkError
 from limber.estimation.doubt.causes import largest, variance_parts
 from limber.estimation.doubt.identifiability import (
     SCALE_DEVIATION,
@@ -183,7 +183,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         failure = error
     try:
         found = fitted(subject.without_weight())
-    except WorkError:
+    except (WorkError, InputError):
         if heavy is None:
             raise
         return heavy
