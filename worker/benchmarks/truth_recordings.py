@@ -180,7 +180,7 @@ def _not_identified(rig: Rig) -> tuple[int, str]:
     return (code, told) if code else _called("estimate", rig.branch, "--pull", "slow", "--force")
 
 
-def _at_a_bound(rig: Rig) -> tuple[int, str]:
+def _in_another_unit(rig: Rig) -> tuple[int, str]:
     """A weight in the wrong unit: no modulus is as large as it asks for."""
     code, told = _imported(rig, weight=4e6, own_weight=False)
     if code:
@@ -200,6 +200,6 @@ CASES: tuple[tuple[str, tuple[str, ...], Callable[[Rig], tuple[int, str]]], ...]
     ("a swing that has not ended", ("at rest",), _swinging),
     ("no load shows", ("no load shows",), _nothing_moves),
     ("nothing that gives the scale", ("soft or stiff",), _not_identified),
-    ("a modulus at its bound", ("no estimate", "bound"), _at_a_bound),
+    ("a load in another unit", ("another unit",), _in_another_unit),
 )
 """What is wrong, words that the message has, and how it is made."""
