@@ -234,7 +234,7 @@ def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
     shown.objects["robot"] = []
     for number in range(links.shape[1] - 1):
         ends = links[:, number], links[:, number + 1]
-        length = float(np.linalg.norm(ends[1][0] - ends[0][0]))
+        length = math.dist(ends[0][0], ends[1][0])
         if length < radius / 4:
             # Two joints whose axes meet: there is no link to be seen.
             continue

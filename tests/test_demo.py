@@ -12,6 +12,7 @@ def stages(monkeypatch):
     """Stages that do nothing: their arguments by name; `fail` names one that finds no way."""
     seen: dict[str, list[str]] = {"fail": []}
     results = {"estimate": {"young_pa": [1e9], "young_interval_pa": [[9e8, 1.1e9]]},
+               "virtual-pull": {"young_true_pa": [1e9]},
                "plan": {"baseline": {}, "plan": {}, "energy_saved_percent": 1.0,
                         "length_added_percent": 2.0}}
 

@@ -109,7 +109,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
     ("material", ["limber.color_by", "limber.simulate"]),
     ("pulls", ["limber.import_pull", "limber.virtual_pull"]),
-    ("estimate", ["limber.estimate", "limber.predict"]),
+    ("estimate", ["limber.estimate", "limber.swing", "limber.predict"]),
     ("goal", ["limber.energy", "limber.target"]), ("plan", ["limber.plan"]),
     ("robot", ["limber.execute"]), ("report", ["limber.report", "limber.open_report"])])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, operators):
