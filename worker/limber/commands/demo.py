@@ -117,8 +117,8 @@ def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None,
         demo.stage("Young's modulus from the pull", "estimate", branch)
         demo.stage("a pull with the estimated modulus", "simulate", branch)
         demo.stage("energy over grasp poses", "energy", branch, "--seed", seed)
-        demo.stage("RRT* and D-RRT* paths", "plan", branch, "--name", "to-goal", "--seed", seed,
-                   *goal)
+        demo.stage("the gentlest path and the shortest", "plan", branch, "--name", "to-goal",
+                   "--seed", seed, *goal)
     except Cancelled:
         raise
     except LimberError as error:

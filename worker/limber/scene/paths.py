@@ -30,7 +30,8 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
         plan = max(plans, key=lambda name: branch.manifest.stages[f"plan:{name}"].finished)
     summary = json.loads(branch.require(f"plans/{plan}.json", f"plan --name {plan}").read_text(
         encoding="utf-8"))
-    for key, name, title in (("plan", plan, "D-RRT*"), ("baseline", f"{plan}-baseline", "RRT*")):
+    planned = "gentle" if summary.get("planner") == "eikonal" else "D-RRT*"
+    for key, name, title in (("plan", plan, planned), ("baseline", f"{plan}-baseline", "RRT*")):
         if not branch.has(f"plans/{name}.csv"):
             continue
         _add_path(data, key, _table(branch.path(f"plans/{name}.csv")))
@@ -41,6 +42,9 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
         data.info["notes"].append(f"energy {-saved:+.0f} %, length {added:+.0f} % against RRT*")
+    gap = (summary.get("certificate") or {}).get("gap_percent")
+    if gap is not None:
+        data.info["notes"].append(f"cost at most {gap:.1f} % above the least possible")
     return plan
 
 
