@@ -36,15 +36,15 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
             continue
         _add_path(data, key, _table(branch.path(f"plans/{name}.csv")))
         data.info["paths"][key] = {"title": title, "note": _path_note(summary.get(key) or {})}
+    gap = (summary.get("certificate") or {}).get("gap_percent")
+    if gap is not None and "plan" in data.info["paths"]:
+        data.info["paths"]["plan"]["note"] += f", {gap:.1f} % off the least cost at most"
     _add_energy_scale(data)
     data.info["plan"] = plan
     data.info["goal"] = _goal(summary.get("goal") or {}, data.arrays.get("path:plan"))
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
         data.info["notes"].append(f"energy {-saved:+.0f} %, length {added:+.0f} % against RRT*")
-    gap = (summary.get("certificate") or {}).get("gap_percent")
-    if gap is not None:
-        data.info["notes"].append(f"cost at most {gap:.1f} % above the least possible")
     return plan
 
 
