@@ -82,3 +82,15 @@ def test_a_mesh_follows_its_skeleton():
     assert found.nodes[found.tets[:, 4]] == pytest.approx(
         found.nodes[found.tets[:, :2]].mean(axis=1))
     assert reshaped(mesh, tube, tube).nodes == pytest.approx(mesh.nodes, abs=1e-12)
+
+
+def test_a_mesh_that_would_turn_inside_out_goes_less_far():
+    """Neighbouring sections pushed through each other: every tetrahedron keeps its side."""
+    tube = _tube()
+    mesh = mesh_branch(tube, MeshSettings(mesher="sweep", mesh_sides=8, mesh_spacing=1.3)).mesh
+    nodes = tube.nodes.copy()
+    nodes[24:26, 2] += np.array([0.03, -0.03])
+    moved = reshaped(mesh, tube, replace(tube, nodes=nodes))
+    assert moved.volumes.min() > 0
+    far = np.abs(mesh.nodes[:, 2] - 0.196) > 0.05
+    assert moved.nodes[far] == pytest.approx(mesh.nodes[far], abs=1e-12)

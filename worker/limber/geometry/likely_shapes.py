@@ -18,6 +18,8 @@ from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 POINT_LIMIT = 60_000
 """As many points as the fit itself looks at: more share their errors."""
 _LEAST, _MOST = 0.5, 2.0
+_LEAST_VOLUME = 0.1  # of a tetrahedron's own, below which its corners go half as far
+_HALVINGS = 30
 
 
 def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
@@ -54,7 +56,9 @@ def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
 def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
     """Return a skeleton's mesh moved to another skeleton of the same tree.
 
-    Nodes go with the axis, and away from it as the radius grows; edges stay straight.
+    Nodes go with the axis, and away from it as the radius grows; edges stay straight. Where a
+    tetrahedron would turn inside out or nearly vanish (twigs that the scan leaves wide open, side
+    by side at a fork), its corners go a shorter way.
     """
     low, high, share, offset = on_cylinders(skeleton, mesh.nodes)
     moves, growth = other.nodes - skeleton.nodes, other.radius / skeleton.radius - 1
@@ -63,8 +67,16 @@ def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
         weight = share.reshape(-1, *[1] * (values.ndim - 1))
         return (1 - weight) * values[low] + weight * values[high]
 
-    nodes = mesh.nodes + between(moves) + between(growth)[:, None] * offset
+    way = between(moves) + between(growth)[:, None] * offset
+    corners = mesh.tets[:, :4]
+    going = np.ones(len(way))
+    for _ in range(_HALVINGS):
+        nodes = mesh.nodes + going[:, None] * way
+        narrow = replace(mesh, nodes=nodes).volumes < _LEAST_VOLUME * mesh.volumes
+        if not narrow.any():
+            break
+        going[np.unique(corners[narrow])] *= 0.5
     if mesh.is_quadratic:
-        corners = mesh.tets[:, :4][:, EDGES]
-        nodes[mesh.tets[:, 4:]] = nodes[corners].mean(axis=2)
+        nodes[mesh.tets[:, 4:]] = nodes[corners[:, EDGES]].mean(axis=2)
     return replace(mesh, nodes=nodes)
+
