@@ -224,12 +224,7 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
                    grasp=_place(settings.grasp_point, settings, branch), sigma=sigma)
     entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER})
-    _require_on_branch(entry.grasp, name, branch.nodes)
-    poses = np.zeros((2, 6))
-    poses[:, :3] = entry.grasp.point_m
-    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
-    write_pull(folder, Pull(name, entry, still.times[[0, -1]], poses, wrenches,
-                            Observations(still.times, positions)))
+    _write_loaded(folder, name, entry, load, Observations(still.times, positions), branch)
     moved = positions[-1] - rest
     if suspicion := _against(moved, load):
         progress.warn(f"{name}: {suspicion}")
@@ -237,6 +232,16 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
             "labels": [labels[k] for k in used], "load_n": load.tolist(),
             "displacement_m": moved.tolist(), "settled_s": still.duration,
             "registration_rms_m": placed.rms if placed else None, "position_sigma_m": sigma}
+
+
+def _write_loaded(folder: Path, name: str, entry: PullEntry, load: np.ndarray,
+                  seen: Observations, branch: BranchFrame) -> None:
+    """Write a pull without a robot: a steady load [N], shape [3], where the grasp is."""
+    _require_on_branch(entry.grasp, name, branch.nodes)
+    poses = np.zeros((2, 6))
+    poses[:, :3] = entry.grasp.point_m
+    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
+    write_pull(folder, Pull(name, entry, seen.times[[0, -1]], poses, wrenches, seen))
 
 
 def _import_swing(stream: Stream, labels: list[str], source: Path, folder: Path, name: str,
@@ -262,12 +267,7 @@ def _import_swing(stream: Stream, labels: list[str], source: Path, folder: Path,
     entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER, "swing": SwingEntry(
         start=settings.swing_start, load_mass_kg=mass, noise_m=noise,
         registration_m=placed.rms if placed else None)})
-    _require_on_branch(entry.grasp, name, branch.nodes)
-    poses = np.zeros((2, 6))
-    poses[:, :3] = entry.grasp.point_m
-    wrenches = np.tile(np.r_[load, 0.0, 0.0, 0.0], (2, 1))
-    write_pull(folder, Pull(name, entry, seen.times[[0, -1]], poses, wrenches,
-                            Observations(seen.times, positions)))
+    _write_loaded(folder, name, entry, load, Observations(seen.times, positions), branch)
     return {"frame_count": len(seen.times), "point_count": len(used), "time_offset_s": 0.0,
             "labels": [labels[k] for k in used], "load_n": load.tolist(), "load_mass_kg": mass,
             "registration_rms_m": placed.rms if placed else None}

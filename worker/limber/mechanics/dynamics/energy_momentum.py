@@ -19,7 +19,8 @@ import numpy as np
 
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import NewmarkSettings
-from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.dynamics.stepper import Stepper
+from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.materials import Material, neo_hookean_energy, neo_hookean_stress
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
@@ -34,30 +35,16 @@ _FRESH = 3
 chosen, not measured."""
 
 
-class EnergyMomentumStepper:
-    """Takes steps, and keeps the tangent of the last.
-
-    Attributes:
-        iteration_count: So far.
-        status, trouble: Why the last step failed.
-        tangent: The last step was solved with; None before the first.
-    """
+class EnergyMomentumStepper(Stepper):
+    """Takes steps that keep energy and momentum."""
 
     def __init__(self, drive: Drive, settings: NewmarkSettings):
-        self.drive, self.settings = drive, settings
-        self.model, self.equations = drive.model, drive.equations
-        self.iteration_count = 0
-        self.status, self.trouble = Status.converged, ""
-        self.tangent: Tangent | None = None
+        super().__init__(drive, settings)
         self._balances: deque[tuple[float, np.ndarray]] = deque(maxlen=2)
         self._is_polynomial = self.model.material != Material.stable_neo_hookean
         # Its stress is given through the strain that St. Venant-Kirchhoff would have it at.
         self._bearing = (self.model if self._is_polynomial
                          else self.model.with_material(Material.st_venant_kirchhoff))
-
-    def forget_tangent(self) -> None:
-        """Use the last tangent no more."""
-        self.tangent = None
 
     def begin(self, start: MotionState, out: np.ndarray) -> None:
         """Begin where the holds bear ``out`` [N] on each node, shape [node_count, 3]."""

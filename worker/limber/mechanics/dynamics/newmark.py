@@ -6,7 +6,8 @@ import numpy as np
 
 from limber.mechanics.dynamics.drive import Drive
 from limber.mechanics.dynamics.motion import NewmarkSettings
-from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.dynamics.stepper import Stepper
+from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
 from limber.sparse import NotPositiveDefiniteError
@@ -16,26 +17,12 @@ _GOOD_TANGENT = 1e-3
 chosen, not measured."""
 
 
-class NewmarkStepper:
-    """Takes steps, and keeps the tangent of the last.
-
-    Attributes:
-        iteration_count: So far.
-        status, trouble: Why the last step failed.
-        tangent: The last step was solved with; None before the first.
-    """
+class NewmarkStepper(Stepper):
+    """Takes steps by Newmark's formulas."""
 
     def __init__(self, drive: Drive, settings: NewmarkSettings):
-        self.drive, self.settings = drive, settings
-        self.model, self.equations = drive.model, drive.equations
-        self.iteration_count = 0
-        self.status, self.trouble = Status.converged, ""
-        self.tangent: Tangent | None = None
+        super().__init__(drive, settings)
         self._tangent_step, self._tangent_error = 0.0, np.inf
-
-    def forget_tangent(self) -> None:
-        """Use the last tangent no more."""
-        self.tangent = None
 
     def viscous(self, old: MotionState, dt: float) -> Viscous | None:
         """Return the viscous part of a step of ``dt`` from ``old``."""

@@ -1,0 +1,38 @@
+"""What the schemes of implicit steps in time have in common."""
+
+from abc import ABC, abstractmethod
+
+from limber.mechanics.dynamics.drive import Drive
+from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.linear.equations import Tangent, Viscous
+from limber.mechanics.motion_state import MotionState
+from limber.mechanics.status import Status
+
+
+class Stepper(ABC):
+    """Takes steps, and keeps the tangent of the last.
+
+    Attributes:
+        iteration_count: So far.
+        status, trouble: Why the last step failed.
+        tangent: The last step was solved with; None before the first.
+    """
+
+    def __init__(self, drive: Drive, settings: NewmarkSettings):
+        self.drive, self.settings = drive, settings
+        self.model, self.equations = drive.model, drive.equations
+        self.iteration_count = 0
+        self.status, self.trouble = Status.converged, ""
+        self.tangent: Tangent | None = None
+
+    def forget_tangent(self) -> None:
+        """Use the last tangent no more."""
+        self.tangent = None
+
+    @abstractmethod
+    def viscous(self, old: MotionState, dt: float) -> Viscous | None:
+        """Return the viscous part of a step of ``dt`` from ``old``; None where there is none."""
+
+    @abstractmethod
+    def step(self, old: MotionState, dt: float, viscous: Viscous | None) -> MotionState | None:
+        """Return the state ``dt`` after ``old``, or None where it is not found."""
