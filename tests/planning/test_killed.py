@@ -87,8 +87,20 @@ def test_a_killed_energy_leaves_no_process_and_a_folder_to_go_on_with(folder, ki
     run("energy", folder, "--samples", "60", "--force")
     assert_clean(folder)
     with np.load(folder / "energy.npz") as now, np.load(io.BytesIO(before)) as then:
-        assert {name: now[name].tobytes() for name in then} == {
-            name: then[name].tobytes() for name in then}
+        assert set(then) == set(now)
+        for name in then:
+            assert_same(now[name], then[name], name)
+
+
+def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
+    """Grasps to the bit. Kernels and BLAS of two processes may differ in the last digit, which
+    solved states carry on to the solver's tolerance and fitted weights times their condition."""
+    if name == "poses" or now.dtype.kind not in "fc":
+        np.testing.assert_array_equal(now, then, name)
+    else:
+        rtol = 1e-3 if "weights" in name else 1e-6
+        np.testing.assert_allclose(now, then, rtol, rtol * np.abs(then).max(initial=0.0),
+                                   err_msg=name)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from limber.planning.plan_file import (
 )
 from limber.planning.resolve import ResolvedPath, SolvedPoses
 
-OLD = Path(__file__).parents[2] / "blend_files/bending_branch/plans/to-goal.json"
+OLD = Path(__file__).parent / "plan_format_1.json"  # written by the last version before format 2
 
 
 def solved(xs):
