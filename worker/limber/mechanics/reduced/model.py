@@ -463,15 +463,16 @@ def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bo
     """
     from scipy.linalg.lapack import dposv
 
-    shift, scale = 0.0, np.abs(np.diag(matrix)).mean()
-    while True:
-        shifted = matrix if shift == 0.0 else matrix + shift * scale * np.eye(len(matrix))
-        _, solution, info = dposv(shifted, right, lower=1)
+    _, solution, info = dposv(matrix, right, lower=1)
+    if info == 0:
+        return solution, True
+    scale, shift = np.abs(np.diag(matrix)).mean(), 1e-6
+    while shift <= 1e3 and np.isfinite(scale):
+        _, solution, info = dposv(matrix + shift * scale * np.eye(len(matrix)), right, lower=1)
         if info == 0:
-            return solution, shift == 0.0
-        shift = max(4 * shift, 1e-6)
-        if shift > 1e3 or not np.isfinite(scale):
-            return np.full(len(right), np.nan), False
+            return solution, False
+        shift *= 4
+    return np.full(len(right), np.nan), False
 
 
 def as_control_points(model: BranchModel, points: Sequence[np.ndarray] | None = None,
