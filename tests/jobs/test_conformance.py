@@ -69,6 +69,14 @@ class InPool:
         return outcome
 
 
+def runs(child: psutil.Process, behaviour: str) -> bool:
+    """Whether it is the program; one that ends meanwhile has no command line any more."""
+    try:
+        return behaviour in child.cmdline()
+    except psutil.Error:
+        return False
+
+
 class AsProcess:
     """A program that reports as a stage does."""
 
@@ -82,8 +90,7 @@ class AsProcess:
 
         def hear(fraction: float, message: str, _numbers: dict) -> None:
             outcome.reports.append((fraction, message))
-            outcome.processes = [p for p in psutil.Process().children()
-                                 if behaviour in p.cmdline()]
+            outcome.processes = [p for p in psutil.Process().children() if runs(p, behaviour)]
             if cancel_at and message == cancel_at:
                 # A hang does not report any more: the cancel has to come from elsewhere.
                 threading.Timer(0.2, progress.cancel).start()
