@@ -71,7 +71,8 @@ def test_cancel_ends_the_child(stand_in):
     with pytest.raises(Cancelled):
         process.run_stage(["x"], progress)
     time.sleep(0.1)
-    assert not [p for p in psutil.Process().children() if "stage.py" in " ".join(p.cmdline())]
+    commands = [p.as_dict(["cmdline"])["cmdline"] or [] for p in psutil.Process().children()]
+    assert not [words for words in commands if "stage.py" in " ".join(words)]
 
 
 def test_missing_branch_folder_is_an_input_error(tmp_path):
