@@ -58,6 +58,7 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     """
     shown = _new_branch(scene, data, scalar)
     _add_paths(shown, data)
+    _add_trees(shown, data)
     _add_skeleton(shown, data)
     _add_points(shown, data)
     _add_goal(shown, data)
@@ -157,14 +158,28 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
         shown.objects[name] = [add_object(shown.collection, f"{title} path", curve, material)]
 
 
+def _add_trees(shown: ShownBranch, data: SceneData) -> None:
+    """Add what the planners searched as lines; hidden, since they cover all of the space."""
+    for key, about in (data.info.get("trees") or {}).items():
+        mesh = _lines(f"{about['title']} tree", data, f"tree:{key}", f"tree_parent:{key}")
+        thing = add_object(shown.collection, f"{about['title']} tree", mesh)
+        thing.color = (*COLORS[f"path:{key}"], 1.0)
+        thing.hide_viewport = thing.hide_render = True
+        shown.objects[f"tree:{key}"] = [thing]
+
+
+def _lines(name: str, data: SceneData, nodes: str, parents: str) -> bpy.types.Mesh:
+    """Make a mesh of the edges of a tree."""
+    parent = data.arrays[parents]
+    hung = np.flatnonzero(parent >= 0)
+    return meshes.new_lines(name, data.arrays[nodes], np.column_stack([parent[hung], hung]))
+
+
 def _add_skeleton(shown: ShownBranch, data: SceneData) -> None:
     """Add the centreline with its radii, hidden: it lies inside the branch."""
     if "skeleton" not in data.arrays:
         return
-    parents = data.arrays["skeleton_parent"]
-    nodes = np.flatnonzero(parents >= 0)
-    mesh = meshes.new_lines("Skeleton", data.arrays["skeleton"],
-                            np.column_stack([parents[nodes], nodes]))
+    mesh = _lines("Skeleton", data, "skeleton", "skeleton_parent")
     meshes.set_scalars(mesh, "radius", data.arrays["skeleton_radius"])
     meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
     if "skeleton_probability" in data.arrays:

@@ -19,7 +19,8 @@ _MOST_ARRAYS = 500
 
 # Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
 # points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
-# seen, p points of a path (each path has its own). i: whole numbers, b: truth values, r: real.
+# seen, p points of a path (each path has its own), q nodes of a search tree (likewise). i: whole
+# numbers, b: truth values, r: real.
 _SHAPES = {
     "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
     "frame_times": "s r", "frame_energy": "s r", "frame_kinetic_energy": "s r",
@@ -32,7 +33,7 @@ _SHAPES = {
     "grasp": "13 r", "grasp_radius": "1 r", "grasp_motion": "s3 r",
     "targets": "t3 r", "targets_radius": "t r", "targets_motion": "st3 r",
     "path": "p3 r", "path_pose": "p6 r", "path_energy": "p r", "path_force": "p r",
-    "path_strain": "p r", "path_color": "p4 r",
+    "path_strain": "p r", "path_color": "p4 r", "tree": "q3 r", "tree_parent": "q i",
     "observation": "om3 r", "observation_visible": "om b", "observation_times": "o r",
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
     "robot_links": "s83 r", "robot_radius": "1 r",
@@ -132,7 +133,7 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
         if kind not in _SHAPES:
             continue
         wanted, number = _SHAPES[kind].split()
-        letters = [f"p:{key}" if letter == "p" else letter
+        letters = [f"{letter}:{key}" if letter in "pq" else letter
                    for letter in re.findall(r"\d|[a-z]", wanted)]
         fits = len(letters) == array.ndim and all(
             count == (int(letter) if letter.isdigit() else sizes.setdefault(letter, count))
@@ -146,10 +147,10 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
     faces, count = arrays["faces"], len(arrays["vertices"])
     if len(faces) and (faces.min() < 0 or faces.max() >= count):
         return f"faces do not index {count} vertices"
-    parents = arrays.get("skeleton_parent")
-    if parents is not None and len(parents) and (
-            parents.min() < -1 or (parents >= np.arange(len(parents))).any()):
-        return "skeleton_parent is no tree"
+    for name, parents in arrays.items():
+        if name.partition(":")[0] in ("skeleton_parent", "tree_parent") and len(parents) and (
+                parents.min() < -1 or (parents >= np.arange(len(parents))).any()):
+            return f"{name} is no tree"
     return ""
 
 
@@ -157,6 +158,8 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     """Return what ``info`` speaks of that the arrays do not have, or nothing."""
     wanted = [f"{kind}:{name}" for name in info["scalars"] for kind in ("scalar", "color")]
     wanted += [f"path:{name}" for name in info["paths"]]
+    wanted += [f"{kind}:{name}" for name in info.get("trees") or {}
+               for kind in ("tree", "tree_parent")]
     wanted += [f"frame_scalar:{name}" for name in info.get("frame_scalars") or {}]
     if len(arrays.get("targets", ())) != len(info.get("targets") or ()):
         return "the targets do not fit their names"

@@ -80,6 +80,8 @@ def _write_plan(stage, path: np.ndarray) -> None:
             writer = csv.writer(stream)
             writer.writerow(PATH_COLUMNS)
             writer.writerows([0.0, *point, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0] for point in points)
+    stage.path("plans/to-goal-trees.csv").write_text("planner,x_m,y_m,z_m,parent\n" + "".join(
+        f"D-RRT*,{x:.9g},{y:.9g},{z:.9g},{number - 1}\n" for number, (x, y, z) in enumerate(path)))
     stage.path("plans/to-goal.json").write_text(json.dumps({
         "goal": {"kind": "grasp", "position_m": list(path[-1]), "tolerance_m": 0.02},
         "plan": {"length_m": 0.13, "energy_sum_nmm": 4.5},

@@ -81,6 +81,10 @@ def test_content(bpy, addon, beam, tmp_path):
     np.testing.assert_allclose(curves.polyline_points(objects["D-RRT* path"].data), beam.path,
                                atol=1e-6)
     assert objects["RRT* path"].active_material != objects["D-RRT* path"].active_material
+    tree = objects["D-RRT* tree"].data
+    np.testing.assert_allclose(meshes.positions(tree), beam.path, atol=1e-6)
+    assert [tuple(edge.vertices) for edge in tree.edges] == [
+        (k, k + 1) for k in range(len(beam.path) - 1)]
     assert len(shown.objects["control_points"]) == 4
     bpy.context.scene.frame_set(1)
     heights = [thing.location.z for thing in shown.objects["control_points"]]

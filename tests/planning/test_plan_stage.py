@@ -83,6 +83,10 @@ def test_files_tell_the_same(planned_branch, small_mesh):
         assert float(rows[-1]["s_m"]) == pytest.approx(plan[key]["length_m"], rel=1e-6)
         assert {"length_m", "energy_integral_jm", "energy_sum_nmm", "peak_energy_j",
                 "peak_force_n"} <= set(plan[key])
+    with open(planned_branch / "plans/there-trees.csv", newline="") as stream:
+        nodes = list(csv.DictReader(stream))
+    assert {row["planner"] for row in nodes} == {"RRT*", "D-RRT*"}
+    assert sum(row["parent"] == "-1" for row in nodes) == 2 and len(nodes) > 200
     frames = json.loads((planned_branch / "frames/there.json").read_text())
     data = (planned_branch / "frames/there.pc2").read_bytes()
     vertex_count = len(np.unique(small_mesh.surface_faces()))

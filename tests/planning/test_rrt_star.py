@@ -1,6 +1,7 @@
 """Both engines of RRT* on a branch with a ridge: gentler, honest when there is no way."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -150,3 +151,23 @@ def test_cancel_ends_the_search(ridge_field, engine):
     with pytest.raises(Cancelled):
         plan_path(make_problem(ridge_field, deformation=1.0), Search(iterations=4000),
                   engine=engine, progress=progress)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_tree_comes_with_the_path(ridge_field, engine):
+    """Each node hangs on one before it, all on the start; the tree's polyline runs along edges; a
+    smaller tree has the same edges."""
+    problem = make_problem(ridge_field, deformation=1.0)
+    found = plan_path(problem, Search(iterations=600, seed=5), engine=engine)
+    nodes, parents = found.tree.nodes, found.tree.parents
+    assert parents[0] == -1 and np.array_equal(nodes[0], START) and len(nodes) > 100
+    assert ((parents[1:] >= 0) & (parents[1:] < np.arange(1, len(nodes)))).all()
+
+    def edges(tree):
+        return {(*tree.nodes[parent], *tree.nodes[node])
+                for node, parent in enumerate(tree.parents) if parent >= 0}
+
+    assert {(*a, *b) for a, b in pairwise(found.raw)} <= edges(found.tree)
+    small = found.tree.pruned(50)
+    assert len(small.nodes) == 50 and len(edges(small)) == 49
+    assert edges(small) < edges(found.tree)

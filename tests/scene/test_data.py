@@ -111,6 +111,21 @@ def test_goal_path_and_motion(tmp_path, mesh):
     assert np.linalg.norm(data.arrays["view_direction"]) == pytest.approx(1.0)
 
 
+def test_search_trees(tmp_path, mesh):
+    """Nodes and parents of each planner's tree; a plan without them has none, a circle is named."""
+    table = "planner,x_m,y_m,z_m,parent\nRRT*,0,0,0.3,-1\nRRT*,0.1,0,0.3,0\nRRT*,0,0.1,0.3,{}\n"
+    plan = _plan({}, [[0.0, 0.0, 0.3], [0.1, 0.0, 0.3]])
+    data = scene_data(_branch(tmp_path / "a", mesh, plan__p=plan | {
+        "plans/p-trees.csv": table.format(1)}))
+    np.testing.assert_allclose(data.arrays["tree:baseline"][2], [0, 0.1, 0.3])
+    np.testing.assert_array_equal(data.arrays["tree_parent:baseline"], [-1, 0, 1])
+    assert data.info["trees"] == {"baseline": {"title": "RRT*", "node_count": 3}}
+    assert scene_data(_branch(tmp_path / "b", mesh, plan__p=plan)).info["trees"] == {}
+    with pytest.raises(BranchFolderError, match=r"no search trees .* no tree"):
+        scene_data(_branch(tmp_path / "c", mesh, plan__p=plan | {
+            "plans/p-trees.csv": table.format(2)}))
+
+
 def test_frames_of_another_mesh_are_refused(tmp_path, mesh):
     """Too few vertices, a file cut short: an error, since Blender would show the rest shape."""
     surface = mesh.nodes[np.unique(mesh.surface_faces())]

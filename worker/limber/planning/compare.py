@@ -14,7 +14,7 @@ from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
-from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
 from limber.planning.planners.trees import FoundPath, plan_path
 from limber.planning.problem import GentleProblem
 from limber.planning.settings import PlanSettings
@@ -32,7 +32,8 @@ class PathPair:
     there straight may buckle on the way and be another branch when it arrives. ``certificate``
     says how close the plan is to the best possible path on the field; ``compared`` has the
     polylines [n, 3] of all paths that were found, by name. ``margins`` is by how much the limits
-    were tighter than asked; ``detour`` what a limit on the length did.
+    were tighter than asked; ``detour`` what a limit on the length did. ``trees`` are those of the
+    planners that grew one, by the planner's name.
     """
 
     baseline: FoundPath
@@ -43,6 +44,7 @@ class PathPair:
     compared: dict[str, np.ndarray]
     margins: dict[str, float] = field(default_factory=dict)
     detour: DetourPath | None = None
+    trees: dict[str, SearchTree] = field(default_factory=dict)
 
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
@@ -127,7 +129,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         compared[name] = path.points
         compared[f"{name}, not smoothed"] = path.raw
     return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
-                    detour=detour)
+                    detour=detour, trees={name: path.tree for name, path in trees.items()})
 
 
 def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,

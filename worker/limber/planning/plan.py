@@ -24,6 +24,7 @@ from limber.planning.field.grasp_model import GraspModel
 from limber.planning.full_check import broken_on_full_model, field_error, learnt
 from limber.planning.goals import Goal, GraspGoal, TipGoal, default_goal
 from limber.planning.limits import Limits
+from limber.planning.planners.tree_search import SearchTree
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread
@@ -39,12 +40,14 @@ class PlannedMotion:
         summary: The stage's result.
         baseline, plan: The shortest path (RRT*), and the gentle one.
         field: With what was learnt from plans that were refused.
+        trees: What the planners with a tree searched, by their name.
     """
 
     summary: dict[str, Any]
     baseline: ResolvedPath
     plan: ResolvedPath
     field: EnergyField
+    trees: dict[str, SearchTree]
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
@@ -91,7 +94,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     summary["rounds"] = rounds
     for message in _doubts(summary, baseline, plan):
         progress.warn(message)
-    return PlannedMotion(summary, baseline, plan, field)
+    return PlannedMotion(summary, baseline, plan, field, pair.trees)
 
 
 def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:

@@ -27,6 +27,8 @@ Arrays (m, s, J, Pa; what a folder does not have is left out):
 ``path:KEY`` [p, 3], ``path_pose:KEY`` [p, 6],  paths of ``info["paths"]``: points, poses, energy
 ``path_energy:KEY`` ``path_force:KEY``          (colours by ``info["path_energy"]``), force, strain
 ``path_strain:KEY`` [p], ``path_color:KEY``
+``tree:KEY`` [q, 3], ``tree_parent:KEY`` [q]    search trees of ``info["trees"]``: nodes, and which
+                                                earlier one each hangs on (-1: none)
 ``observation`` [t, m, 3], ``observation_       what was measured in the pull that
 visible`` [t, m], ``observation_times`` [t],    ``info["observation"]`` names, and the gripper
 ``observation_grasp`` [g, 3], ``observation_

@@ -1,4 +1,4 @@
-"""Paths to a goal in a scene: their points, poses and energies, the goal, and where it may lie."""
+"""Paths to a goal in a scene: their points, poses and energies, what was searched, the goal."""
 
 import csv
 import json
@@ -13,6 +13,7 @@ from limber.scene.colours import colour_scale, colours_of
 from limber.store import Branch
 
 _POSITION = ("x_m", "y_m", "z_m")
+_TREES = {"D-RRT*": "plan", "RRT*": "baseline"}  # what a tree's path is called
 _ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 
 
@@ -39,6 +40,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     gap = (summary.get("certificate") or {}).get("gap_percent")
     if gap is not None and "plan" in data.info["paths"]:
         data.info["paths"]["plan"]["note"] += f", {gap:.1f} % off the least cost at most"
+    _add_trees(data, branch, plan)
     _add_energy_scale(data)
     data.info["plan"] = plan
     data.info["goal"] = _goal(summary.get("goal") or {}, data.arrays.get("path:plan"))
@@ -68,6 +70,35 @@ def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:
     for column, name in (("energy_j", "energy"), ("force_n", "force"), ("strain", "strain")):
         if column in table:
             data.arrays[f"path_{name}:{key}"] = table[column]
+
+
+def _add_trees(data: SceneData, branch: Branch, plan: str) -> None:
+    """Add the search trees; plans of older programs have none."""
+    data.info["trees"] = {}
+    if not branch.has(f"plans/{plan}-trees.csv"):
+        return
+    path = branch.path(f"plans/{plan}-trees.csv")
+    with open(path, encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for planner, key in _TREES.items():
+        own = [row for row in rows if row.get("planner") == planner]
+        if not own:
+            continue
+        try:
+            nodes = np.array([[float(row[name]) for name in _POSITION] for row in own])
+            parents = np.array([int(row["parent"]) for row in own])
+        except (KeyError, TypeError, ValueError) as error:
+            raise _damaged_trees(path, str(error)) from error
+        if not np.isfinite(nodes).all() or parents[0] != -1 or (
+                (parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
+            raise _damaged_trees(path, f"the nodes of {planner} are no tree")
+        data.arrays[f"tree:{key}"], data.arrays[f"tree_parent:{key}"] = nodes, parents
+        data.info["trees"][key] = {"title": planner, "node_count": len(nodes)}
+
+
+def _damaged_trees(path: Path, why: str) -> BranchFolderError:
+    return BranchFolderError(f"{path} holds no search trees ({why}).", "The file is damaged.",
+                             "Run `limber plan` again with --force.")
 
 
 def _add_energy_scale(data: SceneData) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from limber.planning.plan_file import Way
 
 
+_MOST_NODES = 2000  # of a search tree in its file; those that carry the most others stay
 _FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
 _COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
             "strain")
@@ -50,7 +51,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
          force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Plan paths on the branch's energy field.
 
-    Writes ``plans/NAME.json``, two csv files and the frames.
+    Writes ``plans/NAME.json``, csv files of both paths, the whole motion and the search trees, and
+    the frames.
 
     Raises:
         BranchFolderError: no energy field, or one of another geometry or material.
@@ -63,9 +65,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
     from limber.stages.loading import load_grasp_model
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
-            ("-baseline", "-motion")):
+            ("-baseline", "-motion", "-trees")):
         raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names; -baseline and -motion are its own tables.",
+                         "It becomes part of file names; -baseline, -motion and -trees are its own "
+                         "tables.",
                          "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field_path = branch.require("energy.npz", "energy")
@@ -110,6 +113,7 @@ def _write(stage: Stage, name: str, settings: PlanSettings, grasp_model: GraspMo
     stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
     stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
     stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")
+    stage.path(f"plans/{name}-trees.csv").write_text(_trees_table(found), encoding="utf-8")
     displacements = found.plan.solved.displacements
     vertices = np.unique(grasp_model.mesh.surface_faces())
     frames = grasp_model.mesh.nodes[vertices] + displacements[:, vertices]
@@ -139,6 +143,16 @@ def _motion_table(motion: Way) -> str:
     return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
 
 
+def _trees_table(found: PlannedMotion) -> str:
+    """A row a node: its tree, its position, and the row of that tree that it hangs on, -1: none."""
+    lines = ["planner,x_m,y_m,z_m,parent"]
+    for planner, tree in found.trees.items():
+        small = tree.pruned(_MOST_NODES)
+        lines += [f"{planner},{x:.6g},{y:.6g},{z:.6g},{parent}"
+                  for (x, y, z), parent in zip(small.nodes, small.parents, strict=True)]
+    return "\n".join(lines) + "\n"
+
+
 def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | None = None) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -166,6 +180,6 @@ STAGE = StageDescription(
     "plan", 100, run, PlanInputs, PlanSettings, ParallelOptions, key="plan:{name}",
     reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
-            "plans/{name}-motion.csv", "frames/{name}.pc2", "frames/{name}.json",
-            "frames/{name}.npz"),
+            "plans/{name}-motion.csv", "plans/{name}-trees.csv", "frames/{name}.pc2",
+            "frames/{name}.json", "frames/{name}.npz"),
     tables=_tables)

@@ -13,7 +13,7 @@ import numpy as np
 
 from limber.errors import MissingDependencyError
 from limber.planning.cost import edge_cost
-from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
 from limber.progress import Progress
 
 _REWIRE_FACTOR = 0.05
@@ -30,8 +30,8 @@ def ompl_missing() -> str:
 
 
 def search_with_ompl(problem: PathProblem, search: Search, progress: Progress,
-                     ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
-    """Return the best path [n, 3] or None, the cost's history and the tree's size.
+                     ) -> tuple[np.ndarray | None, list[dict[str, float]], SearchTree]:
+    """Return the best path [n, 3] or None, the cost's history and the tree.
 
     Raises:
         MissingDependencyError: OMPL is not installed.
@@ -67,11 +67,20 @@ def search_with_ompl(problem: PathProblem, search: Search, progress: Progress,
     setup.solve(base.PlannerTerminationCondition(watch))
     data = base.PlannerData(information)
     setup.getPlannerData(data)
-    nodes = data.numVertices()
+    tree = _tree(data)
     if not setup.haveExactSolutionPath():
-        return None, watch.history, nodes
+        return None, watch.history, tree
     states = setup.getSolutionPath().getStates()
-    return np.array([state[0:3] for state in states]), watch.history, nodes
+    return np.array([state[0:3] for state in states]), watch.history, tree
+
+
+def _tree(data: object) -> SearchTree:
+    count = data.numVertices()
+    nodes = np.array([data.getVertex(number).getState()[0:3] for number in range(count)])
+    parents = np.full(count, -1)
+    for number in range(count):
+        parents[data.getEdges(number)] = number
+    return SearchTree.of(nodes.reshape(-1, 3), parents)
 
 
 class _Watch:

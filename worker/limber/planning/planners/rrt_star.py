@@ -6,15 +6,15 @@ import numpy as np
 
 from limber.compiled import compiled
 from limber.planning.cost import edge_cost
-from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
 from limber.progress import Progress
 
 _CHUNK = 250  # iterations between two reports of progress, each a chance to cancel
 
 
 def search_tree(problem: PathProblem, search: Search, progress: Progress,
-                ) -> tuple[np.ndarray | None, list[dict[str, float]], int]:
-    """Return the best polyline [k, 3] or None, its cost as the tree grew, the number of nodes."""
+                ) -> tuple[np.ndarray | None, list[dict[str, float]], SearchTree]:
+    """Return the best polyline [k, 3] or None, its cost as the tree grew, and the tree."""
     generator = np.random.default_rng([search.seed, 0])
     dimension = len(problem.start)
     tree = _Tree(search.iterations + 1, dimension)
@@ -34,7 +34,8 @@ def search_tree(problem: PathProblem, search: Search, progress: Progress,
             history.append({"iteration": done + size, "cost": float(tree.cost[best])})
         progress((done + size) / search.iterations, "growing the tree", **numbers)
     best = tree.best(count, problem.in_goal)
-    return (None if best is None else tree.branch(best)), history, count
+    return (None if best is None else tree.branch(best)), history, SearchTree.of(
+        tree.nodes[:count].copy(), tree.parent[:count].copy())
 
 
 class _Tree:

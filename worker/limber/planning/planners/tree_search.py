@@ -1,4 +1,4 @@
-"""What a tree planner is asked: start, goals, cost, and how long and how wide to search."""
+"""What a tree planner is asked: start, goals, cost, how long and how wide to search; its tree."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,3 +62,43 @@ class Search:
     goal_bias: float = 0.05
     shortcuts: int = 400
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class SearchTree:
+    """A tree as it ended: ``nodes`` [n, 3] [m], and the ``parents`` [n] that they hang on.
+
+    A parent comes before its children; the first node is the start and has the parent -1.
+    """
+
+    nodes: np.ndarray
+    parents: np.ndarray
+
+    @classmethod
+    def of(cls, nodes: np.ndarray, parents: np.ndarray) -> "SearchTree":
+        """Return the tree of nodes in any order; what does not hang on the start is left out."""
+        depth = np.where(parents < 0, 0, -1)
+        depth[np.flatnonzero(depth == 0)[1:]] = -1
+        while True:
+            below = (depth < 0) & (parents >= 0) & (depth[parents] >= 0)
+            if not below.any():
+                break
+            depth[below] = depth[parents[below]] + 1
+        order = np.argsort(depth, kind="stable")[int((depth < 0).sum()):]
+        place = np.full(len(nodes), -1)
+        place[order] = np.arange(len(order))
+        return cls(nodes[order], np.where(depth[order] > 0, place[parents[order]], -1))
+
+    def pruned(self, most: int) -> "SearchTree":
+        """Return at most ``most`` of its nodes: those that carry the most others.
+
+        Its edges are all edges of the tree: a node carries fewer than the one that it hangs on.
+        """
+        if len(self.nodes) <= most:
+            return self
+        carried = np.ones(len(self.nodes))
+        for node in range(len(self.nodes) - 1, 0, -1):
+            carried[self.parents[node]] += carried[node]
+        kept = np.sort(np.argsort(-carried, kind="stable")[:most])
+        return SearchTree.of(self.nodes[kept], np.searchsorted(kept, self.parents[kept])
+                             - (self.parents[kept] < 0))

@@ -19,7 +19,7 @@ from limber.planning.cost import path_cost
 from limber.planning.planners.ompl_engine import search_with_ompl
 from limber.planning.planners.rrt_star import search_tree
 from limber.planning.planners.smoothing import polish, shortcut, slide_end
-from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
 from limber.progress import SILENT, Progress
 
 
@@ -32,18 +32,18 @@ class FoundPath:
         cost: Its cost by the problem's weights.
         tree_cost: Cost before shortcuts.
         history: ``{"iteration", "cost"}``, cost of the best path so far (absent before the first).
-        node_count: Size of the tree.
         engine: Which engine found it.
         raw: The tree's polyline before shortcuts, shape [k, 3]; None from a search without trees.
+        tree: All that was searched; None from a search without trees.
     """
 
     points: np.ndarray
     cost: float
     tree_cost: float
     history: list[dict[str, float]] = field(default_factory=list)
-    node_count: int = 0
     engine: str = "own"
     raw: np.ndarray | None = None
+    tree: SearchTree | None = None
 
 
 def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
@@ -55,13 +55,13 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
         MissingDependencyError: ``ompl`` was asked for and is not installed.
     """
     if engine == "ompl":
-        raw, history, node_count = search_with_ompl(problem, search, progress)
+        raw, history, tree = search_with_ompl(problem, search, progress)
     else:
-        raw, history, node_count = search_tree(problem, search, progress)
+        raw, history, tree = search_tree(problem, search, progress)
     if raw is None:
         raise NoPathError(
             f"{search.iterations} iterations found no allowed path to the goal region.",
-            f"{node_count} poses were reached from the start; the limits, or poses that the "
+            f"{len(tree.nodes)} poses were reached from the start; the limits, or poses that the "
             "branch model refused, may separate it from the goal.",
             "Allow more --iterations, or raise --max-energy or --max-force.")
     tree_cost = float(path_cost(raw, problem.limits, problem.weights))
@@ -70,4 +70,4 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     points = slide_end(points, problem.goals, problem.limits, problem.weights)
     points = polish(points, problem.energy_field, problem.limits, problem.weights)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
-                     history, node_count, engine, raw)
+                     history, engine, raw, tree)
