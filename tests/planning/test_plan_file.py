@@ -32,7 +32,7 @@ def solved(xs):
         poses=poses, energies=xs**2, forces=vector, torques=0.1 * vector, strains=0.01 * xs,
         strain_places=vector, stresses=1e6 * xs, min_det_f=1.0 + 0 * xs, tips=2 * vector,
         targets=np.stack([vector, 3 * vector], axis=1),
-        shape_slopes=np.zeros((len(xs), 3, 12)), displacements=np.zeros((len(xs), 4, 3)))
+        displacements=np.zeros((len(xs), 4, 3)))
 
 
 def resolved(path, approach):

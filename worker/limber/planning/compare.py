@@ -14,8 +14,8 @@ from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
-from limber.planning.planners.tree_search import PathProblem, Search, SearchTree
-from limber.planning.planners.trees import FoundPath, plan_path
+from limber.planning.planners.tree_search import PathProblem, Search
+from limber.planning.planners.trees import FoundPath, found_again, plan_path
 from limber.planning.problem import GentleProblem
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
@@ -32,8 +32,8 @@ class PathPair:
     there straight may buckle on the way and be another branch when it arrives. ``certificate``
     says how close the plan is to the best possible path on the field; ``compared`` has the
     polylines [n, 3] of all paths that were found, by name. ``margins`` is by how much the limits
-    were tighter than asked; ``detour`` what a limit on the length did. ``trees`` are those of the
-    planners that grew one, by the planner's name.
+    were tighter than asked; ``detour`` what a limit on the length did. ``trees`` is what the
+    planners that grow one found, by the planner's name.
     """
 
     baseline: FoundPath
@@ -44,12 +44,16 @@ class PathPair:
     compared: dict[str, np.ndarray]
     margins: dict[str, float] = field(default_factory=dict)
     detour: DetourPath | None = None
-    trees: dict[str, SearchTree] = field(default_factory=dict)
+    trees: dict[str, FoundPath] = field(default_factory=dict)
 
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-                limits: Limits, *, progress: Progress = SILENT) -> PathPair:
+                limits: Limits, *, before: PathPair | None = None, progress: Progress = SILENT,
+                ) -> PathPair:
     """Plan both paths within ``limits``, tighter by what the field may be wrong by where it can be.
+
+    ``before`` is what was found until the field learnt: its trees are not grown again where their
+    paths still hold.
 
     Where no path keeps the margins, one that keeps the limits on the field alone is planned: the
     full model decides whether it holds. That no path exists is said without margins only.
@@ -66,13 +70,14 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     parts = [part for part in parts if allowed_points(start[None], limits.on(field, part))[0]]
     if any(margins.values()) and parts:
         try:
-            return replace(plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
-                                     progress=progress.part(0.0, 0.5)), margins=parts[0])
+            found = plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
+                              before=before, progress=progress.part(0.0, 0.5))
+            return replace(found, margins=parts[0])
         except NoPathError:
             progress.warn("No path keeps the limits with margins for the error of the energy "
                           f"field ({_told(parts[0])}): planned without; the full model decides.")
     return replace(plan_pair(field, start, goal, settings, limits.on(field),
-                             progress=progress.part(0.5, 1.0)), margins=none)
+                             before=before, progress=progress.part(0.5, 1.0)), margins=none)
 
 
 def _told(margins: dict[str, float]) -> str:
@@ -81,7 +86,8 @@ def _told(margins: dict[str, float]) -> str:
 
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-              limits: FieldArrays | None = None, *, progress: Progress = SILENT) -> PathPair:
+              limits: FieldArrays | None = None, *, before: PathPair | None = None,
+              progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits, and bound the cost of any path from below.
 
     ``limits`` are those of the settings where not given.
@@ -98,7 +104,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     trees = _trees(limits, field, start, goal, goals, settings, weighed,
-                   progress.part(0.0, 0.5))
+                   {} if before is None else before.trees, progress.part(0.0, 0.5))
     problem = GentleProblem(field, limits, weighed.weights, start, goal)
     known = [path.points for path in trees.values()]
     detour = None
@@ -129,7 +135,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         compared[name] = path.points
         compared[f"{name}, not smoothed"] = path.raw
     return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
-                    detour=detour, trees={name: path.tree for name, path in trees.items()})
+                    detour=detour, trees=trees)
 
 
 def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
@@ -152,9 +158,9 @@ def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSetti
 
 
 def _trees(limits: FieldArrays, field: EnergyField, start: np.ndarray, goal: Goal,
-           goals: np.ndarray, settings: PlanSettings, weighed: CostWeights, progress: Progress,
-           ) -> dict[str, FoundPath]:
-    """Return what RRT* and D-RRT* find: either, both or nothing."""
+           goals: np.ndarray, settings: PlanSettings, weighed: CostWeights,
+           before: dict[str, FoundPath], progress: Progress) -> dict[str, FoundPath]:
+    """Return what RRT* and D-RRT* find, or had found before: either, both or nothing."""
     def in_goal(points: np.ndarray) -> np.ndarray:
         return goal.distance(field, points) <= goal.tolerance
 
@@ -166,6 +172,9 @@ def _trees(limits: FieldArrays, field: EnergyField, start: np.ndarray, goal: Goa
         part = progress.part(0.5 * number, 0.5 * (number + 1))
         part(0.0, name)
         problem = PathProblem(start, goals, in_goal, field, limits, cost.weights)
+        if name in before and (again := found_again(before[name], problem)):
+            found[name] = again
+            continue
         try:
             found[name] = plan_path(problem, search, engine=engine, progress=part)
         except NoPathError as error:

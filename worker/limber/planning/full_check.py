@@ -3,6 +3,7 @@
 import numpy as np
 
 from limber.planning.field.energy_field import EnergyField, GraspSamples
+from limber.planning.field.grasp_model import GraspModel
 from limber.planning.goals import Goal, TipGoal
 from limber.planning.limits import Limits
 from limber.planning.resolve import ResolvedPath, SolvedPoses
@@ -40,7 +41,8 @@ def field_error(field: EnergyField, states: SolvedPoses) -> float:
     return float(np.sqrt(np.mean(off**2))) / size if size else 0.0
 
 
-def learnt(field: EnergyField, path: ResolvedPath, limits: Limits) -> GraspSamples:
+def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
+           ) -> GraspSamples:
     """Return states of a path that is not passed on as samples: its end, where limits are broken,
     and where the field is off most; and poses that have no solution as rejected ones."""
     whole = path.approach.joined(path.solved)
@@ -56,12 +58,16 @@ def learnt(field: EnergyField, path: ResolvedPath, limits: Limits) -> GraspSampl
         if len(chosen) < _MOST_LEARNT and (
                 np.linalg.norm(others - place, axis=1).min() > 0.5 * _APART):
             chosen.append(int(index))
-    return _as_samples(whole.take(np.array(chosen, int)), path.unsolved, field.samples)
+    return _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved, field.samples)
 
 
-def _as_samples(states: SolvedPoses, unsolved: np.ndarray, like: GraspSamples) -> GraspSamples:
-    names = ("targets", "torques", "strain_places", "stresses", "shape_slopes")
+def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarray,
+                like: GraspSamples) -> GraspSamples:
+    names = ("targets", "torques", "strain_places", "stresses")
     optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
+    if like.shape_slopes is not None:
+        optional["shape_slopes"] = np.array([grasp_model.shape_slopes(u)
+                                             for u in states.displacements])
     return GraspSamples(states.poses, states.energies, states.forces, states.tips,
                         states.min_det_f, np.hstack([unsolved, np.zeros_like(unsolved)]),
                         states.strains, **optional)

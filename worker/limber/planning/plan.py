@@ -69,16 +69,21 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     start = _start(field, goal, settings)
     limits = Limits.of(settings)
     rounds: list[dict[str, Any]] = []
+    pair = baseline = None
     for number in range(settings.replans + 1):
         ahead = progress.part(number / (settings.replans + 1), (number + 1) / (
             settings.replans + 1))
         began = perf_counter()
-        pair = plan_within(field, start, goal, settings, limits, progress=ahead.part(0.0, 0.3))
+        before, pair = pair, plan_within(field, start, goal, settings, limits, before=pair,
+                                         progress=ahead.part(0.0, 0.3))
         planned = perf_counter()
         ahead(0.3, "both paths on the full model")
-        baseline, plan = resolve_side_by_side(
-            grasp_model, [pair.baseline.points, pair.plan.points], pair.approach, workers,
-            ahead.part(0.3, 0.95))
+        # The shortest path rarely changes with what was learnt: it is solved once.
+        same = before is not None and np.array_equal(before.baseline.points, pair.baseline.points)
+        plan, *other = resolve_side_by_side(
+            grasp_model, [pair.plan.points] + [pair.baseline.points] * (not same), pair.approach,
+            workers, ahead.part(0.3, 0.95))
+        baseline = other[0] if other else baseline
         broken = broken_on_full_model(plan, limits, goal)
         off = field_error(field, plan.solved)
         rounds.append({"broken": broken, "sample_count": len(field.samples.poses),
@@ -89,12 +94,13 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             break
         if is_last:
             raise _refused(broken, settings)
-        field = refit(field, learnt(field, plan, limits))
+        field = refit(field, learnt(field, grasp_model, plan, limits))
     summary = _summary(field, goal, start, pair, baseline.require(), plan, settings)
     summary["rounds"] = rounds
     for message in _doubts(summary, baseline, plan):
         progress.warn(message)
-    return PlannedMotion(summary, baseline, plan, field, pair.trees)
+    return PlannedMotion(summary, baseline, plan, field, {
+        name: path.tree for name, path in pair.trees.items()})
 
 
 def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:

@@ -29,7 +29,6 @@ class SolvedPoses:
         min_det_f: Least determinant of the deformation gradient, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].
         targets: Positions of the named targets [m], shape [n, targets, 3].
-        shape_slopes: See :meth:`GraspModel.shape_slopes`, shape [n, 3, 6 + 3 targets].
         displacements: Of all nodes [m], shape [n, node_count, 3].
     """
 
@@ -43,7 +42,6 @@ class SolvedPoses:
     min_det_f: np.ndarray
     tips: np.ndarray
     targets: np.ndarray
-    shape_slopes: np.ndarray
     displacements: np.ndarray
 
     @classmethod
@@ -61,7 +59,6 @@ class SolvedPoses:
             min_det_f=np.array([float(result.min_det_f) for result in results]),
             tips=np.array([grasp_model.tip(u) for u in moved]),
             targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
-            shape_slopes=np.array([grasp_model.shape_slopes(u) for u in moved]),
             displacements=np.array(moved))
 
     @property

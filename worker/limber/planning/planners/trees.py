@@ -10,7 +10,7 @@ Both stop after a number of iterations, never a time, so a seed gives the same p
 end with shortcuts that lower the cost; OMPL's other simplifiers ignore it.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -71,3 +71,12 @@ def plan_path(problem: PathProblem, search: Search, *, engine: str = "own",
     points = polish(points, problem.energy_field, problem.limits, problem.weights)
     return FoundPath(points, float(path_cost(points, problem.limits, problem.weights)), tree_cost,
                      history, engine, raw, tree)
+
+
+def found_again(found: FoundPath, problem: PathProblem) -> FoundPath | None:
+    """Return a found path on a field that has learnt since; None if it is not allowed there."""
+    points = found.points
+    if problem.weights.energy > 0.0:
+        points = polish(points, problem.energy_field, problem.limits, problem.weights)
+    cost = float(path_cost(points, problem.limits, problem.weights))
+    return replace(found, points=points, cost=cost) if np.isfinite(cost) else None
