@@ -84,7 +84,8 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     shift = start - FIRST_STEP / np.sqrt(len(start))
 
     def residual(moved: np.ndarray) -> np.ndarray:
-        found = objective.evaluate(moved + shift)
+        # Nearly every step is taken, and its derivative is cheapest right after the solve.
+        found = objective.evaluate(moved + shift, jacobian=True)
         if found is None:
             # Farther off than anything: the trust region shrinks.
             return np.full(size, np.sqrt(FAILED_OBJECTIVE / size))

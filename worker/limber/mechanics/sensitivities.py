@@ -2,8 +2,8 @@
 
 The internal force is linear in both Lamé coefficients, so its explicit derivative to any material
 parameter is the same kernel with other coefficients. The displacement's derivative solves the
-tangent equations at the converged state; each solve is refined against the exact directional
-derivative of the force, so the result does not depend on what was factorised.
+tangent equations at the converged state; where their factor is of a matrix nearby, each solve is
+refined against the exact directional derivative of the force.
 """
 
 from collections.abc import Callable, Sequence
@@ -89,19 +89,20 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
     grasps = [] if grasp is None else [grasp] if isinstance(grasp, Grasp) else list(grasp)
     equations = model.equations(grasps if is_held else ())
     u = result.displacement
-    tangent = equations.tangent(model, u)
+    tangent = equations.exact_tangent(model, u)
     explicit = explicit_forces(model, wanted, u)
 
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(u, direction)
 
-    columns, forces, energies = [], [], []
-    internal = model.internal(u)
-    for partial in explicit:
-        change = refined_solve(tangent, force, -partial)
-        columns.append(change)
-        out = partial + force(change)
-        forces.append(reactions(grasps, out) if is_held else np.zeros((len(grasps), 3)))
+    # One that was factorised as it is needs no refinement.
+    columns = (tangent.solve_all([-partial for partial in explicit])
+               if tangent.is_positive_definite
+               else [refined_solve(tangent, force, -partial) for partial in explicit])
+    internal, forces, energies = model.internal(u), [], []
+    for partial, change in zip(explicit, columns, strict=True):
+        forces.append(reactions(grasps, partial + force(change)) if is_held
+                      else np.zeros((len(grasps), 3)))
         energies.append(float((internal.force * change).sum()))
     energies = np.array(energies) + explicit_energies(model, wanted, u)
     reaction = np.stack(forces, axis=-1) if grasps else np.zeros((1, 3, len(columns)))

@@ -24,6 +24,8 @@ def warm_up(progress: Progress = SILENT) -> None:
         model = BranchModel(mesh, young=1e7, poisson=0.3, density=900.0, damping=damping,
                             fixed=np.array([0, 1, 2]))
         simulate_dynamics(model, times=np.array([0.0, 0.01]), sensitivities=ParameterSet())
+    rest = np.zeros_like(mesh.nodes)
+    model.equations().tangent(model, rest).solve_all(3 * [rest])
     progress(2 / 3, "compiling kernels")
     compile_kernels()
     progress(1.0, "compiling kernels")

@@ -129,10 +129,11 @@ def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndar
 
 def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) -> np.ndarray:
     """Change of an equilibrium by each nodal load, shape [c, node_count, 3]."""
-    tangent = model.equations(()).tangent(model, displacement)
+    tangent = model.equations(()).exact_tangent(model, displacement)
+    if tangent.is_positive_definite:
+        return np.array(tangent.solve_all(loads))
 
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(displacement, direction)
 
     return np.array([refined_solve(tangent, force, load, tolerance=1e-5) for load in loads])
-

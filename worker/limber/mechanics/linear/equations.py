@@ -94,16 +94,30 @@ class Tangent:
                 out.
             pin_moves: Prescribed means of the pinned patches [m], shape [pinned, 3]; default 0.
         """
+        return self.solve_all([right], pin_moves)[0]
+
+    def solve_all(self, rights: Sequence[np.ndarray], pin_moves: np.ndarray | None = None,
+                  ) -> list[np.ndarray]:
+        """Return the displacements for several forces, as :meth:`solve` does for one.
+
+        Args:
+            rights: As there, each.
+            pin_moves: As there, or for each of S forces its own, shape [3 pinned, S].
+        """
         equations = self.equations
         order = equations.pattern.order
-        solution = self._factor.solve(right[order].ravel())
+        solutions = self._factor.solve(np.stack([right[order].ravel() for right in rights], axis=1))
         if equations.pinned:
-            moves = 0.0 if pin_moves is None else np.ravel(pin_moves)
-            excess = equations.pin_rows.T @ solution - moves
-            solution = solution - self._pin_solutions @ np.linalg.solve(self._compliance, excess)
-        result = np.zeros_like(right)
-        result[order] = solution.reshape(-1, 3)
-        return result
+            moves = 0.0 if pin_moves is None else np.reshape(
+                pin_moves, (3 * len(equations.pinned), -1))
+            excess = equations.pin_rows.T @ solutions - moves
+            solutions = solutions - self._pin_solutions @ np.linalg.solve(self._compliance, excess)
+        results = []
+        for right, solution in zip(rights, solutions.T, strict=True):
+            result = np.zeros_like(right)
+            result[order] = solution.reshape(-1, 3)
+            results.append(result)
+        return results
 
 
 class Equations:
@@ -134,6 +148,7 @@ class Equations:
         # Factors that no tangent uses: their memory and symbolic part serve the next one.
         self._spare: list[Factor] = [make_factor(self.pattern)]
         self._twin = self._spare[0].twin
+        self._known: tuple[BranchModel, np.ndarray, Tangent] | None = None
         self._values = self.pattern.scratch_values()
         self._axes: dict[str, tuple[sp.csr_matrix, np.ndarray]] = {}
         self._pin_entries = [self._entries_of(grasp) for grasp in self.pinned]
@@ -147,8 +162,23 @@ class Equations:
         """Return the equations of the same tetrahedra elsewhere; pattern and memory are shared."""
         other = copy.copy(self)
         other.layout = LaneLayout(self.pattern, tets, gradients, weights)
-        other._axes = {}
+        other._axes, other._known = {}, None
         return other
+
+    def exact_tangent(self, model: "BranchModel", displacement: np.ndarray) -> Tangent:
+        """Return the tangent stiffness at a state; the last one, asked for again, is at hand.
+
+        A solve looks at it to see whether its end is stable; what differentiates that end, and
+        the solve that goes on from there, need it too.
+
+        Raises:
+            NotPositiveDefiniteError: as :meth:`tangent`.
+        """
+        known = self._known
+        if known is None or known[0] is not model or not np.array_equal(known[1], displacement):
+            tangent = self.tangent(model, displacement)
+            known = self._known = (model, displacement.copy(), tangent)
+        return known[2]
 
     def tangent(self, model: "BranchModel", displacement: np.ndarray, *,
                 increment: np.ndarray | None = None, viscous: Viscous | None = None,
@@ -164,6 +194,8 @@ class Equations:
             NotPositiveDefiniteError: it is not positive definite, however far its diagonal is
                 raised.
         """
+        # Its memory serves the one that is made now.
+        self._known = None
         return self.factorised(self.assemble(
             model, displacement, increment=increment, viscous=viscous, mass_factor=mass_factor),
             drag)

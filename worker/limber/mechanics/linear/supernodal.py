@@ -49,10 +49,17 @@ class SupernodalFactor:
             raise NotPositiveDefiniteError("a pivot is not positive")
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """Return the solution for right sides of shape [size] or [size, k]."""
+        """Return the solution for right sides of shape [size] or [size, k].
+
+        Three are solved in the time of one: it goes into reading the factor.
+        """
         f = self._fronts
         solution = np.array(right.reshape(len(right), -1).T, order="C")
-        for column in solution:
+        together = len(solution) // 3 * 3
+        for column in range(0, together, 3):
+            _solve_three(f.first, f.row_start, f.rows, f.panel, self._factor, self._inverse,
+                         *solution[column:column + 3])
+        for column in solution[together:]:
             _solve(f.first, f.row_start, f.rows, f.panel, self._factor, self._inverse, column)
         return np.ascontiguousarray(solution.T).reshape(right.shape)
 
@@ -283,3 +290,120 @@ def _solve(first, row_start, rows, panel, factor, inverse, x):
             x1 = (s1 - two[j + 2] * x2) * inverse[start + j + 1]
             x0 = (s0 - one[j + 1] * x1 - one[j + 2] * x2) * inverse[start + j]
             own[j], own[j + 1], own[j + 2] = x0, x1, x2
+
+
+@compiled
+def _solve_three(first, row_start, rows, panel, factor, inverse, x, y, z):
+    """As ``_solve``, of three right sides at once."""
+    count = len(first) - 1
+    tallest = 0
+    for s in range(count):
+        tallest = max(tallest, row_start[s + 1] - row_start[s])
+    t, u, v = (np.zeros(3 * tallest + PAD), np.zeros(3 * tallest + PAD),
+               np.zeros(3 * tallest + PAD))
+    for s in range(count):
+        width, start = 3 * (first[s + 1] - first[s]), 3 * first[s]
+        below = row_start[s + 1] - row_start[s]
+        pivots = (width + PAD - 1) // PAD * PAD
+        runs = (3 * below + PAD - 1) // PAD
+        height = pivots + PAD * runs
+        base = panel[s]
+        t[:PAD * runs] = 0.0
+        u[:PAD * runs] = 0.0
+        v[:PAD * runs] = 0.0
+        for j in range(0, width, 3):
+            at = base + j * height
+            one, two, three = (factor[at:at + height], factor[at + height:at + 2 * height],
+                               factor[at + 2 * height:at + 3 * height])
+            x0, x1, x2 = _down(x, start + j, one, two, j, inverse)
+            y0, y1, y2 = _down(y, start + j, one, two, j, inverse)
+            z0, z1, z2 = _down(z, start + j, one, two, j, inverse)
+            own, other, last = (x[start:start + width], y[start:start + width],
+                                z[start:start + width])
+            for i in range(j + 3, width):
+                a, b, c = one[i], two[i], three[i]
+                own[i] -= a * x0 + b * x1 + c * x2
+                other[i] -= a * y0 + b * y1 + c * y2
+                last[i] -= a * z0 + b * z1 + c * z2
+            one, two, three = one[pivots:], two[pivots:], three[pivots:]
+            for i in range(PAD * runs):
+                a, b, c = one[i], two[i], three[i]
+                t[i] += a * x0 + b * x1 + c * x2
+                u[i] += a * y0 + b * y1 + c * y2
+                v[i] += a * z0 + b * z1 + c * z2
+        for k in range(below):
+            to = 3 * rows[row_start[s] + k]
+            for axis in range(3):
+                x[to + axis] -= t[3 * k + axis]
+                y[to + axis] -= u[3 * k + axis]
+                z[to + axis] -= v[3 * k + axis]
+    for s in range(count - 1, -1, -1):
+        width, start = 3 * (first[s + 1] - first[s]), 3 * first[s]
+        below = row_start[s + 1] - row_start[s]
+        pivots = (width + PAD - 1) // PAD * PAD
+        runs = (3 * below + PAD - 1) // PAD
+        height = pivots + PAD * runs
+        base = panel[s]
+        t[:PAD * runs] = 0.0
+        u[:PAD * runs] = 0.0
+        v[:PAD * runs] = 0.0
+        for k in range(below):
+            to = 3 * rows[row_start[s] + k]
+            for axis in range(3):
+                t[3 * k + axis] = x[to + axis]
+                u[3 * k + axis] = y[to + axis]
+                v[3 * k + axis] = z[to + axis]
+        own, other, last = (x[start:start + width], y[start:start + width],
+                            z[start:start + width])
+        for j in range(width - 3, -1, -3):
+            at = base + j * height
+            one, two, three = (factor[at:at + height], factor[at + height:at + 2 * height],
+                               factor[at + 2 * height:at + 3 * height])
+            x0, x1, x2 = own[j], own[j + 1], own[j + 2]
+            y0, y1, y2 = other[j], other[j + 1], other[j + 2]
+            z0, z1, z2 = last[j], last[j + 1], last[j + 2]
+            for i in range(j + 3, width):
+                a, b, c = one[i], two[i], three[i]
+                x0 -= a * own[i]
+                x1 -= b * own[i]
+                x2 -= c * own[i]
+                y0 -= a * other[i]
+                y1 -= b * other[i]
+                y2 -= c * other[i]
+                z0 -= a * last[i]
+                z1 -= b * last[i]
+                z2 -= c * last[i]
+            low, middle, high = one[pivots:], two[pivots:], three[pivots:]
+            for i in range(PAD * runs):
+                a, b, c = low[i], middle[i], high[i]
+                x0 -= a * t[i]
+                x1 -= b * t[i]
+                x2 -= c * t[i]
+                y0 -= a * u[i]
+                y1 -= b * u[i]
+                y2 -= c * u[i]
+                z0 -= a * v[i]
+                z1 -= b * v[i]
+                z2 -= c * v[i]
+            _up(own, j, x0, x1, x2, one, two, inverse, start)
+            _up(other, j, y0, y1, y2, one, two, inverse, start)
+            _up(last, j, z0, z1, z2, one, two, inverse, start)
+
+
+@compiled
+def _down(x, at, one, two, j, inverse):
+    """Solve for a node's three unknowns on the way down, in place."""
+    x0 = x[at] * inverse[at]
+    x1 = (x[at + 1] - one[j + 1] * x0) * inverse[at + 1]
+    x2 = (x[at + 2] - one[j + 2] * x0 - two[j + 2] * x1) * inverse[at + 2]
+    x[at], x[at + 1], x[at + 2] = x0, x1, x2
+    return x0, x1, x2
+
+
+@compiled
+def _up(own, j, s0, s1, s2, one, two, inverse, start):
+    """The same on the way up."""
+    x2 = s2 * inverse[start + j + 2]
+    x1 = (s1 - two[j + 2] * x2) * inverse[start + j + 1]
+    x0 = (s0 - one[j + 1] * x1 - one[j + 2] * x2) * inverse[start + j]
+    own[j], own[j + 1], own[j + 2] = x0, x1, x2

@@ -103,7 +103,7 @@ class Path:
         """Try a step to ``part`` of the way; return the length taken, None if it failed."""
         settings, equations, held = self.settings, self.equations, self.equations.held
         try:
-            tangent = equations.tangent(self.model, self.displacement)
+            tangent = equations.exact_tangent(self.model, self.displacement)
         except NotPositiveDefiniteError:
             self.trouble = "the stiffness has no positive pivots"
             return None
@@ -234,7 +234,7 @@ class Path:
 
     def _is_stable(self, trial: np.ndarray) -> bool:
         """Whether no pivot of the exact tangent's factor is negative."""
-        return self.equations.tangent(self.model, trial).is_positive_definite
+        return self.equations.exact_tangent(self.model, trial).is_positive_definite
 
     def _result(self) -> StaticResult:
         stretch = principal_stretch(self.model, self.displacement)
