@@ -1,5 +1,6 @@
 """What an optimiser minimises: differences of simulated and measured, each over its deviation."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -284,6 +285,33 @@ class Objective:
                 response = span @ triangle
             found.append(RawSlopes(self.on_free(jacobian), errors, response, residual, kinds))
         return found
+
+    def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
+                        ) -> np.ndarray:
+        """Change of an evaluation's residuals by S things that change its pulls, shape [r, S].
+
+        Less what unknowns of a force and errors of cell and sensors would explain of it.
+
+        Args:
+            evaluation: With derivatives.
+            changes: Of each pull's predicted measurements.
+        """
+        rows, columns = [], []
+        for index, (piece, simulated, change) in enumerate(zip(
+                self.raw_slopes(evaluation), evaluation.pulls, changes, strict=True)):
+            row, column = self._standardised_slopes(
+                index, change.points, change.forces,
+                None if simulated.torques is None else change.torques,
+                change.grasps), piece.errors
+            if piece.response is not None:
+                span, _ = self._span(index, self.forwards[index].response)
+                row, column = (each - span @ (span.T @ each) for each in (row, column))
+            rows.append(row)
+            columns.append(column)
+        found = np.vstack(rows)
+        if self.cell_errors.count:
+            found = eliminated(np.zeros(len(found)), found, np.vstack(columns))[1]
+        return np.vstack([found, np.zeros((self.space.own_row_count, found.shape[1]))])
 
     def _by_errors(self, index: int, simulated: Simulated) -> tuple[ErrorSlopes, np.ndarray]:
         """What errors of cell and sensors do to a pull, and to its standardised residuals."""

@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.errors import WorkError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
-from limber.mechanics.sensitivities import static_sensitivities
-from limber.mechanics.statics.solve import solve_static
+from limber.mechanics.sensitivities import ParameterSet, explicit_forces
+from limber.sparse import NotPositiveDefiniteError
 
 RADIUS_POWER = 4.0
 """Bending stiffness is Young's modulus times radius to the fourth: one can stand for the other."""
@@ -126,22 +125,24 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
     coarse = model.with_parameters(young=weights @ young, gravity=(0.0, 0.0, 0.0))
     fine = BranchModel(refined(mesh), young=np.repeat(weights @ young, 8),
                        poisson=np.repeat(coarse.poisson, 8), density=900.0, gravity=None)
-    free = Grasp(grasp.nodes, grasp.weights, grasp.centre, "pinned")
-    missing, slopes = [], []
+    wanted = ParameterSet(("log_young",), weights, young)
     try:
-        for across in _across(free, mesh.nodes[coarse.fixed]):
-            ours, theirs = (solve_static(each, grasp=free, grasp_force=SMALL_FORCE_N * across
-                                         ).require() for each in (coarse, fine))
-            found = static_sensitivities(coarse, ours, free, weights, ("log_young",),
-                                         is_held=False, control_young=young)
-            # The refined mesh has the coarse one's nodes first.
-            extra = theirs.displacement[:mesh.node_count] - ours.displacement
-            size = np.linalg.norm(operator @ ours.displacement.ravel())
-            missing.append(operator @ extra.ravel() / size)
-            slopes.append(np.column_stack([
-                operator @ found.displacement[..., k].ravel() for k in range(len(young))]) / size)
-    except WorkError:
+        ours, theirs = (each.equations().tangent(each, np.zeros_like(each.mesh.nodes))
+                        for each in (coarse, fine))
+    except NotPositiveDefiniteError:
         return None
+    missing, slopes = [], []
+    for across in _across(grasp, mesh.nodes[coarse.fixed]):
+        load = np.zeros_like(fine.mesh.nodes)
+        # The refined mesh has the coarse one's nodes first.
+        load[grasp.nodes] = SMALL_FORCE_N * grasp.weights[:, None] * across
+        moved = ours.solve(load[:mesh.node_count])
+        size = np.linalg.norm(operator @ moved.ravel())
+        extra = theirs.solve(load)[:mesh.node_count] - moved
+        missing.append(operator @ extra.ravel() / size)
+        slopes.append(np.column_stack([
+            operator @ ours.solve(-partial).ravel()
+            for partial in explicit_forces(coarse, wanted, moved)]) / size)
     missing, slopes = np.concatenate(missing), np.vstack(slopes)
     together = slopes.sum(axis=1)
     alike = float(missing @ together / (together @ together))

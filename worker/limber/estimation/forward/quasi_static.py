@@ -1,5 +1,6 @@
 """A slow pull, simulated frame by frame as a chain of equilibria, with exact derivatives."""
 
+import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.gripper_path import force_for_travel
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
@@ -147,12 +149,15 @@ class QuasiStaticForward(Forward):
         d_torques = np.empty((len(self.keys), 3, count)) if with_torque and sensitivities else None
         states: list[_Memory | None] = []
         before: np.ndarray | None = None
+        is_asked = (sensitivities or self.watches_pose) and self.response is None and (
+            self.has_force_unknowns)
+        compliances: list[np.ndarray] = []
         for key, drive in enumerate(self._drives):
             memory = self._memory[key]
             same = memory is not None and equal_values(self._values, values)
             hint = None if self._hints is None else self._hints[key]
             result = memory.result if same else self._solved(
-                model, self._load(key, drive), memory, jump, before, hint)
+                model, self.load_at(key), memory, jump, before, hint)
             if result is None:
                 return None
             before = result.displacement
@@ -166,6 +171,9 @@ class QuasiStaticForward(Forward):
                 # About the recorded grasp point, which the patch's centre lies beside.
                 arm = drive[:3] - self.frames.poses[self.keys[key], :3]
                 torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
+            # While the factor of this state is at hand.
+            if is_asked:
+                compliances.append(compliance(model, before, self._loads[key]))
             if sensitivities:
                 slope, d_forces[key] = self._slopes(model, values, extra, result)
                 for column in range(count):
@@ -177,9 +185,8 @@ class QuasiStaticForward(Forward):
                                                          self.frames.poses[self.keys[key], :3])
             states.append(_Memory(result, slope))
         self._memory, self._values, self._hints = states, values, None
-        if (sensitivities or self.watches_pose) and self.response is None and (
-                self.has_force_unknowns):
-            self.response = self._response(model)
+        if is_asked:
+            self.response = self._response(compliances)
         return self._at_all_frames(points, forces, d_points, d_forces, torques, d_torques,
                                    *self._held(sensitivities))
 
@@ -210,9 +217,8 @@ class QuasiStaticForward(Forward):
         return replace(simulated, positions=simulated.positions + self.response.points @ change,
                        forces=np.full_like(simulated.forces, np.nan))
 
-    def _response(self, model: BranchModel) -> Response:
-        self._compliances = [compliance(model, memory.displacement, loads) for memory, loads in
-                             zip(self._memory, self._loads, strict=True)]
+    def _response(self, compliances: list[np.ndarray]) -> Response:
+        self._compliances = compliances
         components = len(self._loads[0])
         at_keys = np.array([[self._observed(moved) for moved in each]
                             for each in self._compliances])
@@ -226,9 +232,35 @@ class QuasiStaticForward(Forward):
         return nodal_loads(self.grasp, self.entry.grasp, self.frames.poses[frame],
                            self._model.mesh.nodes, 6 if self.uses_torque else 3)
 
-    def _load(self, key: int, drive: np.ndarray) -> np.ndarray:
-        """What a key frame is solved for: a pose, or nodal forces."""
+    def load_at(self, key: int) -> np.ndarray:
+        """What a key frame is solved for: a pose [m, rad], or nodal forces [N]."""
+        drive = self._drives[key]
         return drive if self.drive == "pose" else np.tensordot(drive, self._loads[key], axes=1)
+
+    def aside(self, nodes: np.ndarray) -> "QuasiStaticForward":
+        """Return the same pull of the branch with its nodes a little elsewhere [m], [n, 3].
+
+        The gripper holds the same nodes where it did; each tetrahedron keeps its material, and a
+        branch that hung as it was scanned hangs so still.
+        """
+        other = copy.copy(self)
+        model = self._model.with_rest_nodes(nodes)
+        other._model = model if self._model.hanging is None else model.as_scanned()
+        other.grasp = Grasp.of_nodes(other.mesh, self.grasp.nodes, self.grasp.mode,
+                                     np.array(self.entry.grasp.point_m))
+        if self.drive == "pose":
+            other._drives = [pose_on(other.grasp, self.entry.grasp, pose)
+                             for pose in self.frames.poses[self.keys]]
+        else:
+            other._loads = [other._loads_at(key) for key in self.keys]
+        return other
+
+    def place(self, displacement: np.ndarray) -> np.ndarray:
+        """Where the recorded grasp point is [m], shape [3]."""
+        arm = np.array(self.entry.grasp.point_m) - self.grasp.centre
+        pose = self.grasp.pose_of(self.mesh.nodes, displacement)
+        turn = rotation_matrix(pose[3:]) if self.grasp.mode == "clamped" else np.eye(3)
+        return pose[:3] + turn @ arm
 
     def _wrench_sigma(self, components: int) -> np.ndarray:
         sensor = self.entry.sensor

@@ -17,8 +17,6 @@ from limber.estimation.forward.forward import Simulated
 from limber.estimation.forward.input_force import Response
 from limber.estimation.forward.quasi_static import QuasiStaticForward, equal_values
 from limber.estimation.parameters import Values
-from limber.mechanics.grasp import rotation_matrix
-from limber.mechanics.model import BranchModel
 
 AT_REST_M = 5e-3
 """A first pose so near the grasp point is the branch at rest: what the sensor then reads is its
@@ -117,7 +115,7 @@ class WatchedForward(QuasiStaticForward):
         return simulated
 
     def _held(self, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        places = np.array([self._place(memory.displacement) for memory in self._memory])
+        places = np.array([self.place(memory.displacement) for memory in self._memory])
         self.grasp_tangent = self.spread @ np.array(
             [self._tangent(memory.displacement) for memory in self._memory])
         if not sensitivities:
@@ -126,19 +124,12 @@ class WatchedForward(QuasiStaticForward):
                                            memory.slope[self.grasp.nodes])
                                  for memory in self._memory])
 
-    def _response(self, model: BranchModel) -> Response:
-        found = super()._response(model)
+    def _response(self, compliances: list[np.ndarray]) -> Response:
+        found = super()._response(compliances)
         at_keys = np.array([[self.grasp.weights @ moved[self.grasp.nodes] for moved in each]
                             for each in self._compliances])
         grasps = np.einsum("fk,kci->fikc", self.spread, at_keys)
         return replace(found, grasps=grasps.reshape(*grasps.shape[:2], -1))
-
-    def _place(self, displacement: np.ndarray) -> np.ndarray:
-        """Where the recorded grasp point is, shape [3]."""
-        arm = np.array(self.entry.grasp.point_m) - self.grasp.centre
-        pose = self.grasp.pose_of(self.mesh.nodes, displacement)
-        turn = rotation_matrix(pose[3:]) if self.grasp.mode == "clamped" else np.eye(3)
-        return pose[:3] + turn @ arm
 
     def _tangent(self, displacement: np.ndarray) -> np.ndarray:
         """Of the branch at the grasp, shape [3]: the longest extent of what is near."""

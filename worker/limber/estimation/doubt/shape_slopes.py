@@ -1,0 +1,128 @@
+"""How a slow pull changes with the shape of the branch, to first order.
+
+All nodes X of the mesh go a way w aside, to another shape of the same tree. At a state u in balance
+the internal force f, the loads p and what holds the branch change with X, and the state follows:
+
+    K du = dp - df,      df = (f(X + s w, u) - f(X, u)) / s  for a small s,
+
+with the tangent stiffness K that belongs to the state. So one factor a key frame serves all shapes,
+at an assembled force and a solve each, where a mesh of its own would have to find its own states.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.nuisances import ErrorSlopes
+from limber.estimation.parameters import Values
+from limber.geometry.tets.tet_mesh import TetMesh
+from limber.mechanics.linear.equations import Tangent
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.sensitivities import reactions
+
+STEP = 1e-4
+"""Part of the way to another shape over which the force's derivative is taken: a branch turned by
+a radian answers far from linearly to the whole of a radius' change."""
+
+
+def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[TetMesh],
+                 ) -> ErrorSlopes:
+    """Return the change of a pull's observations by each of S other shapes.
+
+    Args:
+        forward: Simulated for ``values`` last.
+        values: The physical parameters.
+        meshes: The same tetrahedra with their nodes elsewhere.
+    """
+    here = _Pulled(forward, forward.model_with(values))
+    equations = here.model.equations((forward.grasp,) if here.is_held else ())
+    operator = point_operator(here.model.mesh, forward.rest_points)
+    others = [_aside(forward, values, mesh) for mesh in meshes]
+    elsewhere = [point_operator(mesh, forward.rest_points) - operator for mesh in meshes]
+    changes = []
+    for key, state in enumerate(forward.displacements()):
+        before = here.out_of_balance(key, state)
+        seen = here.seen(key, state, before)
+        tangent = equations.exact_tangent(here.model, state)
+        for there, ways, (moved, out) in zip(others, elsewhere, _followed(
+                here, others, key, state, tangent, before), strict=True):
+            points = operator @ moved.ravel() + ways @ state.ravel()
+            after = there.seen(key, state + STEP * moved, out)
+            changes.append([points.reshape(-1, 3), *(
+                (now - then) / STEP for now, then in zip(after, seen, strict=True))])
+    return ErrorSlopes(*(
+        np.einsum("fk,ks...->f...s", forward.spread, np.array(each).reshape(
+            -1, len(meshes), *each[0].shape)) for each in zip(*changes, strict=True)))
+
+
+@dataclass(frozen=True)
+class _Pulled:
+    """A pull on one shape, with the parameters in question."""
+
+    forward: QuasiStaticForward
+    model: BranchModel
+
+    @property
+    def is_held(self) -> bool:
+        return self.forward.drive == "pose"
+
+    def out_of_balance(self, key: int, state: np.ndarray) -> np.ndarray:
+        """Internal force less load [N], shape [n, 3]."""
+        load = self.model.weight_force
+        if not self.is_held:
+            load = load + self.forward.load_at(key)
+        return self.model.internal(state).force - load
+
+    def hold(self, key: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Displacement of the nodes that are clamped [n, 3], and what is missing of the mean of
+        those that are pinned [p, 3].
+        """
+        held, grasp = np.zeros_like(state), self.forward.grasp
+        if not self.is_held:
+            return held, np.empty((0, 3))
+        pose = self.forward.load_at(key)
+        if grasp.mode == "pinned":
+            return held, (pose[:3] - grasp.centre - grasp.weights @ state[grasp.nodes])[None]
+        held[grasp.nodes] = grasp.displacement(self.model.mesh.nodes, pose)
+        return held, np.empty((0, 3))
+
+    def seen(self, key: int, state: np.ndarray, out: np.ndarray,
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The gripper's force [N], its torque about the recorded place [N m], and its place [m].
+
+        Where a force leads, force and torque are what they are.
+        """
+        grasp, place = self.forward.grasp, self.forward.place(state)
+        if not self.is_held:
+            return np.zeros(3), np.zeros(3), place
+        about = self.forward.frames.poses[self.forward.keys[key], :3]
+        arms = (self.model.mesh.nodes + state)[grasp.nodes] - about
+        return (reactions([grasp], out)[0], np.cross(arms, out[grasp.nodes]).sum(axis=0), place)
+
+
+def _aside(forward: QuasiStaticForward, values: Values, mesh: TetMesh) -> _Pulled:
+    """A step of the way to another shape."""
+    nodes = forward.mesh.nodes
+    aside = forward.aside(nodes + STEP * (mesh.nodes - nodes))
+    return _Pulled(aside, aside.model_with(values))
+
+
+def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndarray,
+              tangent: Tangent, before: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """How the state follows to each of the others [m over the whole way], and what is out of
+    balance there after a step.
+    """
+    held, missing = here.hold(key, state)
+    moved, rights, pins, after = [], [], [], []
+    for there in others:
+        held_there, missing_there = there.hold(key, state)
+        moved.append((held_there - held) / STEP)
+        pins.append(np.ravel(missing_there - missing) / STEP)
+        after.append(there.out_of_balance(key, state))
+        rights.append((before - after[-1]) / STEP - here.model.tangent_times(state, moved[-1]))
+    found = tangent.solve_all(rights, np.column_stack(pins))
+    return [(led + free, out + STEP * here.model.tangent_times(state, led + free))
+            for led, free, out in zip(moved, found, after, strict=True)]
