@@ -50,7 +50,7 @@ def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
     scale = UNIT_METRES[settings.unit]
     skeleton = section_axis(
         surface, None if settings.root is None else np.array(settings.root) * scale)
-    alignment, surface, skeleton = _aligned(surface, skeleton, scale, settings)
+    alignment, surface, skeleton = aligned_body(surface, skeleton, scale, settings)
     thick = float(np.median(skeleton.radius))
     limits = MeshSettings(mesh_time_limit=settings.mesh_time_limit,
                           mesh_memory_limit_mb=settings.mesh_memory_limit_mb)
@@ -65,17 +65,25 @@ def mesh_body(surface: Surface, settings: MeshSurfaceSettings,
     mesh = mark(mesh, skeleton, young=settings.young, poisson=settings.poisson,
                 density=settings.density, fractions=FRACTIONS,
                 grasp_fraction=settings.grasp_fraction)
+    mesher = "ftetwild (cached)" if cached else "ftetwild"
+    return MeshedBody(alignment, skeleton, surface, mesh, numbers_of(
+        surface, skeleton, mesh, alignment, settings, mesher))
+
+
+def numbers_of(surface: Surface, skeleton: Skeleton, mesh: TetMesh, alignment: Alignment,
+               settings: MeshSurfaceSettings, mesher: str) -> dict[str, Any]:
+    """What the stage says of a body."""
     quality = measure_quality(mesh, surface.volume, skeleton, surface)
-    return MeshedBody(alignment, skeleton, surface, mesh, {
+    return {
         "point_count": len(surface.vertices), "node_count": skeleton.node_count,
         "branch_count": 1, "length_m": skeleton.length, "main_length_m": skeleton.length,
         "radius_min_m": float(skeleton.radius.min()),
         "radius_max_m": float(skeleton.radius.max()), "clamped_radius_count": 0,
         "surface_volume_m3": surface.volume, "mesh_volume_m3": quality.volume_m3,
-        "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count,
-        "mesher": "ftetwild (cached)" if cached else "ftetwild", "watertight": True,
-        "mesh_quality": quality.as_dict(), "peak_memory_mb": peak_memory_mb(),
-        "gravity_m_s2": gravity_after(alignment, settings.up)})
+        "tet_count": mesh.tet_count, "mesh_node_count": mesh.node_count, "mesher": mesher,
+        "watertight": True, "mesh_quality": quality.as_dict(),
+        "peak_memory_mb": peak_memory_mb(),
+        "gravity_m_s2": gravity_after(alignment, settings.up)}
 
 
 def section_axis(surface: Surface, root: np.ndarray | None, count: int = 24) -> Skeleton:
@@ -161,8 +169,9 @@ def _to_the_ends(centres: np.ndarray, radii: np.ndarray, axis: np.ndarray, low: 
     return Skeleton.from_edges(nodes, np.arange(len(nodes)) - 1, radius)
 
 
-def _aligned(surface: Surface, skeleton: Skeleton, scale: float, settings: MeshSurfaceSettings,
-             ) -> tuple[Alignment, Surface, Skeleton]:
+def aligned_body(surface: Surface, skeleton: Skeleton, scale: float,
+                 settings: MeshSurfaceSettings) -> tuple[Alignment, Surface, Skeleton]:
+    """From a file's coordinates to the body's own: its root at the origin, and upright."""
     from limber.geometry.skeleton.upright import upright_rotation
 
     root = skeleton.nodes[0]

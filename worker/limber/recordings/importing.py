@@ -197,7 +197,8 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     if settings.weight is not None and settings.load is not None:
         raise InputError("Both --weight and --load were given.", "One load hangs on the branch.",
                          "Give one of them.")
-    if settings.grasp_point is None:
+    sags = settings.weight == 0 and settings.own_weight
+    if settings.grasp_point is None and not sags:
         raise InputError("A load was given, but not where it hangs.",
                          "How far it bends the branch depends on that.", "Give --grasp-point.")
     if settings.motion == "dynamic":
@@ -221,11 +222,14 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
     _require_near(rest, name, branch.nodes)
     sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
     load = _load(settings, branch)
+    moved = positions[-1] - rest
+    # Of the branch's own weight alone no load hangs anywhere: where it is seen to sag most.
+    grasp = (_nearest(branch.nodes, rest[np.argmax(np.linalg.norm(moved, axis=1))])
+             if settings.grasp_point is None else _place(settings.grasp_point, settings, branch))
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
-                   grasp=_place(settings.grasp_point, settings, branch), sigma=sigma)
+                   grasp=grasp, sigma=sigma)
     entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER})
     _write_loaded(folder, name, entry, load, Observations(still.times, positions), branch)
-    moved = positions[-1] - rest
     if suspicion := _against(moved, load):
         progress.warn(f"{name}: {suspicion}")
     return {"frame_count": len(still.times), "point_count": len(used), "time_offset_s": 0.0,
@@ -290,6 +294,12 @@ def _require_on_branch(grasp: GraspEntry, name: str, nodes: np.ndarray | None) -
             "frame of reference or unit.",
             "Give --grasp-point on the branch (in the frame that --coordinates says), and check "
             "--unit.")
+
+
+def _nearest(nodes: np.ndarray, place: np.ndarray) -> tuple[float, float, float]:
+    """The node nearest to a place [m]."""
+    x, y, z = nodes[np.linalg.norm(nodes - place, axis=1).argmin()]
+    return float(x), float(y), float(z)
 
 
 def _require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:

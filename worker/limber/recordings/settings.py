@@ -45,7 +45,8 @@ class ImportSettings(Settings):
         "clamped", description="clamped: the gripper also turns the branch.")
     weight: float | None = Field(
         None, ge=0, description="No robot, but a weight of so many newtons that hangs at "
-        "--grasp-point: SOURCE shows the branch without it first, at rest under it last.")
+        "--grasp-point: SOURCE shows the branch without it first, at rest under it last. 0 with "
+        "--own-weight: held up first, it sags under its own weight.")
     load: tuple[float, float, float] | None = Field(
         None, description="The same for a steady force in any direction [N].")
     own_weight: bool = Field(

@@ -1,7 +1,8 @@
-"""Closed surface (STL, PLY, OBJ) to tetrahedra."""
+"""Closed surface (STL, PLY, OBJ), or a table of sections, to tetrahedra."""
 
+import json
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
 
@@ -13,13 +14,18 @@ from limber.stages.inputs import RunOptions, argument
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
+if TYPE_CHECKING:
+    from limber.geometry.surface.surface import Surface
+
 
 class MeshInputs(Settings):
-    """A closed surface, and the branch folder to make."""
+    """A closed surface or a table of sections, and the branch folder to make."""
 
     groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
 
-    surface: Path = argument("STL, PLY, OBJ or OFF.")
+    surface: Path = argument(
+        "STL, PLY, OBJ or OFF; or a CSV of sections along an axis from the end that is held: x, y, "
+        "z, width, height, and perhaps mass_kg, what hangs there.")
     output: Path = Field(description="The branch folder to make.",
                          json_schema_extra={"short": "-o"})
 
@@ -29,25 +35,27 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     """Fill a closed surface with tetrahedra and mark base, control points and grasp.
 
     Args:
-        path: STL, PLY, OBJ or OFF.
+        path: STL, PLY, OBJ or OFF, or a CSV of sections.
         folder: The branch folder to make or renew.
         settings: How.
         force: Run even if nothing has changed.
         progress: Called as it goes; gets what the user should know.
 
     Raises:
-        InputError: the surface cannot be read or is not that of one solid:
-            :func:`limber.geometry.surface.input.usable_surface`.
+        InputError: the surface cannot be read or is not that of one solid
+            (:func:`limber.geometry.surface.input.usable_surface`), or the table is none of
+            sections (:func:`limber.geometry.sections.read_sections`).
         MeshingError: fTetWild failed.
     """
-    from limber.constants import UNIT_METRES
     from limber.geometry.mesh_surface import mesh_body
-    from limber.geometry.surface.input import usable_surface
-    from limber.geometry.surface.surface import Surface
+    from limber.geometry.sections import mesh_sections, read_sections
 
     settings = settings or MeshSurfaceSettings()
-    surface, warnings = usable_surface(Surface.read(
-        require_file(path, "A surface"), scale=UNIT_METRES[settings.unit]), path)
+    path, warnings, drawn = require_file(path, "A surface"), [], None
+    if path.suffix.lower() == ".csv":
+        drawn = read_sections(path, settings.unit)
+    else:
+        surface, warnings = _usable(path, settings)
     branch = Branch.create(folder)
     digests = {"surface": file_digest(path)}
     if not force and branch.is_current("mesh", settings, digests=digests):
@@ -55,18 +63,30 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     for text in warnings:
         progress.warn(text)
     with branch.stage("mesh", settings, digests=digests) as stage:
-        made = mesh_body(surface, settings, progress)
+        made, masses = (mesh_sections(drawn, settings) if drawn is not None
+                        else (mesh_body(surface, settings, progress), []))
         stage.manifest.alignment = made.alignment
-        stage.manifest.source = {"file": Path(path).name, "unit": settings.unit,
+        stage.manifest.source = {"file": path.name, "unit": settings.unit,
                                  "sha256": digests["surface"]}
         made.skeleton.write_swc(stage.path("skeleton.swc"))
         made.surface.write_ply(stage.path("surface.ply"))
         made.mesh.write(stage.path("mesh.vtu"))
         for name in ("point_masses.json", "skeleton.csv"):
             stage.remove(name)  # of an earlier scan in this folder
+        if masses:
+            stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n",
+                                                       encoding="utf-8")
         stage.result.update(made.numbers | {"warnings": warnings})
         progress(1.0, "meshed", tets=made.mesh.tet_count)
     return branch.manifest.stages["mesh"].result
+
+
+def _usable(path: Path, settings: MeshSurfaceSettings) -> "tuple[Surface, list[str]]":
+    from limber.constants import UNIT_METRES
+    from limber.geometry.surface.input import usable_surface
+    from limber.geometry.surface.surface import Surface
+
+    return usable_surface(Surface.read(path, scale=UNIT_METRES[settings.unit]), path)
 
 
 def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,

@@ -71,7 +71,12 @@ def sweep_run(centres: np.ndarray, radius: np.ndarray, *, sides: int = 6) -> Tet
     """Linear tetrahedra of the tube with rings around ``centres`` [n, 3]: one slice a step."""
     tangent = tangents(centres)
     normals, binormals = frames(centres, tangent)
-    ring = rings(centres, radius, normals, binormals, sides)
+    return swept(centres, rings(centres, radius, normals, binormals, sides))
+
+
+def swept(centres: np.ndarray, ring: np.ndarray) -> TetMesh:
+    """Linear tetrahedra of the tube with these rings, shape [n, sides, 3], around ``centres``."""
+    sides = ring.shape[1]
     nodes = np.concatenate([centres[:, None], ring], axis=1).reshape(-1, 3)
     wedges = []
     for i in range(len(centres) - 1):

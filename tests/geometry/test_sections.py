@@ -1,0 +1,103 @@
+"""A body drawn as sections: its mesh, and Young's modulus from how it sags."""
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_trapezoid, trapezoid
+
+from limber.constants import STANDARD_GRAVITY
+from limber.errors import InputError
+from limber.estimation.settings import EstimateSettings
+from limber.geometry.sections import mesh_sections, read_sections
+from limber.geometry.settings import MeshSurfaceSettings
+from limber.mechanics.added import PointMass
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.statics.solve import solve_static
+from limber.recordings.settings import ImportSettings
+from limber.recordings.streams import Stream, write_stream
+from limber.stages.estimate import estimate
+from limber.stages.import_pull import import_pull
+from limber.stages.loading import load_point_masses
+from limber.stages.mesh import mesh_surface
+from limber.store import Branch
+
+LENGTH, YOUNG, DENSITY, HUNG = 0.5, 4e8, 800.0, 0.03
+WIDTH, HEIGHT = (0.024, 0.012), (0.014, 0.010)
+SETTINGS = MeshSurfaceSettings(upright=False, density=DENSITY)
+
+
+def table(path, *, columns="x_mm,y_mm,z_mm,width_mm,height_mm,mass_kg"):
+    """A level beam along x, wider than high, thinner outwards, with 30 g at its tip."""
+    rows = [[1e3 * LENGTH * share, 0.0, 0.0, *(1e3 * (a + share * (b - a)) for a, b in (
+        WIDTH, HEIGHT)), HUNG * (share == 1)] for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    path.write_text("\n".join([columns, *(",".join(map(str, row)) for row in rows)]) + "\n",
+                    encoding="utf-8")
+    return path
+
+
+def slender_sag(on_edge):
+    """Drop of the tip [m] by Euler and Bernoulli, section by section."""
+    x = np.linspace(0.0, LENGTH, 2001)
+    width, height = (a + x / LENGTH * (b - a) for a, b in (WIDTH, HEIGHT))
+    deep, wide = (width, height) if on_edge else (height, width)
+    weight = STANDARD_GRAVITY * DENSITY * np.pi / 4 * width * height
+    beyond = trapezoid(weight, x) - cumulative_trapezoid(weight, x, initial=0)
+    shear = beyond + HUNG * STANDARD_GRAVITY
+    moment = trapezoid(shear, x) - cumulative_trapezoid(shear, x, initial=0)
+    slope = cumulative_trapezoid(moment / (YOUNG * np.pi / 64 * wide * deep**3), x, initial=0)
+    return float(trapezoid(slope, x))
+
+
+@pytest.mark.parametrize("on_edge", [False, True])
+def test_drawn_ellipses_sag_as_slender_beams_do(tmp_path, on_edge):
+    """On the flat and on edge, under a small part of its weight: within 1 % of beam theory."""
+    body, masses = mesh_sections(read_sections(table(tmp_path / "beam.csv"), "m"), SETTINGS)
+    small, down = 1e-3, -np.eye(3)[1 if on_edge else 2]
+    gravity = small * STANDARD_GRAVITY * (np.array(body.alignment.rotation) @ down)
+    model = BranchModel(body.mesh, young=YOUNG, poisson=0.3, density=DENSITY, gravity=gravity,
+                        point_masses=[PointMass(tuple(m["attached_m"]), m["mass_kg"])
+                                      for m in masses])
+    moved = point_operator(body.mesh, body.skeleton.nodes[-1:]) @ solve_static(
+        model).require().displacement.ravel()
+    drop = float(moved @ gravity / np.linalg.norm(gravity)) / small
+    assert drop == pytest.approx(slender_sag(on_edge), rel=0.01)
+    assert body.mesh.volumes.sum() == pytest.approx(body.surface.volume, rel=1e-9)
+
+
+def test_own_sag_gives_the_modulus(tmp_path):
+    """Held up first, then sagging under its own weight and the 30 g: E within 2 %, covered."""
+    path = table(tmp_path / "beam.csv")
+    branch = tmp_path / "beam.branch"
+    mesh_surface(path, branch, SETTINGS)
+    assert sum(mass.mass for mass in load_point_masses(Branch.open(branch))) == HUNG
+    fine, masses = mesh_sections(read_sections(path, "m"),
+                                 SETTINGS.model_copy(update={"elements_across": 4.5}))
+    model = BranchModel(fine.mesh, young=YOUNG, poisson=0.35, density=DENSITY,
+                        gravity=fine.numbers["gravity_m_s2"], point_masses=[
+                            PointMass(tuple(m["attached_m"]), m["mass_kg"]) for m in masses])
+    places = fine.skeleton.nodes[1:]
+    moved = (point_operator(fine.mesh, places) @ solve_static(
+        model).require().displacement.ravel()).reshape(-1, 3)
+    times = np.arange(200) / 100
+    part = np.where(times > 0.3, 1 - np.exp(-30 * np.maximum(times - 0.3, 0)), 0.0)
+    seen = places + part[:, None, None] * moved + 5e-5 * np.random.default_rng(2).standard_normal(
+        (200, *moved.shape))
+    write_stream(tmp_path / "sag.csv", Stream(times, seen.reshape(200, -1), tuple(
+        f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
+    import_pull(branch, tmp_path / "sag.csv", "sag", ImportSettings(weight=0, own_weight=True))
+    found = estimate(branch, EstimateSettings(fractions=(0.5,), density_sigma=0.01))
+    low, high = found["young_interval_pa"][0]
+    assert found["young_pa"][0] == pytest.approx(YOUNG, rel=0.02)
+    assert low < YOUNG < high and high / low < 1.2
+
+
+def test_what_is_no_table_of_sections_is_refused(tmp_path):
+    """A column missing, a thickness of nothing: it says which."""
+    with pytest.raises(InputError, match="columns x_mm,y_mm,z_mm,width_mm,depth_mm".replace(
+            ",", ", ")):
+        read_sections(table(tmp_path / "a.csv",
+                            columns="x_mm,y_mm,z_mm,width_mm,depth_mm,mass_kg"), "m")
+    wrong = table(tmp_path / "b.csv").read_text(encoding="utf-8").replace("24.0,", "0.0,", 1)
+    (tmp_path / "b.csv").write_text(wrong, encoding="utf-8")
+    with pytest.raises(InputError, match="thickness"):
+        read_sections(tmp_path / "b.csv", "m")
