@@ -38,7 +38,8 @@ def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[R
                        quick),
             truth_scans.scan_row(2 if quick else 30, progress.part(0.6, 0.9), scans, seed),
             bad_recordings_row(progress.part(0.9, 0.92), seed),
-            *truth_beam.rows(progress.part(0.92, 0.95), seed),
+            *truth_beam.rows(progress.part(0.92, 0.94), seed),
+            truth_beam.sag_row(4 if quick else 20, progress.part(0.94, 0.95), seed),
             *truth_states.rows(quick, progress.part(0.95, 1.0), seed)]
 
 

@@ -7,13 +7,22 @@ import numpy as np
 
 from benchmarks import silicone_beam
 from benchmarks.table import Row
+from limber.errors import LimberError
 from limber.estimation.settings import EstimateSettings, PredictSettings
+from limber.geometry.sections import Sections, mesh_sections, read_sections
+from limber.geometry.settings import MeshSurfaceSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.marks import mark
+from limber.mechanics.added import PointMass
+from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
+from limber.mechanics.statics.solve import solve_static
 from limber.progress import Progress
 from limber.recordings.settings import ImportSettings
+from limber.recordings.streams import Stream, write_stream
 from limber.stages.estimate import estimate
 from limber.stages.import_pull import import_pull
+from limber.stages.mesh import mesh_surface
 from limber.stages.predict import predict
 from limber.store import Branch
 
@@ -99,6 +108,73 @@ def _drop_row(folder: Path, young: float, drawn: int) -> Row:
     return Row("drops under other loads, simulated recordings", "3 % and inside their interval",
                f"{100 * worst:.1f} %, {held} of {len(OTHER_LOADS_N)} inside: {'; '.join(told)}",
                bool(worst <= 0.03 and held == len(OTHER_LOADS_N)))
+
+
+def sag_row(count: int, progress: Progress, seed: int) -> Row:
+    """Drawn beams of elliptic sections, thinner outwards, that sag under their own weight."""
+    errors, held, refused = [], 0, []
+    for number in range(count):
+        progress(number / count, f"a drawn beam sags, {number + 1} of {count}")
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                error, is_held = _sagging(Path(folder), np.random.default_rng([seed, 42, number]))
+            except LimberError as refusal:
+                refused.append(str(refusal)[:80])
+                continue
+        errors.append(error)
+        held += is_held
+    worst = 100 * max(errors, default=np.inf)
+    return Row("tapered beam with elliptic sections under its own weight", "5 %, covered",
+               f"worst {worst:.1f} %, median {100 * np.median(errors or [np.inf]):.1f} %, "
+               f"{held} of {count} covered{'; '.join(['', *refused[:2]])}",
+               bool(worst <= 5 and held >= np.ceil(0.88 * count) and not refused))
+
+
+def _sagging(folder: Path, rng: np.random.Generator) -> tuple[float, bool]:
+    """Relative error of E, and whether its interval holds the truth, of one drawn beam.
+
+    Density and hung masses are weighed to 1 %; Poisson's ratio is a book's.
+    """
+    young = float(np.exp(rng.uniform(*np.log([3e8, 4e9]))))
+    density, poisson = rng.uniform(500, 1100), float(np.clip(rng.normal(0.35, 0.05), 0.2, 0.47))
+    table = _drawn_table(folder / "beam.csv", rng)
+    told = MeshSurfaceSettings(unit="mm", density=density * rng.normal(1, 0.01), young=1e9)
+    mesh_surface(folder / "beam.csv", folder / "beam.branch", told)
+    fine, masses = mesh_sections(table, told.model_copy(update={"elements_across": 4.0}))
+    model = BranchModel(
+        fine.mesh, young=young, poisson=poisson, density=density,
+        gravity=fine.numbers["gravity_m_s2"], point_masses=[
+            PointMass(tuple(m["attached_m"]), m["mass_kg"] * rng.normal(1, 0.01)) for m in masses])
+    places = fine.skeleton.nodes[1:]
+    moved = (point_operator(fine.mesh, places) @ solve_static(
+        model).require().displacement.ravel()).reshape(-1, 3)
+    times = np.arange(300) / 100
+    part = np.where(times > 0.5, 1 - np.exp(-12 * np.maximum(times - 0.5, 0)), 0.0)
+    seen = places + part[:, None, None] * moved
+    seen = seen + 2e-4 * rng.standard_normal(seen.shape)
+    write_stream(folder / "sag.csv", Stream(times, seen.reshape(len(times), -1), tuple(
+        f"m{k}_{axis}_m" for k in range(len(places)) for axis in "xyz")))
+    import_pull(folder / "beam.branch", folder / "sag.csv", "sag",
+                ImportSettings(weight=0, own_weight=True))
+    found = estimate(folder / "beam.branch", EstimateSettings(fractions=(0.5,),
+                                                              density_sigma=0.01))
+    low, high = found["young_interval_pa"][0]
+    return abs(found["young_pa"][0] / young - 1), bool(low <= young <= high)
+
+
+def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
+    """A level axis that bends aside a little, six sections, masses at two of them."""
+    share = np.linspace(0, 1, 6)
+    length, width = rng.uniform(400, 800), rng.uniform(12, 30)
+    height = width * rng.uniform(0.5, 1.6)
+    thinner = 1 - share * rng.uniform(0.2, 0.6)
+    aside = rng.uniform(-0.1, 0.1) * length * share**2
+    mass = np.zeros(6)
+    mass[rng.choice(np.arange(2, 6), 2, replace=False)] = rng.uniform(0.0, 0.05, 2)
+    rows = np.column_stack([length * share, aside, 0 * share, width * thinner, height * thinner,
+                            mass])
+    np.savetxt(path, rows, "%.9g", ",", header="x,y,z,width,height,mass_kg", comments="")
+    return read_sections(path, "mm")
 
 
 def _real_row(folder: Path) -> Row:

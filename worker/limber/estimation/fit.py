@@ -18,7 +18,13 @@ from limber.estimation.doubt.identifiability import (
     link_unresolved,
     require_scale,
 )
-from limber.estimation.doubt.model_error import ModelError, geometry_error, mesh_error
+from limber.estimation.doubt.model_error import (
+    ModelError,
+    geometry_error,
+    mesh_error,
+    observer,
+    steady_loads,
+)
 from limber.estimation.doubt.path_error import led_by_path, path_error
 from limber.estimation.doubt.shape_error import shape_error
 from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
@@ -37,7 +43,6 @@ from limber.estimation.preparation import (
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import led_start, scaled_start
-from limber.mechanics.points import point_operator
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import force_unit_suspicion
 from limber.recordings.grasping import grasp_on
@@ -447,10 +452,13 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
     error = _geometry_error(subject, found, settings, axes, cloud, progress)
     if settings.mesh_check:
         progress(1.0, "how much the mesh is too stiff")
-        inside = point_operator(subject.mesh, subject.control_points)
-        model = subject.model.with_parameters(poisson=found.values.poisson)
-        stiff = mesh_error(model, grasp_on(subject.mesh, grasp), inside, subject.weights,
-                           found.values.young)
+        held = grasp_on(subject.mesh, grasp)
+        model = subject.model.with_parameters(poisson=found.values.poisson,
+                                              density=found.values.density)
+        forwards = found.objective.forwards
+        seen = observer(subject.mesh, forwards, held, subject.control_points)
+        stiff = mesh_error(model, held, seen, subject.weights, found.values.young,
+                           steady_loads(forwards))
         if stiff is not None:
             error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
     found.model_error = replace(error, path=_path_error(found, progress))

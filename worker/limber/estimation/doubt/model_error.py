@@ -6,15 +6,19 @@ says how sure each radius is, and a finer mesh how much stiffer this one is than
 """
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy import sparse
 from scipy.spatial import cKDTree
 
+from limber.estimation.forward.forward import Forward
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
+from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces
 from limber.sparse import NotPositiveDefiniteError
 
@@ -22,8 +26,8 @@ RADIUS_POWER = 4.0
 """Bending stiffness is Young's modulus times radius to the fourth: one can stand for the other."""
 REFINED_LIMIT = 60_000
 """Tetrahedra of a refined mesh from which its check is left out: it would take minutes."""
-SMALL_FORCE_N = 1e-6
-"""Far below what bends any branch visibly: the response is linear."""
+SMALL = 1e-6
+"""Displacement over the length of an element at which the response is linear."""
 REMAINING = 4 / 3
 """Error over its drop when edges are halved, at second order."""
 UNSURE = 1 / 3
@@ -102,19 +106,34 @@ class MeshStiffness:
     deviation: np.ndarray
 
 
+@dataclass(frozen=True)
+class SmallLoad:
+    """What bends a branch a little: a force at the grasp, and weight.
+
+    Attributes:
+        force: Shape [3].
+        gravity: Shape [3].
+    """
+
+    force: np.ndarray
+    gravity: np.ndarray
+
+
 def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.ndarray,
-               young: np.ndarray) -> MeshStiffness | None:
+               young: np.ndarray, loads: Sequence[SmallLoad] = ()) -> MeshStiffness | None:
     """Find how much the mesh is too stiff.
 
-    A small force bends the branch on this mesh and on a refined one; the moduli that make this
-    one bend like the refined one differ by the mesh's error.
+    Loads bend the branch a little on this mesh and on a refined one; the moduli that make this
+    one bend like the refined one differ by the mesh's error. That is not the same everywhere (most
+    of it stands at the clamp), nor for every load: it is looked at where the fit looked.
 
     Args:
-        model: The branch; gravity is left out.
-        grasp: Where the force acts.
-        operator: Displacement of points inside from the nodes', shape [3 m, 3 n]; sparse.
+        model: The branch; its own gravity is left out.
+        grasp: Where a force acts.
+        operator: Displacement of what was observed from the nodes', shape [3 m, 3 n]; sparse.
         weights: Part of each control point in each tetrahedron, shape [tet_count, K].
         young: At the control points [Pa], shape [K].
+        loads: Of any size; without them two forces across the branch.
 
     Returns:
         None where the refined mesh is too large, or gives no answer.
@@ -124,7 +143,8 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
         return None
     coarse = model.with_parameters(young=weights @ young, gravity=(0.0, 0.0, 0.0))
     fine = BranchModel(refined(mesh), young=np.repeat(weights @ young, 8),
-                       poisson=np.repeat(coarse.poisson, 8), density=900.0, gravity=None)
+                       poisson=np.repeat(coarse.poisson, 8), density=np.repeat(coarse.density, 8),
+                       gravity=None, point_masses=coarse.point_masses)
     wanted = ParameterSet(("log_young",), weights, young)
     try:
         ours, theirs = (each.equations().tangent(each, np.zeros_like(each.mesh.nodes))
@@ -132,17 +152,22 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
     except NotPositiveDefiniteError:
         return None
     missing, slopes = [], []
-    for across in _across(grasp, mesh.nodes[coarse.fixed]):
-        load = np.zeros_like(fine.mesh.nodes)
-        # The refined mesh has the coarse one's nodes first.
-        load[grasp.nodes] = SMALL_FORCE_N * grasp.weights[:, None] * across
-        moved = ours.solve(load[:mesh.node_count])
+    for load in loads or [SmallLoad(across, np.zeros(3)) for across in _across(
+            grasp, mesh.nodes[coarse.fixed])]:
+        moved, more = (tangent.solve(_nodal(each, grasp, load)) for each, tangent in (
+            (coarse, ours), (fine, theirs)))
         size = np.linalg.norm(operator @ moved.ravel())
-        extra = theirs.solve(load)[:mesh.node_count] - moved
-        missing.append(operator @ extra.ravel() / size)
+        if size == 0:
+            continue
+        # The refined mesh has the coarse one's nodes first.
+        missing.append(operator @ (more[:mesh.node_count] - moved).ravel() / size)
+        # So little that the force is linear in it.
+        little = SMALL * model.mean_edge / np.abs(moved).max()
         slopes.append(np.column_stack([
             operator @ ours.solve(-partial).ravel()
-            for partial in explicit_forces(coarse, wanted, moved)]) / size)
+            for partial in explicit_forces(coarse, wanted, little * moved)]) / (size * little))
+    if not missing:
+        return None
     missing, slopes = np.concatenate(missing), np.vstack(slopes)
     together = slopes.sum(axis=1)
     alike = float(missing @ together / (together @ together))
@@ -153,6 +178,38 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
     count = len(young)
     return MeshStiffness(np.full(count, np.exp(-REMAINING * alike)),
                          np.hypot(UNSURE * alike, REMAINING * apart) * np.ones(count))
+
+
+def observer(mesh: TetMesh, forwards: Sequence[Forward], grasp: Grasp, points: np.ndarray,
+             ) -> sparse.csr_matrix:
+    """Displacement of what pulls observed from that of the nodes, shape [3 m, 3 n].
+
+    The points; and the gripper, where its path and force were measured together.
+
+    Args:
+        points: Taken where no pull observes any [m], shape [k, 3].
+    """
+    places = [forward.rest_points for forward in forwards if len(forward.rest_points)]
+    rows = [point_operator(mesh, np.unique(np.vstack(places), axis=0) if places else points)]
+    if any(not forward.force_is_stated for forward in forwards):
+        mean = sparse.csr_matrix((grasp.weights, (np.zeros(len(grasp.nodes), int), grasp.nodes)),
+                                 shape=(1, mesh.node_count))
+        rows.append(sparse.kron(mean, sparse.identity(3)))
+    return sparse.vstack(rows, format="csr")
+
+
+def steady_loads(forwards: Sequence[Forward]) -> list[SmallLoad]:
+    """The stated loads of pulls without a robot, with the weight that bent the branch as well."""
+    return [SmallLoad(forward.frames.wrenches[-1, :3],
+                      np.array(forward.entry.gravity_m_s2 or (0.0, 0.0, 0.0)))
+            for forward in forwards if forward.force_is_stated]
+
+
+def _nodal(model: BranchModel, grasp: Grasp, load: SmallLoad) -> np.ndarray:
+    """Forces on the nodes [N], shape [n, 3]."""
+    forces = model.mass_load[:, None] * load.gravity
+    forces[grasp.nodes] += grasp.weights[:, None] * load.force
+    return forces
 
 
 def _across(grasp: Grasp, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
