@@ -5,12 +5,13 @@ are tighter by a margin: what 95 % of the samples near the limit, each left out 
 are missed by at most. Whether a limit is kept is decided on the full model alone.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from limber.errors import InputError
 from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.obstacles import Obstacle, closest
 from limber.planning.resolve import SolvedPoses
 from limber.planning.settings import PlanSettings
 
@@ -49,6 +50,7 @@ class Limits:
         force: Magnitude of the gripper's [N].
         strain: Largest principal anywhere in the branch.
         low, high: Box that the grasp stays in [m], shape [3].
+        obstacles: Bodies that the branch must not meet.
     """
 
     energy: float = np.inf
@@ -56,6 +58,34 @@ class Limits:
     strain: float = np.inf
     low: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
+    obstacles: tuple[Obstacle, ...] = ()
+
+    def with_cell(self, low: np.ndarray | None, high: np.ndarray | None, force: float,
+                  obstacles: tuple[Obstacle, ...]) -> "Limits":
+        """Return the limits with those of a robot's cell besides.
+
+        Raises:
+            InputError: the workspaces have nothing in common.
+        """
+        both = replace(self, force=min(self.force, force), obstacles=obstacles,
+                       low=self.low if low is None else np.maximum(self.low, low),
+                       high=self.high if high is None else np.minimum(self.high, high))
+        if not (both.low < both.high).all():
+            raise InputError("The workspace and that of the cell have nothing in common.",
+                             f"Together they go from {both.low} to {both.high} m.",
+                             "Correct --workspace-low and --workspace-high, or the cell file.")
+        return both
+
+    def met(self, states: SolvedPoses, nodes: np.ndarray) -> str | None:
+        """Return in words where the branch, with ``nodes`` [n, 3] at rest, meets an obstacle."""
+        if not self.obstacles:
+            return None
+        places = (nodes + states.displacements).reshape(-1, 3)
+        if (hit := closest(self.obstacles, places)) is None:
+            return None
+        name, depth, where = hit
+        place = ", ".join(f"{x:.3f}" for x in where)
+        return f"the branch is {1e3 * depth:.1f} mm inside {name} at ({place}) m"
 
     @classmethod
     def of(cls, settings: PlanSettings) -> "Limits":

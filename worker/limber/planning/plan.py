@@ -51,8 +51,11 @@ class PlannedMotion:
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
-                workers: int | None = None, progress: Progress = SILENT) -> PlannedMotion:
+                limits: Limits | None = None, workers: int | None = None,
+                progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
+
+    ``limits`` are the settings' where not given; those of a robot's cell come in this way.
 
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and it is planned anew, at most
@@ -67,7 +70,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     one_thread()
     goal = _goal(field, settings)
     start = _start(field, goal, settings)
-    limits = Limits.of(settings)
+    limits = limits or Limits.of(settings)
     rounds: list[dict[str, Any]] = []
     pair = baseline = None
     for number in range(settings.replans + 1):
@@ -85,6 +88,10 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             workers, ahead.part(0.3, 0.95))
         baseline = other[0] if other else baseline
         broken = broken_on_full_model(plan, limits, goal)
+        if met := limits.met(plan.approach.joined(plan.solved), grasp_model.mesh.nodes):
+            raise NoPathError(f"On the planned way {met}.",
+                              "Paths are checked against obstacles, and not yet led around them.",
+                              "Choose another goal, or a workspace that keeps clear of it.")
         off = field_error(field, plan.solved)
         rounds.append({"broken": broken, "sample_count": len(field.samples.poses),
                        "margins": pair.margins, "field_energy_error": off,

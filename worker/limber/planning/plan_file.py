@@ -12,7 +12,7 @@ promised), ``joints_rad`` [n][6] where a robot is given; ``motion`` also ``phase
 
 ``timing`` says where times come from: today one speed of the gripper throughout, no acceleration
 limited. ``limits`` has for each limit asked for its value, the peak of the motion and the margin.
-``robot`` is null until plans are made for one.
+``robot`` is null for plans that were not made in a robot's cell.
 
 Format 1 had no version, no motion, and the sizes of forces alone. It is read as well.
 """
@@ -138,7 +138,8 @@ def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,
     """
     content = {
         "format_version": FORMAT, **summary, "targets": sorted(plan.targets),
-        "timing": {"kind": "constant speed", "speed_m_s": SPEED}, "limits": limits, "robot": None,
+        "timing": {"kind": "constant speed", "speed_m_s": SPEED}, "limits": limits,
+        "robot": summary.get("robot"),
         "baseline": summary["baseline"] | _columns(baseline),
         "plan": summary["plan"] | _columns(plan), "motion": _columns(motion)}
     return json.dumps(plain(content), allow_nan=False, indent=1) + "\n"

@@ -109,7 +109,7 @@ def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: P
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses and forces of the grasp from rest to the path's end, and the branch's axis there."""
     from limber.planning.field.grasp_model import refusal
-    from limber.stages.loading import load_grasp_model, load_skeleton
+    from limber.stages.loading import axis_at, load_grasp_model, load_skeleton
 
     path = branch.require(f"plans/{name}.csv", "plan")
     table = np.genfromtxt(path, delimiter=",", names=True)
@@ -136,12 +136,7 @@ def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: P
         progress(0.02 + 0.38 * number / len(positions), "forces along the path")
     poses = np.array(poses)
     poses[:, :3] = positions
-    skeleton = load_skeleton(branch)
-    nearest = int(np.argmin(np.linalg.norm(skeleton.nodes - rest, axis=1)))
-    parent = int(skeleton.parent[nearest])
-    other = nearest if parent >= 0 else 1
-    axis = skeleton.nodes[other] - skeleton.nodes[int(skeleton.parent[other])]
-    return poses, np.array(forces), axis
+    return poses, np.array(forces), axis_at(load_skeleton(branch), rest)
 
 
 def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:

@@ -10,6 +10,7 @@ import csv
 import io
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -17,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.errors import BranchFolderError, InputError
+from limber.files import file_digest
 from limber.plain import plain
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
@@ -27,8 +29,10 @@ from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
     from limber.planning.field.grasp_model import GraspModel
+    from limber.planning.limits import Limits
     from limber.planning.plan import PlannedMotion
     from limber.planning.plan_file import Way
+    from limber.robot.cell import Cell
 
 
 _MOST_NODES = 2000  # of a search tree in its file; those that carry the most others stay
@@ -42,13 +46,17 @@ _MOTION_COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "fx
 class PlanInputs(BranchInputs):
     """A branch folder, and the plan's name."""
 
-    groups: ClassVar[Groups] = {"output": ("name",)}
+    groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
 
+    cell: Path | None = Field(None, description=(
+        "The robot's cell file: its workspace, force limit and obstacles hold, and its arm must "
+        "reach all of the way."))
     name: str = Field("path", description="Name of the plan's files.")
 
 
-def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: int | None = None,
-         force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
+def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
+         cell_file: Path | None = None, workers: int | None = None, force: bool = False,
+         progress: Progress = SILENT) -> dict[str, Any]:
     """Plan paths on the branch's energy field.
 
     Writes ``plans/NAME.json``, csv files of both paths, the whole motion and the search trees, and
@@ -61,8 +69,11 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
     """
     from limber.planning.field.energy_field import EnergyField
     from limber.planning.field.sampling import energy_inputs
+    from limber.planning.limits import Limits
     from limber.planning.plan import plan_motion
-    from limber.stages.loading import load_grasp_model
+    from limber.planning.plan_file import whole_motion
+    from limber.stages.loading import axis_at, load_grasp_model, load_skeleton
+    from limber.stages.plan_cell import reached_by
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
             ("-baseline", "-motion", "-trees")):
@@ -81,35 +92,59 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path", workers: i
             "The energy field is of another mesh, material, weight or of other targets.",
             "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
             "Run `limber energy` again.")
+    in_cell = None if cell_file is None else _InCell.of(branch, cell_file, settings, progress)
+    if in_cell is not None:
+        digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
     inputs = {"reads": ["energy.npz"], "digests": digests}
     if not force and branch.is_current(key, settings, **inputs):
         return branch.manifest.stages[key].result
     with branch.stage(key, settings, **inputs) as stage:
         field = EnergyField.read(field_path)
-        found = plan_motion(field, grasp_model, settings, workers=workers, progress=progress)
+        limits = Limits.of(settings) if in_cell is None else in_cell.limits
+        found = plan_motion(field, grasp_model, settings, limits=limits, workers=workers,
+                            progress=progress)
+        motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets))
+        if in_cell is not None:
+            progress(0.95, "inverse kinematics")
+            axis = axis_at(load_skeleton(branch), grasp_model.rest_position)
+            found.summary["robot"] = reached_by(in_cell.cell, motion, axis, limits.obstacles)
         progress(0.95, "writing")
-        _write(stage, name, settings, grasp_model, found)
+        _write(stage, name, limits, motion, grasp_model, found)
         stage.result.update(found.summary)
     progress(1.0, "planned")
     return branch.manifest.stages[key].result
 
 
-def _write(stage: Stage, name: str, settings: PlanSettings, grasp_model: GraspModel,
+@dataclass(frozen=True)
+class _InCell:
+    """A cell, and the limits that hold in it."""
+
+    cell: Cell
+    limits: Limits
+
+    @classmethod
+    def of(cls, branch: Branch, path: Path, settings: PlanSettings, progress: Progress,
+           ) -> _InCell:
+        from limber.planning.limits import Limits
+        from limber.stages.plan_cell import cell_for, cell_obstacles, limits_in
+
+        cell = cell_for(branch, path, progress)
+        return cls(cell, limits_in(cell, Limits.of(settings), cell_obstacles(cell, path.parent)))
+
+
+def _write(stage: Stage, name: str, limits: Limits, motion: Way, grasp_model: GraspModel,
            found: PlannedMotion) -> None:
     from limber.mechanics.frames import surface_fields, write_pc2
     from limber.mechanics.strain import strain_state
-    from limber.planning.limits import Limits
-    from limber.planning.plan_file import limits_of_motion, plan_text, way_of, whole_motion
+    from limber.planning.plan_file import limits_of_motion, plan_text, way_of
 
     names = tuple(target.name for target in grasp_model.branch.targets)
     baseline, plan = (way_of(path.solved, names,
                              field_energies=found.field.energy(path.solved.poses[:, :3]))
                       for path in (found.baseline, found.plan))
-    motion = whole_motion(found.plan, names)
-    limits = limits_of_motion(motion, Limits.of(settings))
-    stage.path(f"plans/{name}.json").write_text(
-        plan_text(found.summary, baseline, plan, motion, limits), encoding="utf-8")
+    stage.path(f"plans/{name}.json").write_text(plan_text(
+        found.summary, baseline, plan, motion, limits_of_motion(motion, limits)), encoding="utf-8")
     stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
     stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
     stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")
@@ -166,7 +201,8 @@ def _csv(columns: tuple[str, ...], rows: np.ndarray, phases: tuple[str, ...] | N
 def run(inputs: PlanInputs, settings: PlanSettings, options: ParallelOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
-    return plan(inputs.branch_folder, settings, name=inputs.name, workers=options.workers,
+    return plan(inputs.branch_folder, settings, name=inputs.name, cell_file=inputs.cell,
+                workers=options.workers,
                 force=options.force, progress=progress)
 
 

@@ -1,0 +1,81 @@
+"""Plans made in a robot's cell: reach, workspace, obstacles, and cells that do not fit."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError, NoPathError
+from limber.planning.compare import PlanSettings
+from limber.planning.plan_file import read_plan
+from limber.robot.cell import Cell, write_cell
+from limber.stages.plan import plan as plan_paths
+from limber.store import Branch
+
+SETTINGS = PlanSettings(iterations=300)
+
+
+@pytest.fixture
+def copied(planned_branch, tmp_path):
+    return shutil.copytree(planned_branch, tmp_path / "copy.branch")
+
+
+def cell_file(folder, **content):
+    path = folder.parent / "cell.toml"
+    write_cell(path, Cell(**{
+        "branch": Branch.open(folder).uuid, "robot": {"model": "ur5e"},
+        "base": {"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)}, "tool": {"grasp_pose": (0, 0, 0.15, 0, 0, 0)}
+    } | content))
+    return path
+
+
+def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
+    """With singularity and joint margins in the file; its force limit holds."""
+    plan_paths(copied, SETTINGS, name="reached", cell_file=cell_file(copied), workers=1)
+    plan = read_plan(copied / "plans/reached.json")
+    assert plan.summary["robot"]["model"] == "ur5e"
+    assert plan.summary["robot"]["singularity_distance"] > 0.05
+    assert plan.summary["limits"]["force_n"]["limit"] == 10.0
+
+
+def test_a_robot_too_far_away_refuses_the_plan(copied):
+    far = cell_file(copied, base={"pose": (3.0, 0.1, 0.0, 0, 0, 0.4)})
+    with pytest.raises(NoPathError, match="reach") as refused:
+        plan_paths(copied, SETTINGS, name="far", cell_file=far, workers=1)
+    assert refused.value.exit_code == 3 and not (copied / "plans/far.json").exists()
+
+
+def test_a_branch_that_meets_an_obstacle_refuses_the_plan(copied):
+    """A box where the path leads; the message names it and the place."""
+    path = read_plan(copied / "plans/there.json").plan.poses[:, :3]
+    blocked = cell_file(copied, obstacles=({
+        "kind": "box", "name": "the post", "size_m": (0.02, 0.02, 0.02),
+        "pose": (*map(float, path[-1]), 0, 0, 0)},))
+    goal = tuple(map(float, path[-1]))
+    with pytest.raises(NoPathError, match="inside the post at"):
+        plan_paths(copied, PlanSettings(iterations=300, goal=goal), name="hit",
+                   cell_file=blocked, workers=1)
+
+
+def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):
+    path = read_plan(copied / "plans/there.json").plan.poses[:, :3]
+    goal = tuple(map(float, path[-1]))
+    small = cell_file(copied, workspace={"low_m": (-1, -1, path[-1, 2] + 0.05),
+                                         "high_m": (1, 1, 2)})
+    with pytest.raises((NoPathError, InputError), match="workspace"):
+        plan_paths(copied, PlanSettings(goal=goal), name="outside", cell_file=small, workers=1)
+
+
+def test_cells_that_do_not_fit_are_refused(copied):
+    """Of another branch; an obstacle with a hole; one in millimetres."""
+    with pytest.raises(InputError, match="calibrated for branch"):
+        plan_paths(copied, SETTINGS, cell_file=cell_file(copied, branch="another"))
+    vertices = 5.0 * np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 10]], float)
+    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    for name, kept, words in (("holed", 3, "hole|open|edge"), ("large", 4, "unit")):
+        lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+        lines += ["f " + " ".join(str(k + 1) for k in face) for face in faces[:kept]]
+        (copied.parent / f"{name}.obj").write_text("\n".join(lines) + "\n")
+        cell = cell_file(copied, obstacles=({"kind": "mesh", "file": f"{name}.obj"},))
+        with pytest.raises(InputError, match=words):
+            plan_paths(copied, SETTINGS, cell_file=cell)

@@ -1,0 +1,75 @@
+"""Bodies in the way of branch and gripper: boxes and closed surfaces."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from limber.geometry.surface.distance import distance_to_surface
+from limber.geometry.surface.surface import Surface
+
+_CHUNK = 2_000_000  # point and face pairs whose solid angles are summed at a time
+
+
+class Obstacle(Protocol):
+    """A body, branch frame."""
+
+    name: str
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        """Return how far ``points`` [n, 3] are outside it [m], negative inside, shape [n]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of ``half`` edge lengths [m]; ``centre`` [m] and unit rows ``axes`` [3, 3]."""
+
+    name: str
+    half: np.ndarray
+    centre: np.ndarray
+    axes: np.ndarray
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        beyond = np.abs((points - self.centre) @ self.axes.T) - self.half
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+        return outside + np.minimum(beyond.max(axis=1), 0.0)
+
+
+@dataclass(frozen=True)
+class Solid:
+    """What a closed surface encloses."""
+
+    name: str
+    surface: Surface
+
+    def clearance(self, points: np.ndarray) -> np.ndarray:
+        distance = distance_to_surface(points, self.surface)
+        low, high = self.surface.vertices.min(axis=0), self.surface.vertices.max(axis=0)
+        near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+        for part in np.array_split(near, 1 + len(near) * len(self.surface.faces) // _CHUNK):
+            distance[part] *= np.where(np.abs(_winding(self.surface, points[part])) > 0.5, -1, 1)
+        return distance
+
+
+def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,
+            ) -> tuple[str, float, np.ndarray] | None:
+    """Return the obstacle that bodies of ``radius`` [m] at ``points`` [n, 3] are deepest in, how
+    deep [m] and where [m]; None if they are in none."""
+    worst = None
+    for obstacle in obstacles:
+        depth = radius - obstacle.clearance(points)
+        index = int(depth.argmax())
+        if depth[index] > 0.0 and (worst is None or depth[index] > worst[1]):
+            worst = obstacle.name, float(depth[index]), points[index]
+    return worst
+
+
+def _winding(surface: Surface, points: np.ndarray) -> np.ndarray:
+    """How often a surface winds around each point [n, 3] (Van Oosterom and Strackee 1983), [n]."""
+    a, b, c = (surface.vertices[surface.faces[:, k]][None] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=2) for v in (a, b, c))
+    over = np.einsum("nij,nij->ni", a, np.cross(b, c))
+    under = (la * lb * lc + np.einsum("nij,nij->ni", a, b) * lc
+             + np.einsum("nij,nij->ni", b, c) * la + np.einsum("nij,nij->ni", c, a) * lb)
+    return np.arctan2(over, under).sum(axis=1) / (2 * np.pi)

@@ -1,0 +1,103 @@
+"""What a robot's cell asks of a plan: its workspace, its obstacles, and that the arm reaches."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import InputError, NoPathError
+from limber.geometry.surface.input import usable_surface
+from limber.geometry.surface.surface import Surface
+from limber.planning.limits import Limits
+from limber.planning.obstacles import Box, Obstacle, Solid, closest
+from limber.planning.plan_file import SPEED, Way
+from limber.progress import Progress
+from limber.robot.belonging import check_branch
+from limber.robot.cell import BoxEntry, Cell, read_cell
+from limber.robot.execution import robot_motion
+from limber.robot.kinematics import inverted, matrices
+from limber.store import Branch
+
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_CAPSULE_POINTS = 9  # along a part of the gripper
+_LARGE = 20.0  # [m] an obstacle that is larger is in another unit
+
+
+def cell_for(branch: Branch, path: Path, progress: Progress) -> Cell:
+    """Return the cell of a file, checked to be this branch's.
+
+    Raises:
+        InputError: it cannot be read, or is another branch's.
+    """
+    cell = read_cell(path)
+    if warning := check_branch(cell, branch.uuid, branch.folder):
+        progress.warn(warning)
+    return cell
+
+
+def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
+    """Return the cell's obstacles; files of meshes lie in ``folder``.
+
+    Raises:
+        InputError: a mesh cannot be read, has holes, or is in another unit.
+    """
+    found: list[Obstacle] = []
+    for number, entry in enumerate(cell.obstacles):
+        name = entry.name or f"obstacle {number + 1}"
+        if isinstance(entry, BoxEntry):
+            frame = matrices(np.array(entry.pose))
+            found.append(Box(name, 0.5 * np.array(entry.size_m), frame[:3, 3], frame[:3, :3].T))
+            continue
+        path = folder / entry.file
+        surface, _ = usable_surface(Surface.read(path, scale=_UNITS[entry.unit]), path)
+        size = float(np.ptp(surface.vertices, axis=0).max())
+        if size > _LARGE:
+            raise InputError(f"The obstacle {path} is {size:.0f} m long.",
+                             "No branch's cell is that large: its unit is another one.",
+                             'Say unit = "mm" or "cm" in the cell file.')
+        found.append(Solid(name, surface))
+    return tuple(found)
+
+
+def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...]) -> Limits:
+    """Return limits with the cell's workspace, force and obstacles besides.
+
+    Raises:
+        InputError: the two workspaces have nothing in common.
+    """
+    box = cell.workspace
+    return limits.with_cell(None if box is None else np.array(box.low_m),
+                            None if box is None else np.array(box.high_m),
+                            cell.limits.soft_force_n, obstacles)
+
+
+def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obstacle, ...],
+               ) -> dict[str, Any]:
+    """Return how the cell's robot takes the gripper along approach and path.
+
+    Raises:
+        NoPathError: no continuous branch of the inverse kinematics carries it, or the gripper
+            meets an obstacle; says where.
+    """
+    there = np.array(motion.phases) != "return"
+    found = robot_motion(cell, motion.poses[there], motion.forces[there], axis,
+                         speed=min(SPEED, cell.limits.speed_m_s))
+    base = matrices(np.array(cell.base.pose))
+    tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
+    flange = base @ matrices(np.vstack([found.approach.poses, found.path.poses])) @ tool
+    share = np.linspace(0.0, 1.0, _CAPSULE_POINTS)[:, None]
+    for part in cell.tool.parts:
+        start, end = np.array(part.start_m), np.array(part.end_m)
+        along = start + share * (end - start)
+        places = np.einsum("nij,kj->nki", flange[:, :3, :3], along) + flange[:, None, :3, 3]
+        if hit := closest(obstacles, places.reshape(-1, 3), part.radius_m):
+            name, depth, where = hit
+            raise NoPathError(
+                f"The gripper would be {1e3 * depth:.1f} mm inside {name} at "
+                f"({', '.join(f'{x:.3f}' for x in where)}) m.",
+                "Paths are checked against obstacles, and not yet led around them.",
+                "Choose another goal, or a workspace that keeps clear of it.")
+    return {"model": cell.arm.name, "gripper_rotation": found.rotation,
+            "duration_s": found.approach.duration + found.path.duration,
+            "singularity_distance": found.joints.singularity,
+            "joint_limit_margin_rad": found.joints.limit_margin}
