@@ -2,6 +2,9 @@
 
 Each branch is sampled and planned on as a user would. Costs and bounds are of the field; whether
 limits hold is asked of the full model. Nothing is left out: what failed is counted and told.
+
+With ``--out`` fields and trials are kept as they are made: the same ``--seed`` goes on with them.
+Starts are taken in turn over all branches, so that also a part of them speaks for all.
 """
 
 import json
@@ -12,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.planning_branches import Subject, arcs, forked
 from benchmarks.planning_trials import Trial, no_path_seconds, run_trial
 from benchmarks.table import Row
@@ -55,10 +59,11 @@ def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[R
     for number, subject in enumerate(subjects):
         part = progress.part(0.3 * number / len(subjects), 0.3 * (number + 1) / len(subjects))
         try:
-            fielded.append(_fielded(subject, settings, 15 if quick else 40, part))
+            fielded.append(_fielded(subject, settings, 15 if quick else 40, out, part))
         except LimberError as error:
             failed.append(f"{subject.name}: {error}")
-    trials = _trials(fielded, 3 if quick else 10, seed, progress.part(0.3, 1.0))
+    kept = None if out is None else out / "planning-trials.jsonl"
+    trials = _trials(fielded, 3 if quick else 10, seed, kept, progress.part(0.3, 1.0))
     table = [*_paper_rows(trials), *_bound_rows(trials), *_field_rows(fielded, failed),
              *_full_rows(trials), *_no_path_rows(fielded), *_unmade()]
     if out is not None:
@@ -70,7 +75,29 @@ def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[R
     return table
 
 
-def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, progress: Progress,
+def _source() -> str:
+    return source_digest(("planning", "mechanics"), *Path(__file__).parent.glob("planning*.py"))
+
+
+def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, out: Path | None,
+             progress: Progress) -> _Fielded:
+    """Sample and fit, or read what an earlier run kept of the same branch."""
+    kept = None if out is None else (
+        out / f"field-{settings.seed}-{subject.name.replace(' ', '-')}-{_source()}.npz")
+    if kept is not None and kept.is_file():
+        known = EnergyField.read(kept)
+        with np.load(kept) as file:
+            fresh = _Fresh(*file["fresh"])
+            seconds = float(file["seconds"])
+        return _Fielded(subject, known, default_goal(known, 0.01), seconds, fresh)
+    found = _sampled(subject, settings, fresh_count, progress)
+    if kept is not None:
+        found.known.write(kept, {"seconds": np.array(found.seconds),
+                                 "fresh": np.array(list(asdict(found.fresh).values()))})
+    return found
+
+
+def _sampled(subject: Subject, settings: EnergySettings, fresh_count: int, progress: Progress,
              ) -> _Fielded:
     model, began = subject.model, time.perf_counter()
     sampled = sample_field(model, settings, progress=progress.part(0.0, 0.7))
@@ -89,16 +116,25 @@ def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, progr
         np.linalg.norm(known.tip(places) - fresh.tips, axis=1)))
 
 
-def _trials(fielded: list[_Fielded], count: int, seed: int, progress: Progress,
-            ) -> dict[str, list[Trial]]:
+def _trials(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
+            progress: Progress) -> dict[str, list[Trial]]:
     found: dict[str, list[Trial]] = {one.subject.name: [] for one in fielded}
+    source, wanted = _source(), {}
+    for number in range(count):
+        for k, one in enumerate(fielded):
+            # Seeds of starts follow from the base seed, the branch and the start's number.
+            wanted[one.subject.name, (seed + 1009 * k + 101 * number) % (1 << 31)] = one, number
+    for trial in read_trials(Trial, kept):
+        if trial.source == source and wanted.pop((trial.branch, trial.seed), None):
+            found[trial.branch].append(trial)
     with Pool() as pool:
-        # Seeds of starts follow from the base seed, the branch and the start's number.
-        futures = {pool.submit(run_trial, one.subject.model, one.known, one.goal, number,
-                               (seed + 1009 * k + 101 * number) % (1 << 31)): one.subject.name
-                   for k, one in enumerate(fielded) for number in range(count)}
+        futures = [pool.submit(run_trial, one.subject.model, one.known, one.goal, number, own,
+                               branch=name, source=source)
+                   for (name, own), (one, number) in wanted.items()]
         for done, future in enumerate(as_completed(futures)):
-            found[futures[future]].append(future.result())
+            trial = future.result()
+            keep(trial, kept)
+            found[trial.branch].append(trial)
             progress((done + 1) / len(futures), "trials")
     return {name: sorted(trials, key=lambda trial: trial.number)
             for name, trials in found.items()}

@@ -23,9 +23,16 @@ _OPTIMUM_STARTS = 3
 
 @dataclass
 class Trial:
-    """What one start gave; ``trouble`` where no path was found or the branch could not follow."""
+    """What one start gave; ``trouble`` where no path was found or the branch could not follow.
+
+    ``branch``, ``seed`` and ``source`` (digest of the sources) say whose trial it is.
+    """
 
     number: int
+    branch: str = ""
+    seed: int = 0
+    source: str = ""
+    all_seconds: float = np.nan
     seconds: float = np.nan
     gap: float = np.nan
     to_optimum: float = np.nan
@@ -40,17 +47,23 @@ class Trial:
     excess: float = np.nan
     trouble: str = ""
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is None:  # as JSON has it
+                setattr(self, name, np.nan)
+
 
 def run_trial(model: GraspModel, known: EnergyField, goal: GraspGoal, number: int, seed: int,
-              ) -> Trial:
+              **whose: str) -> Trial:
     """Plan from rest (number 0) or from a random start, without limits and with one that binds."""
-    trial = Trial(number)
+    trial, began = Trial(number, seed=seed, **whose), time.perf_counter()
     settings = PlanSettings(seed=seed)
     try:
         start = known.rest.copy() if number == 0 else random_start(known, goal, settings, seed)
         _measure(trial, model, known, start, goal, settings)
     except LimberError as error:
         trial.trouble = f"{type(error).__name__}: {error}"
+    trial.all_seconds = time.perf_counter() - began
     return trial
 
 
