@@ -23,7 +23,7 @@ def both():
 def test_a_box_and_its_surface_are_as_far(both):
     """Signed distances agree inside and outside, and are those to the nearest of many points."""
     box, solid = both
-    points = box.centre + np.random.default_rng(0).uniform(-0.4, 0.4, (400, 3))
+    points = box.centre + np.random.default_rng(0).uniform(-0.3, 0.3, (3000, 3))
     clearance = box.clearance(points)
     assert (clearance < 0).sum() > 10 and (clearance > 0).sum() > 100
     assert np.allclose(clearance, solid.clearance(points), atol=1e-9)

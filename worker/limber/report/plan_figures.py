@@ -21,7 +21,7 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
     """Return the figures of plan ``name`` with their captions."""
     plan = read_plan(branch.path(f"plans/{name}.json"))
     field = EnergyField.read(branch.path("energy.npz"))
-    return [
+    shown = [
         (along_paths(plan), "Energy above the hanging state (strain and weight), gripper force and "
                             "largest strain along both paths, on the full model; the energy of the "
                             "field that the planner saw is dashed."),
@@ -31,6 +31,13 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
         (convergence(plan), "Cost of the best path so far over the planner's iterations, relative "
                             "to the last."),
     ]
+    if plan.summary.get("certificate"):
+        shown.append((certificate(plan), "What the gentle path costs, and what no path on the "
+                      "energy field costs less than, as the grid of the proof is refined."))
+    if plan.summary.get("detour"):
+        shown.append((trade_off(plan), "Energy against length of the gentlest paths for several "
+                      "weights of distance; no path lies below the dashed line."))
+    return shown
 
 
 def along_paths(plan: PlanFile) -> "Figure":
@@ -101,6 +108,56 @@ def convergence(plan: PlanFile) -> "Figure":
     axis.set(xlabel="iterations", ylabel="cost / final cost")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False)
+    return figure
+
+
+def certificate(plan: PlanFile) -> "Figure":
+    """Draw how the lower and the upper bound on the best path's cost close, grid by grid."""
+    from matplotlib.figure import Figure
+
+    levels = plan.summary["certificate"]["levels"]
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    axis = figure.subplots()
+    spacing = 1e3 * np.array([level["spacing_m"] for level in levels])
+    lower, upper = (np.array([level[name] for level in levels], float)
+                    for name in ("lower", "upper"))
+    axis.fill_between(spacing, lower, upper, color=_COLOURS["plan"], alpha=0.15,
+                      label="the best path lies here")
+    axis.plot(spacing, upper, "o-", color=_COLOURS["plan"], label="best path found")
+    axis.plot(spacing, lower, "o--", color=_COLOURS["plan"], label="no path is cheaper: proven")
+    axis.set(xscale="log", xlabel="cells of the grid [mm]", ylabel="cost", ylim=(0.0, None))
+    axis.invert_xaxis()
+    axis.set_xticks(spacing, [f"{value:.2g}" for value in spacing])
+    axis.minorticks_off()
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def trade_off(plan: PlanFile) -> "Figure":
+    """Draw energy against length of the gentlest paths, and below which no path is."""
+    from matplotlib.figure import Figure
+
+    detour = plan.summary["detour"]
+    curve = sorted(detour["curve"], key=lambda point: point["length_m"])
+    length = 1e3 * np.array([point["length_m"] for point in curve])
+    energy = 1e3 * np.array([point["energy_integral_jm"] for point in curve])
+    span = np.linspace(1e3 * detour["shortest_m"], max(length.max(), 1e3 * detour["longest_m"]), 80)
+    bounded = [point for point in curve if point["lower_bound_jm"] is not None]
+    lines = [1e3 * point["lower_bound_jm"] - point["metre_jm"] * span for point in bounded]
+    floor = np.maximum(np.max(lines, axis=0), 0.0)
+    figure = Figure(figsize=(6, 3.6), layout="constrained")
+    axis = figure.subplots()
+    # A path that is allowed to be longer may be any shorter one: the curve only falls.
+    best = np.minimum.accumulate(energy)
+    axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
+                      color=_COLOURS["plan"], alpha=0.15, label="the best lies here")
+    axis.plot(span, floor, "--", color=_COLOURS["plan"], lw=1, label="proven bound")
+    axis.plot(length, energy, "o-", color=_COLOURS["plan"], ms=4, label="gentlest found")
+    axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="length allowed")
+    axis.set(xlabel="length of the path [mm]", ylabel="energy over length [mJ m]", ylim=(0.0, None))
+    axis.grid(alpha=0.25)
+    axis.legend(frameon=False, fontsize=8)
     return figure
 
 
