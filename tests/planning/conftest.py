@@ -50,7 +50,8 @@ class AnalyticBranch:
         return GraspSamples(
             np.hstack([points, rotation]), energies, self.force(points),
             1.5 * points + [0.0, 0.0, 0.3], np.full(count, 0.95),
-            np.asarray(rejected, float).reshape(-1, 6), 0.1 * points[:, 0] + 0.05)
+            np.asarray(rejected, float).reshape(-1, 6), 0.1 * points[:, 0] + 0.05,
+            axial_forces=self.force(points)[:, 2])
 
     def _bump(self, points):
         return self.height * np.exp(-((points - SIDE) ** 2).sum(axis=1) / self.width**2)

@@ -9,7 +9,7 @@ from limber.errors import NoPathError
 from limber.planning.bound import certificate
 from limber.planning.bound.certificate import certify
 from limber.planning.compare import plan_pair
-from limber.planning.cost import CostWeights
+from limber.planning.cost import CostWeights, resample
 from limber.planning.field.trust import TrustRegion
 from limber.planning.goals import GraspGoal, TipGoal
 from limber.planning.planners.detour import plan_detour
@@ -99,6 +99,19 @@ def _spline_slope(u, cells, place):
     return np.stack([np.einsum("nijk,ni,nj,nk->n", block, *[
         (slope if axis == component else value)[:, axis] for axis in range(3)])
         for component in range(3)], axis=1)
+
+
+def test_a_limit_along_the_branch_binds_path_and_bound(ridge_field, across):
+    """The force along the branch stays below its limit; the bound stays below the dearer path."""
+    _, free = across
+    load = np.abs(ridge_field.load(resample(free.points, 0.001), "axial_force"))
+    cap = 1.05 * max(load[0], load[-1])
+    assert load.max() > 1.1 * cap
+    problem = problem_on(ridge_field, axial_force=cap)
+    found = plan_gentle(problem)
+    kept = np.abs(ridge_field.load(resample(found.points, 0.001), "axial_force"))
+    assert kept.max() <= cap * (1 + 1e-9)
+    assert found.cost > free.cost and found.certificate.lower <= found.cost
 
 
 def test_without_deformation_the_bound_is_the_distance(well_field):

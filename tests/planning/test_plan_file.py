@@ -32,7 +32,7 @@ def solved(xs):
         poses=poses, energies=xs**2, forces=vector, torques=0.1 * vector, strains=0.01 * xs,
         strain_places=vector, stresses=1e6 * xs, min_det_f=1.0 + 0 * xs, tips=2 * vector,
         targets=np.stack([vector, 3 * vector], axis=1),
-        displacements=np.zeros((len(xs), 4, 3)))
+        axial_forces=1 - xs, displacements=np.zeros((len(xs), 4, 3)))
 
 
 def resolved(path, approach):
@@ -66,6 +66,9 @@ def test_motion_from_rest_has_no_approach():
 def test_limits_tell_their_margin(path):
     """Over the whole motion; what was not asked for is not there."""
     limits = limits_of_motion(whole_motion(path), Limits(force=2.0))
+    both = limits_of_motion(whole_motion(path), Limits(axial_force=1.5, torque=1.0))
+    assert both["axial_force_n"]["margin"] == pytest.approx(0.5)
+    assert both["torque_nm"]["peak"] == pytest.approx(0.1 * np.hypot(0.2, 1.2))
     assert set(limits) == {"force_n"}
     assert limits["force_n"]["peak"] == pytest.approx(np.hypot(0.2, 1.2))
     assert limits["force_n"]["margin"] == pytest.approx(2.0 - np.hypot(0.2, 1.2))

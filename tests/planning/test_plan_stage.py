@@ -152,15 +152,18 @@ def test_limits_hold_on_the_full_model(copied):
     of the motion, approach and return included."""
     plan = read_plan(copied)
     caps = {}
-    for name, column in (("max_force", "forces_n"), ("max_strain", "strains")):
+    for name, column in (("max_force", "forces_n"), ("max_strain", "strains"),
+                         ("max_stress", "stresses_pa"), ("max_axial_force", "axial_forces_n")):
         free = np.array(plan["plan"][column])
-        free = np.linalg.norm(free, axis=1) if free.ndim == 2 else free
+        free = np.linalg.norm(free, axis=1) if free.ndim == 2 else np.abs(free)
         ends = max(free[0], free[-1])
         caps[name] = float(max(0.5 * (ends + free.max()), 1.05 * ends))
     done = plan_paths(copied, PlanSettings(**caps, **QUICK), name="capped", workers=1)
     motion = read_plan(copied, "capped")["motion"]
     assert np.linalg.norm(motion["forces_n"], axis=1).max() <= caps["max_force"]
     assert max(motion["strains"]) <= caps["max_strain"]
+    assert max(motion["stresses_pa"]) <= caps["max_stress"]
+    assert np.abs(motion["axial_forces_n"]).max() <= caps["max_axial_force"]
     assert done["margins"]["force"] >= 0.0 and done["rounds"][-1]["broken"] == []
 
 

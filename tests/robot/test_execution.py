@@ -13,7 +13,7 @@ from limber.robot.calibration import fit_base
 from limber.robot.cell import Cell
 from limber.robot.execution import across, followed, robot_motion
 from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
-from limber.stages.execute import ExecuteOptions, ExecuteSettings, execute
+from limber.stages.execute import ExecuteOptions, ExecuteSettings, _positions, execute
 from limber.stages.loading import load_grasp_model, load_skeleton
 from limber.store import Branch
 
@@ -162,6 +162,17 @@ def test_a_dry_run_moves_nothing_and_says_what_it_would_do(planned_folder, tmp_p
     preview = np.genfromtxt(planned_folder / "executions" / "path-preview.csv", delimiter=",",
                             names=True)
     assert np.all(np.diff(preview["t_s"]) > 0)
+
+
+def test_the_plans_own_approach_is_taken(planned_folder):
+    """From rest by the motion's poses before the path, not straight; without the return."""
+    branch = Branch.open(planned_folder)
+    rows = [("approach", 0.0), ("approach", 0.03), ("path", 0.02), ("path", 0.01), ("return", 0.05)]
+    with branch.stage("plan:path") as stage:
+        stage.path("plans/path-motion.csv").write_text(
+            "x_m,y_m,z_m,phase\n" + "".join(f"{x},0,0.3,{phase}\n" for phase, x in rows))
+    found = _positions(branch, "path", np.array([0, 0, 0.3]))
+    np.testing.assert_allclose(found[:, 0], [0.0, 0.03, 0.02, 0.01])
 
 
 def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):

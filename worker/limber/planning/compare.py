@@ -9,7 +9,7 @@ from limber.planning.bound.certificate import Certificate
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.goals import Goal, GraspGoal, allowed_points, goal_points, over_limits
-from limber.planning.limits import Limits
+from limber.planning.limits import UNITS, Limits
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
@@ -81,8 +81,8 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
 
 
 def _told(margins: dict[str, float]) -> str:
-    units = {"energy": " J", "force": " N", "strain": ""}
-    return ", ".join(f"{name} {value:.2g}{units[name]}" for name, value in margins.items() if value)
+    return ", ".join(f"{name.replace('_', ' ')} {value:.2g} {UNITS[name]}".rstrip()
+                     for name, value in margins.items() if value)
 
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,

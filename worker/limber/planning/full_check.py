@@ -63,7 +63,7 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
 
 def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarray,
                 like: GraspSamples) -> GraspSamples:
-    names = ("targets", "torques", "strain_places", "stresses")
+    names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
     optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
     if like.shape_slopes is not None:
         optional["shape_slopes"] = np.array([grasp_model.shape_slopes(u)

@@ -7,7 +7,13 @@ import numpy as np
 
 from limber.compiled import compiled
 from limber.errors import NoPathError
-from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
+from limber.planning.field.energy_field import (
+    LOADS,
+    EnergyField,
+    FieldArrays,
+    allowed_at,
+    energy_at,
+)
 
 
 class Goal(Protocol):
@@ -101,7 +107,7 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
         raise NoPathError(
             f"No pose in the goal region keeps the limits: {over_limits(field, trusted, limits)}.",
             "All of the region was sampled.",
-            "Raise the limit (--max-energy, --max-force, --max-strain, the workspace), or choose a "
+            "Raise the limit (--max-energy, --max-force and others, the workspace), or choose a "
             "goal nearer to the rest pose.")
     return np.ascontiguousarray(allowed)
 
@@ -110,8 +116,10 @@ def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> 
     """Return in words which limits none of ``points`` [n, 3] keeps, and by how much."""
     outside = np.maximum(limits.low - points, points - limits.high).max(axis=1)
     found = [("energy", field.energy(points), limits.max_energy, " J"),
-             ("force", np.linalg.norm(field.force(points), axis=1), limits.max_force, " N"),
-             ("strain", field.strain(points), limits.max_strain, "")]
+             ("force", np.linalg.norm(field.force(points), axis=1), limits.max_force, " N")]
+    found += [(name.replace("_", " "), np.abs(field.load(points, name)), limit, unit)
+              for name, limit, unit in zip(LOADS, limits.max_loads, ("", " Pa", " N", " Nm"),
+                                           strict=True) if limit < np.inf]
     told = [f"the {name} is at least {values.min():.3g}{unit} where {limit:.3g}{unit} is allowed"
             for name, values, limit, unit in found if values.min() > limit]
     if outside.min() > 0.0:

@@ -10,10 +10,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from limber.errors import InputError
-from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
 from limber.planning.obstacles import Obstacle, closest
 from limber.planning.resolve import SolvedPoses
 from limber.planning.settings import PlanSettings
+
+UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
+         "torque": "Nm"}
+"""Of the limits, by the names that they have in :class:`Limits`."""
 
 _COVERED = 0.95  # of the samples near a limit
 _NEAR = (0.5, 1.3)  # times the limit
@@ -48,7 +52,9 @@ class Limits:
     Attributes:
         energy: Above the hanging state [J].
         force: Magnitude of the gripper's [N].
-        strain: Largest principal anywhere in the branch.
+        strain, stress: Largest principal anywhere in the branch, stress in Pa.
+        axial_force: Of the gripper along the branch, pulling or pushing [N].
+        torque: Of the gripper [Nm].
         low, high: Box that the grasp stays in [m], shape [3].
         obstacles: Bodies that the branch must not meet.
     """
@@ -56,6 +62,9 @@ class Limits:
     energy: float = np.inf
     force: float = np.inf
     strain: float = np.inf
+    stress: float = np.inf
+    axial_force: float = np.inf
+    torque: float = np.inf
     low: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
     obstacles: tuple[Obstacle, ...] = ()
@@ -88,8 +97,11 @@ class Limits:
         return f"the branch is {1e3 * depth:.1f} mm inside {name} at ({place}) m"
 
     @classmethod
-    def of(cls, settings: PlanSettings) -> "Limits":
+    def of(cls, settings: PlanSettings, stiffer: float = 1.0) -> "Limits":
         """Return the settings' limits.
+
+        ``stiffer`` is how many times Young's modulus may be what was estimated: so much more may
+        the stress be than what a model with the estimate says.
 
         Raises:
             InputError: the workspace is empty.
@@ -101,50 +113,62 @@ class Limits:
                              "Its lower corner must be below the upper one in x, y and z.",
                              "Correct --workspace-low and --workspace-high.")
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
-                   settings.max_strain or np.inf, low, high)
+                   settings.max_strain or np.inf, (settings.max_stress or np.inf) / stiffer,
+                   settings.max_axial_force or np.inf, settings.max_torque or np.inf, low, high)
+
+    def asked(self) -> dict[str, float]:
+        """Return the limits that were asked for, by the names of ``UNITS``."""
+        return {name: getattr(self, name) for name in UNITS if getattr(self, name) < np.inf}
 
     def margins(self, known: EnergyField) -> "dict[str, float]":
         """Return how much tighter than asked to plan on a field: by limit, 0 for none asked."""
         samples = known.samples
-        missed = {"energy": np.abs(known.missed[:, 0]),
+        missed = {"energy": known.missed[:, 0],
                   "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
-                  "strain": np.abs(known.missed[:, 4])}
+                  **dict(zip(LOADS, known.missed[:, 4:].T, strict=True))}
         values = {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
-                  "strain": samples.strains}
+                  **samples.loads}
         inner = ~known.region.is_face()
-        found = {}
-        for name, off in missed.items():
-            limit = getattr(self, name)
-            if not limit < np.inf:
-                found[name] = 0.0
-                continue
-            near = inner & (values[name] > _NEAR[0] * limit) & (values[name] < _NEAR[1] * limit)
+        found = dict.fromkeys(UNITS, 0.0)
+        for name, limit in self.asked().items():
+            if values[name] is None:
+                raise InputError(f"The energy field knows no {name.replace('_', ' ')}.",
+                                 "It was sampled by an older program.",
+                                 "Run `limber energy` again with --force.")
+            size = np.abs(values[name])
+            near = inner & (size > _NEAR[0] * limit) & (size < _NEAR[1] * limit)
             near = near if near.sum() >= _FEWEST else inner
-            found[name] = min(float(np.quantile(off[near], _COVERED)), _MOST * limit)
+            off = np.quantile(np.abs(missed[name][near]), _COVERED)
+            found[name] = min(float(off), _MOST * limit)
         return found
 
     def on(self, known: EnergyField, margins: dict[str, float] | None = None) -> FieldArrays:
         """Return the field with these limits for compiled loops, tighter by ``margins``."""
-        less = margins or {"energy": 0.0, "force": 0.0, "strain": 0.0}
-        return known.limited(self.energy - less["energy"], self.force - less["force"],
-                             max_strain=self.strain - less["strain"], low=self.low,
-                             high=self.high)
+        less = margins or dict.fromkeys(UNITS, 0.0)
+        tighter = {name: getattr(self, name) - less[name] for name in UNITS}
+        return known.limited(tighter.pop("energy"), tighter.pop("force"), low=self.low,
+                             high=self.high, **tighter)
 
     def broken(self, states: SolvedPoses) -> list[Broken]:
         """Return the limits that states of the full model break, each where it is worst."""
         places = states.poses[:, :3]
         outside = np.maximum(self.low - places, places - self.high).max(axis=1)
-        asked = [("energy [J]", states.energies, self.energy),
-                 ("force [N]", states.force_sizes, self.force),
-                 ("strain", states.strains, self.strain),
-                 ("distance outside the workspace [m]", outside, 1e-6)]
+        asked = [(f"{name.replace('_', ' ')} [{UNITS[name]}]".replace(" []", ""), size,
+                  getattr(self, name)) for name, size in _sizes(states).items()]
+        asked.append(("distance outside the workspace [m]", outside, 1e-6))
         return [Broken(name, float(values.max()), limit, places[values.argmax()])
                 for name, values, limit in asked if values.max() > limit]
 
     def kept(self, states: SolvedPoses) -> np.ndarray:
         """Return which states keep all limits, bool [n]."""
         places = states.poses[:, :3]
-        return ((states.energies <= self.energy) & (states.force_sizes <= self.force)
-                & (states.strains <= self.strain)
+        within = [size <= getattr(self, name) for name, size in _sizes(states).items()]
+        return (np.logical_and.reduce(within)
                 & (places >= self.low - 1e-6).all(axis=1)
                 & (places <= self.high + 1e-6).all(axis=1))
+
+
+def _sizes(states: SolvedPoses) -> dict[str, np.ndarray]:
+    """Return what limits are on, by the names of ``UNITS``, shape [n] each."""
+    return {"energy": states.energies, "force": states.force_sizes,
+            **{name: np.abs(values) for name, values in states.loads.items()}}

@@ -6,9 +6,10 @@ branch to the start (``approach``), along the plan (``path``) and back by the wa
 (``return``). Each way is a table of columns of one length:
 
 ``times_s``, ``poses`` [m, rad] [n][6], ``energies_j``, ``forces_n`` and ``torques_nm`` [n][3] (of
-the gripper on the branch, the torque about the pose's position), ``strains`` (largest in the
-branch), ``tips_m`` [n][3], ``targets_m`` {name: [n][3]}, ``field_energies_j`` (what the field had
-promised), ``joints_rad`` [n][6] where a robot is given; ``motion`` also ``phases``.
+the gripper on the branch, the torque about the pose's position), ``axial_forces_n`` (along the
+branch, outward), ``strains`` and ``stresses_pa`` (largest in the branch), ``tips_m`` [n][3],
+``targets_m`` {name: [n][3]}, ``field_energies_j`` (what the field had promised), ``joints_rad``
+[n][6] where a robot is given; ``motion`` also ``phases``.
 
 ``timing`` says where times come from: today one speed of the gripper throughout, no acceleration
 limited. ``limits`` has for each limit asked for its value, the peak of the motion and the margin.
@@ -27,7 +28,7 @@ import numpy as np
 from limber.errors import InputError
 from limber.plain import plain
 from limber.planning.cost import arc_lengths
-from limber.planning.limits import Limits
+from limber.planning.limits import UNITS, Limits
 from limber.planning.resolve import ResolvedPath, SolvedPoses
 
 FORMAT = 2
@@ -37,7 +38,8 @@ SPEED = 0.02
 _WAYS = ("baseline", "plan")
 _COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "tips": "tips_m",
             "torques": "torques_nm", "times": "times_s", "field_energies": "field_energies_j",
-            "joints": "joints_rad"}
+            "joints": "joints_rad", "stresses": "stresses_pa",
+            "axial_forces": "axial_forces_n"}
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class Way:
         targets: Positions [m], shape [n, 3] each, by name.
         field_energies: What the energy field had promised [J], shape [n].
         joints: Of the robot [rad], shape [n, joints].
+        stresses: Largest in the branch [Pa], shape [n].
+        axial_forces: Part of the force along the branch, outward [N], shape [n].
         phases: ``approach``, ``path`` or ``return``, n of them.
     """
 
@@ -70,6 +74,8 @@ class Way:
     field_energies: np.ndarray | None = None
     joints: np.ndarray | None = None
     phases: tuple[str, ...] | None = None
+    stresses: np.ndarray | None = None
+    axial_forces: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,8 @@ def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
         strains=solved.strains, forces=solved.forces, torques=solved.torques,
         times=arc_lengths(solved.poses[:, :3]) / SPEED, tips=solved.tips,
         targets={name: solved.targets[:, k] for k, name in enumerate(targets)},
-        field_energies=field_energies, phases=phases)
+        field_energies=field_energies, phases=phases, stresses=solved.stresses,
+        axial_forces=solved.axial_forces)
 
 
 def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = ()) -> Way:
@@ -121,12 +128,16 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = ()) -> Way:
 
 def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]:
     """Return value, peak along the motion and margin of each limit that was asked for."""
-    asked = {"energy_j": (limits.energy, motion.energies),
-             "force_n": (limits.force, motion.force_sizes),
-             "strain": (limits.strain, motion.strains)}
-    return {name: {"limit": limit, "peak": float(values.max()),
-                   "margin": limit - float(values.max())}
-            for name, (limit, values) in asked.items() if limit < np.inf}
+    peaks = {"energy": motion.energies, "force": motion.force_sizes, "strain": motion.strains,
+             "stress": motion.stresses, "axial_force": motion.axial_forces,
+             "torque": np.linalg.norm(motion.torques, axis=1)}
+    found = {}
+    for name, limit in limits.asked().items():
+        peak = float(np.abs(peaks[name]).max())
+        unit = UNITS[name].lower()
+        found[f"{name}_{unit}" if unit else name] = {"limit": limit, "peak": peak,
+                                                     "margin": limit - peak}
+    return found
 
 
 def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,

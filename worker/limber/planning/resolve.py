@@ -8,6 +8,7 @@ from limber.errors import ConvergenceError
 from limber.jobs import run_tasks
 from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
+from limber.planning.field.energy_field import LOADS
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.progress import SILENT, Progress
 
@@ -29,6 +30,7 @@ class SolvedPoses:
         min_det_f: Least determinant of the deformation gradient, shape [n].
         tips: Position of the branch's tip [m], shape [n, 3].
         targets: Positions of the named targets [m], shape [n, targets, 3].
+        axial_forces: Part of the forces along the branch, outward [N], shape [n].
         displacements: Of all nodes [m], shape [n, node_count, 3].
     """
 
@@ -42,6 +44,7 @@ class SolvedPoses:
     min_det_f: np.ndarray
     tips: np.ndarray
     targets: np.ndarray
+    axial_forces: np.ndarray
     displacements: np.ndarray
 
     @classmethod
@@ -59,12 +62,21 @@ class SolvedPoses:
             min_det_f=np.array([float(result.min_det_f) for result in results]),
             tips=np.array([grasp_model.tip(u) for u in moved]),
             targets=np.array([grasp_model.branch.target_positions(u) for u in moved]),
+            axial_forces=np.array([grasp_model.axial_force(result.displacement,
+                                                           result.reaction_force)
+                                   for result in results]),
             displacements=np.array(moved))
 
     @property
     def force_sizes(self) -> np.ndarray:
         """Magnitude of the gripper's force [N], shape [n]."""
         return np.linalg.norm(self.forces, axis=1)
+
+    @property
+    def loads(self) -> dict[str, np.ndarray]:
+        """Loads by their names, shape [n] each."""
+        return dict(zip(LOADS, (self.strains, self.stresses, self.axial_forces,
+                                np.linalg.norm(self.torques, axis=1)), strict=True))
 
     def take(self, index: np.ndarray) -> "SolvedPoses":
         """Return the states of ``index``, in its order."""

@@ -28,7 +28,8 @@ class PlanSettings(Settings):
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
-                               "max_force", "max_strain", "workspace_low", "workspace_high"),
+                               "max_force", "max_axial_force", "max_torque", "max_strain",
+                               "max_stress", "workspace_low", "workspace_high"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
     experts = ("start_seed", "iterations", "engine", "replans", "field_error")
@@ -54,8 +55,16 @@ class PlanSettings(Settings):
         "Deformation energy that no pose may exceed [J]."))
     max_force: float | None = Field(None, gt=0, description=(
         "Force of the gripper that no pose may exceed [N]."))
+    max_axial_force: float | None = Field(None, gt=0, description=(
+        "Part of that force along the branch, pulling or pushing, that no pose may exceed [N]."))
+    max_torque: float | None = Field(None, gt=0, description=(
+        "Torque of the gripper that no pose may exceed [Nm]. A gripper that turns as the branch "
+        "does needs nearly none."))
     max_strain: float | None = Field(None, gt=0, lt=1, description=(
         "Largest principal strain anywhere in the branch that no pose may exceed (0.01 is 1 %)."))
+    max_stress: float | None = Field(None, gt=0, description=(
+        "Largest principal stress anywhere in the branch that no pose may exceed [Pa]; held for "
+        "the stiff end of the estimate's intervals."))
     workspace_low: tuple[float, float, float] | None = Field(None, description=(
         "Lower corner of the box that the grasp stays in, in the branch's frame [m]."))
     workspace_high: tuple[float, float, float] | None = Field(None, description=(

@@ -109,20 +109,10 @@ def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: P
                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses and forces of the grasp from rest to the path's end, and the branch's axis there."""
     from limber.planning.field.grasp_model import refusal
-    from limber.stages.loading import axis_at, load_grasp_model, load_skeleton
+    from limber.stages.loading import load_grasp_model
 
-    path = branch.require(f"plans/{name}.csv", "plan")
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    if table.size < 2 or "x_m" not in (table.dtype.names or ()):
-        raise InputError(f"{path} is no path.", "", "Plan again.")
-    planned = np.column_stack([table[column] for column in ("x_m", "y_m", "z_m")])
     model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
-    rest = model.rest_position
-    way = float(np.linalg.norm(planned[0] - rest))
-    # From rest the branch is first taken to where the plan starts.
-    leading = rest + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
-        planned[0] - rest)
-    positions = np.vstack([leading, planned]) if way > 1e-4 else planned
+    positions = _positions(branch, name, model.rest_position)
     poses, forces, state = [], [], model.rest.displacement
     for number, position in enumerate(positions):
         result = model.follow(position[None], state)[0]
@@ -136,7 +126,26 @@ def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: P
         progress(0.02 + 0.38 * number / len(positions), "forces along the path")
     poses = np.array(poses)
     poses[:, :3] = positions
-    return poses, np.array(forces), axis_at(load_skeleton(branch), rest)
+    return poses, np.array(forces), model.reach.axis
+
+
+def _positions(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
+    """Return the way of the grasp from rest to the path's end [m], shape [n, 3].
+
+    Approach and path as planned; a path without a planned approach is led up to straight.
+    """
+    whole = branch.has(f"plans/{name}-motion.csv")
+    path = branch.require(f"plans/{name}-motion.csv" if whole else f"plans/{name}.csv", "plan")
+    table = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
+    if table.size < 2 or not {"x_m", "phase" if whole else "s_m"} <= set(table.dtype.names or ()):
+        raise InputError(f"{path} is no path.", "", "Plan again.")
+    planned = np.column_stack([table[column] for column in ("x_m", "y_m", "z_m")])
+    if whole:
+        planned = planned[table["phase"] != "return"]
+    way = float(np.linalg.norm(planned[0] - rest))
+    leading = rest + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
+        planned[0] - rest)
+    return np.vstack([leading, planned]) if way > 1e-4 else planned
 
 
 def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:

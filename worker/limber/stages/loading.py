@@ -144,13 +144,6 @@ def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILE
                           load_skeleton(branch))
 
 
-def axis_at(skeleton: Skeleton, place: np.ndarray) -> np.ndarray:
-    """Return the direction of the branch near ``place`` [3], not normalised, shape [3]."""
-    nearest = int(np.argmin(np.linalg.norm(skeleton.nodes - place, axis=1)))
-    other = nearest if int(skeleton.parent[nearest]) >= 0 else 1
-    return skeleton.nodes[other] - skeleton.nodes[int(skeleton.parent[other])]
-
-
 def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
     """Return the branch that is estimated; the start is uniform.
 

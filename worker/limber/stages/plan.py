@@ -72,7 +72,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.limits import Limits
     from limber.planning.plan import plan_motion
     from limber.planning.plan_file import whole_motion
-    from limber.stages.loading import axis_at, load_grasp_model, load_skeleton
+    from limber.stages.loading import load_grasp_model
     from limber.stages.plan_cell import reached_by
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
@@ -92,7 +92,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
             "The energy field is of another mesh, material, weight or of other targets.",
             "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
             "Run `limber energy` again.")
-    in_cell = None if cell_file is None else _InCell.of(branch, cell_file, settings, progress)
+    stiffer = _stiffer(branch) if settings.max_stress else 1.0
+    digests = digests | {"stiffer": f"{stiffer:.6f}"}
+    asked = Limits.of(settings, stiffer)
+    in_cell = None if cell_file is None else _InCell.of(branch, cell_file, asked, progress)
     if in_cell is not None:
         digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
@@ -101,14 +104,14 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         return branch.manifest.stages[key].result
     with branch.stage(key, settings, **inputs) as stage:
         field = EnergyField.read(field_path)
-        limits = Limits.of(settings) if in_cell is None else in_cell.limits
+        limits = asked if in_cell is None else in_cell.limits
         found = plan_motion(field, grasp_model, settings, limits=limits, workers=workers,
                             progress=progress)
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets))
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
-            axis = axis_at(load_skeleton(branch), grasp_model.rest_position)
-            found.summary["robot"] = reached_by(in_cell.cell, motion, axis, limits.obstacles)
+            found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
+                                                limits.obstacles)
         progress(0.95, "writing")
         _write(stage, name, limits, motion, grasp_model, found)
         stage.result.update(found.summary)
@@ -124,13 +127,29 @@ class _InCell:
     limits: Limits
 
     @classmethod
-    def of(cls, branch: Branch, path: Path, settings: PlanSettings, progress: Progress,
-           ) -> _InCell:
-        from limber.planning.limits import Limits
+    def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress) -> _InCell:
         from limber.stages.plan_cell import cell_for, cell_obstacles, limits_in
 
         cell = cell_for(branch, path, progress)
-        return cls(cell, limits_in(cell, Limits.of(settings), cell_obstacles(cell, path.parent)))
+        return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)))
+
+
+def _stiffer(branch: Branch) -> float:
+    """Return how many times Young's modulus may be the estimate, by its widest interval.
+
+    Raises:
+        InputError: an interval has no upper end.
+    """
+    if "estimate" not in branch.manifest.stages:
+        return 1.0
+    result = branch.manifest.stages["estimate"].result
+    highest = np.array(result["young_interval_pa"], float)[:, 1]
+    share = highest / np.array(result["young_pa"], float)
+    if not np.isfinite(share).all():
+        raise InputError("--max-stress is given, and the estimate says not how stiff the branch "
+                         "may be at most.", "A stiffer branch bears more stress at the same pose.",
+                         "Record another pull, or limit --max-strain instead.")
+    return float(np.max(share, initial=1.0))
 
 
 def _write(stage: Stage, name: str, limits: Limits, motion: Way, grasp_model: GraspModel,

@@ -30,6 +30,7 @@ from limber.planning.bound.subsolution import (
     subsolution,
     terrain,
 )
+from limber.planning.field.energy_field import LOADS
 from limber.planning.problem import GentleProblem
 from limber.progress import SILENT, Progress
 
@@ -243,9 +244,10 @@ def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, point
     if limits.max_energy < np.inf:
         energy = grid.spread(nodes, problem.energy_field.energy(points))
         closed |= _all_above(energy, limits.max_energy + problem.field_error)
-    if limits.max_strain < np.inf:
-        strain = grid.spread(nodes, problem.energy_field.strain(points))
-        closed |= _all_above(strain, limits.max_strain)
+    for name, limit in zip(LOADS, limits.max_loads, strict=True):
+        if limit < np.inf:
+            load = grid.spread(nodes, problem.energy_field.load(points, name)**2)
+            closed |= _all_above(load, limit**2)
     beyond = np.maximum(limits.low - points, points - limits.high).max(axis=1)
     closed |= _corners_of(grid, nodes, beyond - far).max(axis=0) > 0.0
     if limits.max_force < np.inf:
@@ -326,9 +328,10 @@ def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
 
 def _separated(problem: GentleProblem, grid: _Grid, open_cells: np.ndarray) -> NoPathError:
     limits = problem.limits
-    kept = [f"{name} {value:.3g} {unit}" for name, value, unit in (
+    kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
         ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
-        ("strain", limits.max_strain, "")) if value < np.inf]
+        *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
+             ("", "Pa", "N", "Nm"), strict=True)) if value < np.inf]
     what = (" at most " + " and ".join(kept)) if kept else ""
     share = 100.0 * open_cells.mean()
     return NoPathError(

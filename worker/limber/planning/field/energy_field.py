@@ -46,7 +46,10 @@ _SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites r
 _CHOSEN_BY = ("energy_error", "force_error", "energy_error_median", "force_error_median")
 _OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
-             "shape_slopes": "shape_slopes"}
+             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n"}
+LOADS = ("strain", "stress", "axial_force", "torque")
+"""What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
+gripper's force along the branch [N], outward positive, and its torque [Nm]."""
 _CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
 
 
@@ -68,6 +71,7 @@ class GraspSamples:
         stresses: Largest principal Cauchy stress by magnitude [Pa], shape [m].
         shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
             [m, 3, 6 + 3 targets].
+        axial_forces: Part of the force along the branch at the grasp, outward [N], shape [m].
     """
 
     poses: np.ndarray
@@ -82,6 +86,7 @@ class GraspSamples:
     strain_places: np.ndarray | None = None
     stresses: np.ndarray | None = None
     shape_slopes: np.ndarray | None = None
+    axial_forces: np.ndarray | None = None
 
     @property
     def positions(self) -> np.ndarray:
@@ -94,6 +99,19 @@ class GraspSamples:
         if self.targets is not None:
             known.append(self.targets.reshape(len(self.poses), -1))
         return np.hstack(known)
+
+    @property
+    def loads(self) -> dict[str, np.ndarray | None]:
+        """By the names of ``LOADS``, shape [m] each; None where a file does not have them."""
+        torque = None if self.torques is None else np.linalg.norm(self.torques, axis=1)
+        return dict(zip(LOADS, (self.strains, self.stresses, self.axial_forces, torque),
+                        strict=True))
+
+    @property
+    def load_table(self) -> np.ndarray:
+        """The same as columns, shape [m, loads]; 0 for what is not known."""
+        nothing = np.zeros(len(self.poses))
+        return np.column_stack([nothing if one is None else one for one in self.loads.values()])
 
     def joined(self, other: "GraspSamples") -> "GraspSamples":
         """Return these samples and those of ``other`` behind them."""
@@ -114,10 +132,10 @@ class FieldArrays(NamedTuple):
     chart: tuple
     energy: tuple
     region: tuple
-    strain: tuple
+    loads: tuple
     max_energy: float
     max_force: float
-    max_strain: float
+    max_loads: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
@@ -132,10 +150,10 @@ class EnergyField:
         shape_chart: Those of the other two.
         energy_fit: Interpolant of the energy (cut off at 0 by the methods).
         shape_fit: Channels: natural rotation vector, position of the tip and of each target.
-        strain_fit: Of the largest strain anywhere in the branch.
+        load_fit: Channels: those of ``LOADS``.
         region: Where the field may be believed.
         errors: On samples left out; see :func:`error_measures`.
-        missed: There, prediction less truth of energy [J], force [N] and strain, shape [m, 5].
+        missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 8].
     """
 
     samples: GraspSamples
@@ -143,7 +161,7 @@ class EnergyField:
     shape_chart: Chart
     energy_fit: RadialInterpolant
     shape_fit: RadialInterpolant
-    strain_fit: RadialInterpolant
+    load_fit: RadialInterpolant
     region: TrustRegion
     errors: dict[str, float]
     missed: np.ndarray
@@ -191,22 +209,23 @@ class EnergyField:
         points, chart = _rows(points), self.shape_chart if shape else self.chart
         return chart.pull_back(points, fit.gradient(chart.map(points))[:, :, channel])
 
-    def strain(self, points: np.ndarray) -> np.ndarray:
-        """Return the largest strain in the branch at ``points`` [n, 3], shape [n]."""
-        return self._value(self.strain_fit, points, True)[:, 0]
+    def load(self, points: np.ndarray, name: str) -> np.ndarray:
+        """Return one of ``LOADS`` at ``points`` [n, 3], shape [n]."""
+        return self._value(self.load_fit, points, True)[:, LOADS.index(name)]
 
-    def strain_gradient(self, points: np.ndarray) -> np.ndarray:
-        """Return its gradient [1/m], shape [n, 3]."""
-        return self._gradient(self.strain_fit, points, 0, True)
+    def load_gradient(self, points: np.ndarray, name: str) -> np.ndarray:
+        """Return its gradient to the position, shape [n, 3]."""
+        return self._gradient(self.load_fit, points, LOADS.index(name), True)
 
     def limited(self, max_energy: float = np.inf, max_force: float = np.inf, *,
-                max_strain: float = np.inf, low: np.ndarray | None = None,
-                high: np.ndarray | None = None) -> FieldArrays:
-        """Return the arrays for compiled loops, with limits on energy [J], force [N], strain and
-        the box from ``low`` to ``high`` [m] that the grasp stays in."""
+                low: np.ndarray | None = None, high: np.ndarray | None = None,
+                **max_loads: float) -> FieldArrays:
+        """Return the arrays for compiled loops, with limits on energy [J], force [N], the box from
+        ``low`` to ``high`` [m] that the grasp stays in, and on loads by name (magnitudes)."""
         return FieldArrays(self.chart.arrays, self.energy_fit.arrays, self.region.arrays,
-                           (self.shape_chart.arrays, self.strain_fit.arrays),
-                           float(max_energy), float(max_force), float(max_strain),
+                           (self.shape_chart.arrays, self.load_fit.arrays),
+                           float(max_energy), float(max_force),
+                           np.array([max_loads.get(name, np.inf) for name in LOADS]),
                            np.full(3, -np.inf) if low is None else np.asarray(low, float),
                            np.full(3, np.inf) if high is None else np.asarray(high, float))
 
@@ -228,7 +247,7 @@ class EnergyField:
         }
         arrays |= {stored: getattr(samples, name) for name, stored in _OPTIONAL.items()
                    if getattr(samples, name) is not None}
-        for name in ("energy_fit", "shape_fit", "strain_fit"):
+        for name in ("energy_fit", "shape_fit", "load_fit"):
             arrays |= getattr(self, name).to_arrays(f"{name}_")
         np.savez_compressed(path, **arrays, **(extra or {}))
 
@@ -250,8 +269,10 @@ class EnergyField:
                 **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
             if "chart_layers" not in arrays:  # of an older program
                 return fit_field(samples, arrays["chart_base_m"])
+            if "load_fit_kernel" not in arrays:
+                return fit_field(samples, arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
-                    for name in ("energy_fit", "shape_fit", "strain_fit")]
+                    for name in ("energy_fit", "shape_fit", "load_fit")]
             region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],
                                     arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
             charts = [replace(region.chart, stretch=float(stretch), depth=float(depth))
@@ -418,12 +439,12 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
     options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": _SMOOTHING}
     shape = RadialInterpolant.fit(places, samples.shape, _slopes_on(shape_chart, samples),
                                   **options)
-    strain = RadialInterpolant.fit(places, samples.strains, **options)
-    off = -RadialInterpolant.leave_one_out(places, samples.strains, **options)[:, 0]
+    loads = RadialInterpolant.fit(places, samples.load_table, **options)
+    off = -RadialInterpolant.leave_one_out(places, samples.load_table, **options)[:, 0]
     tips = _tips_missed(samples, bent, region.chart)
     inside = ~region.is_face()
     errors["tip_error_median_m"] = float(np.median(np.linalg.norm(tips[inside], axis=1)))
-    return EnergyField(samples, chart, shape_chart, energy, shape, strain, region, errors,
+    return EnergyField(samples, chart, shape_chart, energy, shape, loads, region, errors,
                        np.column_stack([missed, off]))
 
 
@@ -451,9 +472,10 @@ def allowed_at(point, energy, field):
             return False
     if not trusted_at(point, field.region):
         return False
-    if field.max_strain < np.inf:
-        chart, fit = field.strain
-        if value_at(mapped(point, *chart), 0, *fit) > field.max_strain:
+    chart, fit = field.loads
+    for k in range(len(field.max_loads)):
+        if field.max_loads[k] < np.inf and (
+                np.abs(value_at(mapped(point, *chart), k, *fit)) > field.max_loads[k]):
             return False
     if field.max_force == np.inf:
         return True

@@ -7,10 +7,11 @@ by turning as the branch would, so each pose carries that natural rotation for t
 gripper that turns otherwise bends the branch more than planned here.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -40,22 +41,27 @@ class Reach:
         arc_length: Length of branch between base and grasp [m].
         chord: Straight distance between them at rest [m].
         tip: Position of the main path's tip [m], shape [3].
+        axis: Of the branch at the grasp, towards the tip, unit, shape [3].
     """
 
     base: np.ndarray
     arc_length: float
     chord: float
     tip: np.ndarray
+    axis: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
 
     @classmethod
     def of(cls, skeleton: Skeleton, centre: np.ndarray) -> "Reach":
         """Measure along the skeleton's main path up to the grasp's ``centre`` [3]."""
         path = skeleton.main_path()
-        nearest = path[np.argmin(np.linalg.norm(skeleton.nodes[path] - centre, axis=1))]
+        place = int(np.argmin(np.linalg.norm(skeleton.nodes[path] - centre, axis=1)))
+        nearest = path[place]
+        along = skeleton.nodes[path[min(place + 1, len(path) - 1)]] - skeleton.nodes[
+            path[max(place - 1, 0)]]
         base = skeleton.nodes[path[0]]
         chord = float(np.linalg.norm(centre - base))
         return cls(base, max(float(skeleton.arc_length[nearest]), chord), chord,
-                   skeleton.nodes[path[-1]])
+                   skeleton.nodes[path[-1]], along / np.linalg.norm(along))
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,11 @@ class GraspModel:
         grasp's position is the gripper's force.
         """
         return result.energy
+
+    def axial_force(self, displacement: np.ndarray, force: np.ndarray) -> float:
+        """Return the part of a force [3] on the grasp along the branch there, outward [N]."""
+        turn = Rotation.from_rotvec(self.pose(displacement)[3:])
+        return float(turn.apply(self.reach.axis) @ force)
 
     def tip(self, displacement: np.ndarray) -> np.ndarray:
         """Return the position of the branch's tip [m], shape [3]."""

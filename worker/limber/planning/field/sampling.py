@@ -50,17 +50,19 @@ class _Solved:
     strain_place: np.ndarray
     stress: float
     shape_slopes: np.ndarray
+    axial_force: float
 
 
 def _taken(grasp_model: GraspModel, result: StaticResult, target: int) -> _Solved:
     moved, at_rest = result.displacement, result is grasp_model.rest
     strain, place, stress = grasp_model.peak_load(moved)
+    force = np.zeros(3) if at_rest else result.reaction_force
     return _Solved(
         target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
-        np.zeros(3) if at_rest else result.reaction_force, grasp_model.tip(moved),
+        force, grasp_model.tip(moved),
         float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
         np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
-        grasp_model.shape_slopes(moved))
+        grasp_model.shape_slopes(moved), grasp_model.axial_force(moved, force))
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,8 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray,
         torques=np.array([s.torque for s in good]),
         strain_places=np.array([s.strain_place for s in good]),
         stresses=np.array([s.stress for s in good]),
-        shape_slopes=np.array([s.shape_slopes for s in good]))
+        shape_slopes=np.array([s.shape_slopes for s in good]),
+        axial_forces=np.array([s.axial_force for s in good]))
     return samples, {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
 
 

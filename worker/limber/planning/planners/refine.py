@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from limber.planning.cost import resample
-from limber.planning.field.energy_field import EnergyField
+from limber.planning.field.energy_field import LOADS, EnergyField
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
 
@@ -100,9 +100,11 @@ def _excesses(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
     if limits.max_energy < np.inf:
         yield (field.energy(points) / limits.max_energy - 1.0 + reserve,
                field.energy_gradient(points) / limits.max_energy)
-    if limits.max_strain < np.inf:
-        yield (field.strain(points) / limits.max_strain - 1.0 + reserve,
-               field.strain_gradient(points) / limits.max_strain)
+    for name, limit in zip(LOADS, limits.max_loads, strict=True):
+        if limit < np.inf:
+            load = field.load(points, name)
+            yield (np.abs(load) / limit - 1.0 + reserve,
+                   np.sign(load)[:, None] * field.load_gradient(points, name) / limit)
     for axis in range(3):
         for bound, side in ((limits.low[axis], -1.0), (limits.high[axis], 1.0)):
             if np.isfinite(bound):
