@@ -24,8 +24,10 @@ def cell_file(folder, **content):
     path = folder.parent / "cell.toml"
     write_cell(path, Cell(**{
         "branch": Branch.open(folder).uuid, "robot": {"model": "ur5e"},
-        "base": {"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)}, "tool": {"grasp_pose": (0, 0, 0.15, 0, 0, 0)}
-    } | content))
+        "base": {"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
+        "tool": {"grasp_pose": (0, 0, 0.15, 0, 0, 0)},
+        # The branch needs 20 N to get anywhere.
+        "limits": {"soft_force_n": 40.0, "hard_force_n": 60.0}} | content))
     return path
 
 
@@ -35,7 +37,14 @@ def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     plan = read_plan(copied / "plans/reached.json")
     assert plan.summary["robot"]["model"] == "ur5e"
     assert plan.summary["robot"]["singularity_distance"] > 0.05
-    assert plan.summary["limits"]["force_n"]["limit"] == 10.0
+    assert plan.summary["limits"]["force_n"]["limit"] == 40.0
+
+
+def test_a_cell_that_allows_too_little_force_is_named(copied):
+    """The cell's force limit, not a vague word: the branch needs more on any way."""
+    weak = cell_file(copied, limits={"soft_force_n": 10.0, "hard_force_n": 20.0})
+    with pytest.raises(NoPathError, match="force"):
+        plan_paths(copied, SETTINGS, name="weak", cell_file=weak, workers=1)
 
 
 def test_a_robot_too_far_away_refuses_the_plan(copied):
@@ -52,7 +61,7 @@ def test_a_branch_that_meets_an_obstacle_refuses_the_plan(copied):
         "kind": "box", "name": "the post", "size_m": (0.02, 0.02, 0.02),
         "pose": (*map(float, path[-1]), 0, 0, 0)},))
     goal = tuple(map(float, path[-1]))
-    with pytest.raises(NoPathError, match="inside the post at"):
+    with pytest.raises(NoPathError, match=r"goal .* mm inside the post"):
         plan_paths(copied, PlanSettings(iterations=300, goal=goal), name="hit",
                    cell_file=blocked, workers=1)
 

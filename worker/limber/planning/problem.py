@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.planning.cost import EdgeWeights, resample
-from limber.planning.field.energy_field import EnergyField, FieldArrays
+from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
 from limber.planning.goals import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
@@ -37,6 +37,15 @@ class GentleProblem:
             return np.inf
         fine = resample(np.ascontiguousarray(path, float), _FINE)
         return float(path_cost(fine, self.limits, self.weights._replace(step=_FINE)))
+
+    def limits_in_words(self) -> str:
+        """Return the limits that there are, or an empty string."""
+        limits = self.limits
+        kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
+            ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
+            *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
+                 ("", "Pa", "N", "Nm"), strict=True)) if value < np.inf]
+        return (" at most " + " and ".join(kept)) if kept else ""
 
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""

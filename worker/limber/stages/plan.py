@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.errors import BranchFolderError, InputError
+from limber.errors import BranchFolderError, InputError, NoPathError
 from limber.files import file_digest
 from limber.plain import plain
 from limber.planning.settings import PlanSettings
@@ -102,6 +102,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     inputs = {"reads": ["energy.npz"], "digests": digests}
     if not force and branch.is_current(key, settings, **inputs):
         return branch.manifest.stages[key].result
+    if in_cell is not None:
+        in_cell.check_goal(settings)
     with branch.stage(key, settings, **inputs) as stage:
         field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
@@ -132,6 +134,18 @@ class _InCell:
 
         cell = cell_for(branch, path, progress)
         return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)))
+
+
+    def check_goal(self, settings: PlanSettings) -> None:
+        """Raise NoPathError where the goal that is given lies inside an obstacle."""
+        from limber.planning.obstacles import closest
+
+        goal = settings.goal or settings.tip_goal
+        hit = goal and closest(self.limits.obstacles, np.array([goal], float))
+        if hit:
+            raise NoPathError(f"The goal lies {1e3 * hit[1]:.1f} mm inside {hit[0]}.",
+                              "Nothing can be brought there.",
+                              "Choose another goal, or correct the obstacle in the cell file.")
 
 
 def _stiffer(branch: Branch) -> float:

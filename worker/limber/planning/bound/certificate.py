@@ -327,12 +327,7 @@ def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
 
 
 def _separated(problem: GentleProblem, grid: _Grid, open_cells: np.ndarray) -> NoPathError:
-    limits = problem.limits
-    kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
-        ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
-        *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
-             ("", "Pa", "N", "Nm"), strict=True)) if value < np.inf]
-    what = (" at most " + " and ".join(kept)) if kept else ""
+    what = problem.limits_in_words()
     share = 100.0 * open_cells.mean()
     return NoPathError(
         f"No path exists: with{what or ' poses that the branch accepts'} no way leads from the "

@@ -52,10 +52,11 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     certificate = certify(problem, improve, progress=progress)
     if best[0] is None:
         raise NoPathError(
-            "No allowed path to the goal was found, nor is it proven that none exists.",
+            f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} was "
+            "found, nor is it proven that none exists.",
             f"The bound says a path costs at least {certificate.lower:.3g} "
             f"(grid of {1e3 * certificate.levels[-1]['spacing_m']:.1f} mm).",
-            "Sample more poses with `limber energy --samples`, or loosen the limits a little.")
+            "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
     return GentlePath(best[0], best[1], certificate)
 
 
