@@ -16,6 +16,7 @@ MODULES = (
     "operators.open_report",
     "operators.open_result",
     "operators.play",
+    "operators.grab",
     "operators.cancel_job",
     "operators.check_worker",
     "panels.job",

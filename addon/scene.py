@@ -17,6 +17,8 @@ SCAN_KEY = "limber_scan_sha256"
 NAME_KEY = "limber_name"
 INFO_KEY = "limber_info"
 ENERGY_KEY = "limber_energy_j"
+GRASP_KEY = "limber_grasp_m"
+"""Of the marked grasp: its place on the branch as it was scanned, and its radius."""
 OFFSET_KEY = "limber_map_offset"
 """The branch's origin in the scan's coordinates, in double precision: a viewport has single."""
 
@@ -125,6 +127,9 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     surface[INFO_KEY] = json.dumps({**data.info, "folder": None})
     if "map_offset" in data.info:
         surface[OFFSET_KEY] = [float(value) for value in data.info["map_offset"]]
+    if "grasp" in data.arrays:
+        surface[GRASP_KEY] = [*data.arrays["grasp"][0].tolist(),
+                              float(data.arrays["grasp_radius"][0])]
     for key in data.info["scalars"]:
         meshes.set_scalars(mesh, key, data.arrays[f"scalar:{key}"])
         meshes.set_colors(mesh, f"{key}_color", data.arrays[f"color:{key}"])

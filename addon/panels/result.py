@@ -19,6 +19,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         self.layout.prop(settings.scene, "plan")
         self.layout.prop(settings.scene, "motion")
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
+        self.layout.operator("limber.grab", icon="VIEW_PAN")
         self.layout.prop(settings, "show_expert")
         if not preferences.has_worker():
             column = self.layout.column(align=True)

@@ -108,28 +108,14 @@ def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
 def test_interface(run, blender, environment, beam, tmp_path):
     """In a window, by events: the tab opens, a scan is imported and reconstructed by clicks, a job
     cancelled by a click, a result opened, all by the worker beside the interface, and played."""
-    missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
-    if missing:
-        pytest.skip(f"NO {' AND '.join(missing)}: scripts/provision_blender --gui-test brings it")
+    require_screen()
     scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud
     scan.write_ply(tmp_path / "scan.ply")
     slow = tmp_path / "slow_worker"
     slow.write_text("#!/bin/sh\necho '{\"progress\": 0.4, \"message\": \"slowly\"}'\n"
                     "exec sleep 100\n")
     slow.chmod(0o755)
-    with virtual_screen() as display:
-        process = subprocess.Popen(
-            [blender, "--enable-event-simulate", "--window-geometry", "0", "0", "1280", "800",
-             "--python", str(FOLDER / "drive_interface.py"), "--", str(tmp_path)],
-            env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE, text=True)
-        try:
-            _take_pictures(tmp_path, display, process)
-        finally:
-            process.kill()
-    assert (tmp_path / "log.json").is_file(), process.stderr.read()[-2000:]
-    seen = json.loads((tmp_path / "log.json").read_text())
-    assert seen["error"] is None, seen
+    seen = driven("drive_interface.py", blender, environment, tmp_path)
     assert seen["category"] == "Limber"
     assert seen["imported_points"] == len(scan.points)
     assert seen["reconstructed_faces"] > 50
@@ -143,6 +129,45 @@ def test_interface(run, blender, environment, beam, tmp_path):
     assert not Path(f"/proc/{seen['left_running']}").exists(), "closing Blender ends the worker"
     for name in ("tab", "job", "opened", "playing"):
         assert _colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
+
+
+def test_grab(run, blender, environment, beam, tmp_path):
+    """By mouse events: pressed and dragged the beam follows; kept, left, undone; Esc restores."""
+    require_screen()
+    seen = driven("drive_grab.py", blender, environment, tmp_path)
+    assert seen["began"] == ["RUNNING_MODAL"]
+    is_given, move, place, mode = seen["kept"]
+    assert is_given and mode == "pinned"
+    assert abs(move[0]) > 0.02 and abs(move[1]) < 0.005
+    assert abs(place[2] - 0.57) < 0.06, "where it was pressed"
+    assert seen["restored"] < 1e-6 and seen["motion_shown"]
+    assert not seen["after_undo"]
+    assert seen["sessions_left"] == 0 and not Path(f"/proc/{seen['session']}").exists()
+    assert _colour_count(tmp_path / "grab.png") > 50
+
+
+def require_screen() -> None:
+    missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"NO {' AND '.join(missing)}: scripts/provision_blender --gui-test brings it")
+
+
+def driven(script: str, blender: str, environment: dict[str, str], folder: Path) -> dict:
+    """Run a script that drives Blender in a window; return what it has seen."""
+    with virtual_screen() as display:
+        process = subprocess.Popen(
+            [blender, "--enable-event-simulate", "--window-geometry", "0", "0", "1280", "800",
+             "--python", str(FOLDER / script), "--", str(folder)],
+            env=environment | {"DISPLAY": display}, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, text=True)
+        try:
+            _take_pictures(folder, display, process)
+        finally:
+            process.kill()
+    assert (folder / "log.json").is_file(), process.stderr.read()[-2000:]
+    seen = json.loads((folder / "log.json").read_text())
+    assert seen["error"] is None, seen
+    return seen
 
 
 @contextmanager

@@ -11,7 +11,8 @@ Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each 
   not this one.
 - ``{"command": "grasp", "vertex": 17, "mode": "pinned", "radius_m": 0.01}``: hold the branch there,
   where it is now; ``"point": [x, y, z]`` instead of a vertex is a place on the branch as it was
-  scanned [m]. The reply says ``grasp`` (a number) and ``pose``. Eight at once, at most.
+  scanned [m]. The reply says ``grasp`` (a number), its ``pose``, and its ``rest_pose`` on the
+  branch as it was scanned. Eight at once, at most.
 - ``{"command": "release", "grasp": 2}``: let go; without ``grasp``, of all.
 - ``{"command": "move", "grasp": 2, "pose": [x, y, z, rx, ry, rz]}``: that grasp (the first, if not
   named) to this pose [m, rad]. The newest pose wins: poses that come while one is being solved
@@ -169,6 +170,7 @@ class Session:
             case protocol.Grab(vertex=vertex, point=point, radius_m=radius, mode=mode):
                 number = answering.grab(vertex, point, radius, mode)
                 return {"grasp": number, "pose": self.held.grasps[number].pose,
+                        "rest_pose": self.held.grasps[number].grasp.rest_pose,
                         "node_count": len(self.held.grasps[number].grasp.nodes)}
             case protocol.Release(grasp=grasp):
                 answering.release(grasp)

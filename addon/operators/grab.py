@@ -1,0 +1,354 @@
+"""Grab the branch where the mouse is and bend it by hand, the worker answering in real time."""
+
+import enum
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import blf
+import bpy
+from bpy_extras import view3d_utils
+from mathutils import Vector
+
+from .. import preferences, properties, scene
+from ..bridge import animation, meshes
+from ..session import HeldFrame, Session
+from ..stages import stages
+from ..worker import WorkerNotFound
+
+_INTERVAL_SECONDS = 1 / 60
+_KEYS = ("Drag: bend | Enter: keep for a simulation | S, G: keep as the plan's start, goal | "
+         "Esc: let go and leave")
+_NAVIGATION = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WHEELINMOUSE", "WHEELOUTMOUSE",
+               "TRACKPADPAN", "TRACKPADZOOM", "MOUSEROTATE", "MOUSESMARTZOOM", "NDOF_MOTION"}
+_WORDS = {"learning": "full model, slow; learning", "reduced": "learnt model",
+          "full": "full model", "untrusted": "NOT TO BE RELIED ON"}
+_NORMAL, _OVER = (1.0, 1.0, 1.0, 1.0), (1.0, 0.25, 0.2, 1.0)
+
+
+class Kept(enum.Enum):
+    """What becomes of a grab that is kept."""
+
+    MOTION = "RET"
+    START = "S"
+    GOAL = "G"
+
+
+@dataclass
+class Hold:
+    """What the mouse holds.
+
+    Attributes:
+        rest: Where that place is on the branch as it was scanned [m]; once the grasp is known,
+            its centre there.
+        begin: Where it was when the mouse took it, in the world.
+        asked: Number of the command that the session answers with the grasp.
+        number: Of the grasp, None until it is known.
+        position: Where the grasp was when it was taken [m].
+        wanted: Where it is to be [m].
+        is_dragged: Whether the mouse button is down.
+    """
+
+    rest: Vector
+    begin: Vector
+    asked: int
+    number: int | None = None
+    position: Vector | None = None
+    wanted: Vector | None = None
+    is_dragged: bool = True
+
+
+class LIMBER_OT_grab(bpy.types.Operator):
+    """Bend the branch by hand: press on it and drag. Force and energy stand at the mouse"""
+
+    bl_idname = "limber.grab"
+    bl_label = "Grab the Branch"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    radius: bpy.props.FloatProperty(
+        name="Grasp radius [m]", default=0.01, min=0.0, soft_max=0.1,
+        description="The branch is held within this distance of the place that was pressed")
+
+    _session: Session | None = None
+    _surface: bpy.types.Object | None = None
+    _hold: Hold | None = None
+    _frame: HeldFrame | None = None
+
+    @classmethod
+    def poll(cls, context):
+        if scene.find_surface(context.scene) is None:
+            cls.poll_message_set("Open a result first")
+            return False
+        return context.mode == "OBJECT"
+
+    def execute(self, context):
+        self.report({"ERROR"}, "A grab needs the mouse in a 3D view. From a script use "
+                               "limber.session.client, or limber.simulate.")
+        return {"CANCELLED"}
+
+    def invoke(self, context, event):
+        if context.area is None or context.area.type != "VIEW_3D" or bpy.app.background:
+            return self.execute(context)
+        self._surface = scene.find_surface(context.scene)
+        folder = Path(bpy.path.abspath(self._surface.users_collection[0][scene.FOLDER_KEY]))
+        try:
+            command = [*preferences.worker_command(), "session", "--no-grasp", str(folder)]
+            self._session = Session(command, len(self._surface.data.vertices))
+        except (OSError, WorkerNotFound) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self._begin(context)
+        if event.type == "LEFTMOUSE":
+            # Of the tool: what is pressed is taken as soon as the branch is there.
+            self._waiting = (event.mouse_region_x, event.mouse_region_y)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        try:
+            return self._modal(context, event)
+        except ReferenceError:
+            self._surface = None
+            self._end(context)
+            self.report({"ERROR"}, "The branch was removed while it was held.")
+            return {"CANCELLED"}
+
+    def cancel(self, context):
+        """Blender closes or loads another file: the session must not live on unseen."""
+        self._end(context)
+
+    def _begin(self, context) -> None:
+        mesh = self._surface.data
+        self._rest = meshes.positions(mesh)
+        self._mouse = self._waiting = None
+        motion = self._surface.modifiers.get(animation.MODIFIER)
+        self._had_motion = motion is not None and motion.show_viewport
+        if self._had_motion:
+            motion.show_viewport = False
+        self._area, self._region = context.area, context.region
+        if self._region.type != "WINDOW":
+            # Pressed in the sidebar: the view beside it is meant.
+            self._region = next(r for r in context.area.regions if r.type == "WINDOW")
+        self._timer = context.window_manager.event_timer_add(_INTERVAL_SECONDS,
+                                                             window=context.window)
+        self._drawing = bpy.types.SpaceView3D.draw_handler_add(
+            self._draw, (), "WINDOW", "POST_PIXEL")
+        context.workspace.status_text_set(_KEYS)
+        context.window_manager.modal_handler_add(self)
+
+    def _modal(self, context, event):
+        self._surface.name  # noqa: B018 (a ReferenceError here, not in the middle of something)
+        if event.type == "TIMER":
+            return self._answered(context)
+        if event.type in _NAVIGATION or event.type.startswith(("NUMPAD", "NDOF")):
+            return {"PASS_THROUGH"}
+        self._mouse = self._in_region(event)
+        is_dragged = self._hold is not None and self._hold.is_dragged
+        if event.type in {"LEFTMOUSE", "MOUSEMOVE"} and not is_dragged and not self._is_view(event):
+            # Sidebar, toolbar and other editors stay in use.
+            return {"PASS_THROUGH"}
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            self._waiting = self._mouse
+        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            self._waiting = None
+            if self._hold is not None:
+                self._hold.is_dragged = False
+        elif event.type == "MOUSEMOVE" and is_dragged:
+            self._drag()
+        elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
+            self._end(context)
+            return {"CANCELLED"}
+        elif event.type in {"RET", "NUMPAD_ENTER", "S", "G"} and event.value == "PRESS":
+            return self._keep(context, Kept("RET" if "ENTER" in event.type else event.type))
+        self._area.tag_redraw()
+        return {"RUNNING_MODAL"}
+
+    def _answered(self, context):
+        """Take in what the session has said, show its newest frame, say where to go."""
+        for told in self._session.poll():
+            if self._hold is not None and told.get("id") == self._hold.asked:
+                self._taken(told)
+            elif told["event"] == "error":
+                self.report({"WARNING"}, str(told.get("message", "")))
+        if self._session.error:
+            error = self._session.error
+            self._end(context)
+            self.report({"ERROR"}, error)
+            return {"CANCELLED"}
+        frame = self._session.frame(self._frame.sequence if self._frame else 0)
+        if frame is not None:
+            self._frame = frame
+            meshes.set_positions(self._surface.data, frame.positions)
+            self._area.tag_redraw()
+        if self._waiting is not None and self._session.hello:
+            self._take(context, self._waiting)
+            self._waiting = None
+        if self._hold is not None and self._hold.wanted is not None and self._hold.number:
+            self._session.move(self._hold.number, tuple(self._hold.wanted))
+            self._hold.wanted = None
+        return {"RUNNING_MODAL"}
+
+    def _take(self, context, mouse: tuple[int, int]) -> None:
+        """Hold the branch where the mouse is; what was held before is let go."""
+        seen = self._seen(context, mouse)
+        if seen is None:
+            return
+        rest, place = seen
+        if self._hold is not None:
+            self._session.release()
+        self._hold = Hold(rest, place, self._session.grasp(tuple(rest), self.radius))
+
+    def _seen(self, context, mouse: tuple[int, int]) -> tuple[Vector, Vector] | None:
+        """Return the place under the mouse: on the branch as it was scanned, and in the world."""
+        view = self._area.spaces.active.region_3d
+        origin = view3d_utils.region_2d_to_origin_3d(self._region, view, mouse)
+        direction = view3d_utils.region_2d_to_vector_3d(self._region, view, mouse)
+        thing = self._surface.evaluated_get(context.evaluated_depsgraph_get())
+        into = thing.matrix_world.inverted()
+        hit, place, _, face = thing.ray_cast(into @ origin, into.to_3x3() @ direction)
+        if not hit:
+            return None
+        mesh = thing.data
+        nearest = min(mesh.polygons[face].vertices,
+                      key=lambda k: (mesh.vertices[k].co - place).length)
+        return Vector(self._rest[nearest].tolist()), thing.matrix_world @ place
+
+    def _taken(self, told: dict) -> None:
+        if told["event"] == "error":
+            self.report({"WARNING"}, str(told.get("message", "")))
+            self._hold = None
+            return
+        self._hold.number = told["grasp"]
+        self._hold.position = Vector(told["pose"][:3])
+        self._hold.rest = Vector(told["rest_pose"][:3])
+        if self._mouse is not None and self._hold.is_dragged:
+            self._drag()
+
+    def _drag(self) -> None:
+        """Want the grasp where the mouse is, in the plane of the view through where it was."""
+        hold = self._hold
+        if hold.position is None:
+            return
+        view = self._area.spaces.active.region_3d
+        now = view3d_utils.region_2d_to_location_3d(self._region, view, self._mouse, hold.begin)
+        into = self._surface.matrix_world.inverted().to_3x3()
+        hold.wanted = self._target = hold.position + into @ (now - hold.begin)
+
+    def _keep(self, context, kept: Kept):
+        hold = self._hold
+        if hold is None or hold.position is None or self._target is None:
+            self.report({"WARNING"}, "Nothing is bent yet: press on the branch and drag.")
+            return {"RUNNING_MODAL"}
+        marked = self._surface.get(scene.GRASP_KEY)
+        is_marked = marked is not None and (
+            (Vector(marked[:3]) - hold.rest).length <= marked[3] + self.radius)
+        if kept is not Kept.MOTION and not is_marked:
+            self.report({"WARNING"}, "A plan moves the marked grasp: bend the branch there, or "
+                                     "press Enter to keep this grab for a simulation.")
+            return {"RUNNING_MODAL"}
+        target = tuple(self._target)
+        self._end(context)
+        if kept is Kept.MOTION:
+            moved = tuple(a - b for a, b in zip(target, hold.rest, strict=True))
+            self._give(context, "simulate", grasp_point=tuple(hold.rest), move=moved)
+            group = properties.group_of(context.scene, stages()["simulate"])
+            group.grasp_radius, group.grasp_mode = self.radius, "pinned"
+            self.report({"INFO"}, "Kept: Material, Simulate a Motion bends it so.")
+        else:
+            name = "start" if kept is Kept.START else "goal"
+            self._give(context, "plan", **{name: target})
+            self.report({"INFO"}, f"Kept as the plan's {name}.")
+        return {"FINISHED"}
+
+    def _give(self, context, stage: str, **places: tuple[float, float, float]) -> None:
+        group = properties.group_of(context.scene, stages()[stage])
+        for name, place in places.items():
+            setattr(group, name, place)
+            setattr(group, properties.OPEN + name, True)
+
+    _target: Vector | None = None
+
+    def _end(self, context) -> None:
+        """Let go, and show the branch as it was shown before."""
+        if self._session is None:
+            return
+        context.window_manager.event_timer_remove(self._timer)
+        bpy.types.SpaceView3D.draw_handler_remove(self._drawing, "WINDOW")
+        context.workspace.status_text_set(None)
+        self._session.close()
+        self._session = None
+        if self._surface is not None:
+            meshes.set_positions(self._surface.data, self._rest)
+            if self._had_motion:
+                self._surface.modifiers[animation.MODIFIER].show_viewport = True
+        self._area.tag_redraw()
+
+    def _in_region(self, event) -> tuple[int, int]:
+        return event.mouse_x - self._region.x, event.mouse_y - self._region.y
+
+    def _is_view(self, event) -> bool:
+        """Whether the mouse is over the view itself: sidebar and toolbar lie upon it."""
+        def covers(region) -> bool:
+            return (0 <= event.mouse_x - region.x < region.width
+                    and 0 <= event.mouse_y - region.y < region.height)
+        return covers(self._region) and not any(
+            covers(region) for region in self._area.regions if region != self._region)
+
+    def _draw(self) -> None:
+        """Write at the mouse what holds the branch and who says so."""
+        if bpy.context.region != self._region:
+            return
+        lines, colour = self._lines()
+        x, y = self._mouse or (20, 60)
+        scale = bpy.context.preferences.system.ui_scale
+        blf.size(0, 14 * scale)
+        blf.enable(0, blf.SHADOW)
+        blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
+        blf.color(0, *colour)
+        for number, line in enumerate(lines):
+            blf.position(0, x + 18 * scale, y - 18 * scale * number, 0)
+            blf.draw(0, line)
+        blf.disable(0, blf.SHADOW)
+
+    def _lines(self) -> tuple[list[str], tuple[float, float, float, float]]:
+        if self._session is None or not self._session.hello:
+            return ["loading the branch ..."], _NORMAL
+        if self._frame is None or self._hold is None:
+            return ["press on the branch and drag"], _NORMAL
+        force = Vector(self._frame.force).length
+        words = _WORDS[self._frame.who]
+        if self._frame.who == "learning" and self._session.message:
+            words = f"full model, slow; {self._session.message}"
+        limits = properties.group_of(bpy.context.scene, stages()["plan"])
+        over = [f"over the plan's {title}" for name, value, title in (
+                    ("max_force", force, "force"), ("max_energy", self._frame.energy, "energy"))
+                if getattr(limits, properties.OPEN + name) and value > getattr(limits, name)]
+        lines = [f"{force:.3g} N   {1000 * self._frame.energy:.3g} mJ", words, *over]
+        return lines, _OVER if over or self._frame.who == "untrusted" else _NORMAL
+
+
+class LIMBER_TOOL_grab(bpy.types.WorkSpaceTool):
+    bl_space_type = "VIEW_3D"
+    bl_context_mode = "OBJECT"
+    bl_idname = "limber.grab_tool"
+    bl_label = "Grab the Branch"
+    bl_description = "Press on the branch and drag: it bends as the real one would"
+    bl_icon = "ops.pose.push"
+    bl_keymap = (("limber.grab", {"type": "LEFTMOUSE", "value": "PRESS"}, None),)
+
+    def draw_settings(self, layout, tool):
+        layout.prop(tool.operator_properties("limber.grab"), "radius")
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_grab)
+    if not bpy.app.background:
+        bpy.utils.register_tool(LIMBER_TOOL_grab, after={"builtin.transform"}, separator=True)
+
+
+def unregister() -> None:
+    from .. import session
+
+    session.close_all()
+    if not bpy.app.background:
+        bpy.utils.unregister_tool(LIMBER_TOOL_grab)
+    bpy.utils.unregister_class(LIMBER_OT_grab)

@@ -1,0 +1,189 @@
+"""Bends a branch with the mouse inside a Blender with a window; test_real_blender.py starts it.
+
+    blender --enable-event-simulate --python drive_grab.py -- FOLDER
+
+FOLDER has beam.branch; log.json is written there, and a picture is asked for as drive_interface.py
+does. A step is a function that returns True when it is done.
+"""
+
+import json
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+from bpy_extras import view3d_utils
+from mathutils import Vector
+
+FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
+KEY = "bl_ext.user_default.limber"
+seen = {"error": None}
+state = {}
+
+
+def view():
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    return window, area, next(region for region in area.regions if region.type == "WINDOW")
+
+
+def override():
+    window, area, region = view()
+    return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
+
+
+def surface():
+    return bpy.data.collections["beam"].objects["beam"]
+
+
+def tip():
+    """Return the highest vertex as the mesh has it now, in the world."""
+    values = [0.0] * (3 * len(surface().data.vertices))
+    surface().data.attributes["position"].data.foreach_get("vector", values)
+    points = [Vector(values[k:k + 3]) for k in range(0, len(values), 3)]
+    return max(points, key=lambda point: point.z), points
+
+
+def pixels(place):
+    _, area, region = view()
+    return view3d_utils.location_3d_to_region_2d(region, area.spaces.active.region_3d, place)
+
+
+def event(kind, value="NOTHING", move=(0, 0)):
+    """Simulate an event at the place that is pressed, ``move`` pixels on."""
+    window, _, region = view()
+    x, y = state["place"]
+    window.event_simulate(type=kind, value=value, x=int(region.x + x + move[0]),
+                          y=int(region.y + y + move[1]))
+    return True
+
+
+def sessions():
+    return sys.modules[f"{KEY}.session"]._open
+
+
+def waited(seconds):
+    return time.monotonic() - state["step"] > seconds
+
+
+def open_result():
+    for thing in list(bpy.data.objects):
+        bpy.data.objects.remove(thing)
+    with override():
+        bpy.ops.limber.open_result(directory=str(FOLDER / "beam.branch"))
+    view()[1].spaces.active.region_3d.view_perspective = "ORTHO"
+    return True
+
+
+def begin():
+    if not waited(1.0):
+        return False
+    with override():
+        bpy.ops.view3d.view_axis(type="FRONT")
+        bpy.ops.view3d.view_all()
+        if "before" not in state:
+            bpy.ops.wm.tool_set_by_id(name="limber.grab_tool")
+    state["before"] = tip()[1]
+    with override():
+        seen["began"] = list(bpy.ops.limber.grab("INVOKE_DEFAULT"))
+    return True
+
+
+def is_loaded():
+    if not sessions()[0].hello:
+        return False
+    seen["session"] = sessions()[0].pid
+    # A little below the tip, in the middle of the beam.
+    state["place"] = pixels(Vector((0.0, 0.0, 0.57)))
+    return True
+
+
+def hover():
+    return event("MOUSEMOVE")
+
+
+def press():
+    return waited(0.3) and event("LEFTMOUSE", "PRESS")
+
+
+def drag():
+    return waited(0.6) and event("MOUSEMOVE", move=(60, -4))
+
+
+def is_bent():
+    """The tip has come along by most of the way that the mouse has gone."""
+    if not waited(0.2):
+        return False
+    bent = max((now - then).length for now, then in zip(tip()[1], state["before"], strict=True))
+    seen["bent_m"] = bent
+    return bent > 0.02
+
+
+def picture():
+    request = FOLDER / "grab.request"
+    if "asked" not in state:
+        state["asked"] = request.touch()
+        return False
+    return not request.exists()
+
+
+def let_go():
+    return event("LEFTMOUSE", "RELEASE", move=(60, -4))
+
+
+def keep():
+    return waited(0.3) and event("RET", "PRESS", move=(60, -4))
+
+
+def is_kept():
+    if not waited(0.5) or sessions():
+        return False
+    group = bpy.context.scene.limber.simulate
+    seen["kept"] = [group.use_move, list(group.move), list(group.grasp_point), group.grasp_mode]
+    seen["restored"] = max((now - then).length for now, then in zip(
+        tip()[1], state["before"], strict=True))
+    seen["motion_shown"] = surface().modifiers["Limber motion"].show_viewport
+    return True
+
+
+def undo():
+    with override():
+        bpy.ops.ed.undo()
+    seen["after_undo"] = bpy.context.scene.limber.simulate.use_move
+    return True
+
+
+def escape():
+    return waited(0.5) and event("ESC", "PRESS")
+
+
+def is_left():
+    seen["sessions_left"] = len(sessions())
+    return not sessions()
+
+
+STEPS = [open_result, begin, is_loaded, hover, press, drag, is_bent, picture, let_go, keep,
+         is_kept, undo, begin, is_loaded, escape, is_left]
+
+
+def run():
+    """Do what is next; called again after a while until all is done or something failed."""
+    try:
+        state.setdefault("step", time.monotonic())
+        if STEPS[0]():
+            STEPS.pop(0)
+            del state["step"]
+        elif waited(100):
+            raise TimeoutError(f"{STEPS[0].__name__}, {len(STEPS)} steps from the end")
+        if STEPS:
+            return 0.05
+    except Exception:
+        seen["error"] = traceback.format_exc()
+    (FOLDER / "log.json").write_text(json.dumps(seen))
+    bpy.ops.wm.quit_blender()
+    return None
+
+
+bpy.context.preferences.view.show_splash = False
+bpy.app.timers.register(run, first_interval=2.0)
