@@ -7,8 +7,9 @@ from scipy.spatial import cKDTree
 
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.scan_lines import scan_line_view
 from limber.geometry.cloud.sheets import find_sheet
-from limber.geometry.cloud.sight import View, find_sight, flying_pixels
+from limber.geometry.cloud.sight import Sight, View, find_sight, flying_pixels
 from limber.geometry.settings import PreparationSettings
 
 POINT_MINIMUM = 50
@@ -143,11 +144,14 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
                     eye: np.ndarray | None, counts: dict[str, int]) -> tuple[Cloud, View | None]:
     """Drop flying pixels, if this is what one depth camera saw; and where that stood."""
     eye = settings.camera_at if eye is None else eye
-    place = None if eye is None else np.array(eye) * scale
-    sight = find_sight(cloud.points * scale, place)
+    if eye is None:
+        place, sight = _own_sight(cloud.points * scale)
+    else:
+        place = np.array(eye) * scale
+        sight = find_sight(cloud.points * scale, place)
     if sight is None:
         return cloud, None
-    view = View(np.zeros(3) if place is None else place, sight.pitch)
+    view = View(place, sight.pitch)
     if settings.flying_angle == 0:
         return cloud, view
     flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)
@@ -156,6 +160,19 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
     _enough(rest, "Without its flying pixels (--flying-angle 0 keeps them) the depth camera's "
             "cloud")
     return rest, view
+
+
+def _own_sight(points: np.ndarray) -> tuple[np.ndarray, Sight | None]:
+    """The image that a cloud is, and its camera's place [m], shape [3].
+
+    By the order of its points, or as seen from the origin of the file's coordinates.
+    """
+    told = scan_line_view(points)
+    if told is not None:
+        sight = find_sight(points - told[0], forward=told[1])
+        if sight is not None:
+            return told[0], sight
+    return np.zeros(3), find_sight(points)
 
 
 def _enough(cloud: Cloud, what: str) -> None:

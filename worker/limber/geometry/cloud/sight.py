@@ -48,7 +48,8 @@ class Sight:
     pitch: float
 
 
-def find_sight(points: np.ndarray, eye: np.ndarray | None = None) -> Sight | None:
+def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
+               forward: np.ndarray | None = None) -> Sight | None:
     """Look at a cloud from its camera's place; None if it is no image from there.
 
     An image has one point a pixel, and pixels lie evenly. Points that were scanned from all
@@ -58,6 +59,7 @@ def find_sight(points: np.ndarray, eye: np.ndarray | None = None) -> Sight | Non
         points: Positions [m], shape [n, 3], camera and points in one frame.
         eye: The camera's place [m], shape [3]; None: the origin, if the cloud looks like an image
             from there. If given, only points too wide apart for one view are refused.
+        forward: Middle of the view, a unit vector, shape [3]; None: as the points lie.
     """
     if len(points) < _LEAST:
         return None
@@ -66,7 +68,7 @@ def find_sight(points: np.ndarray, eye: np.ndarray | None = None) -> Sight | Non
     if distance.min() <= 1e-9 * max(float(distance.max()), 1e-300):
         return None
     ray = offset / distance[:, None]
-    forward = _forward(ray)
+    forward = _forward(ray) if forward is None else forward
     if forward is None or (ray @ forward).min() < np.cos(_WIDEST):
         return None
     depth = offset @ forward

@@ -1,0 +1,152 @@
+"""Where the camera of an image stood, told by the order in which a file keeps its pixels.
+
+Clouds made of a depth image keep its pixels row by row, or column by column. All points of a line
+lie in one plane with the camera; all these planes meet in the line through it along which pixels
+are counted; and along a line the pixels are evenly apart. So camera and direction of view
+are known wherever the cloud was moved or turned to since.
+"""
+
+import numpy as np
+
+_WINDOW, _STRIDE = 10, 5  # points in a row that show a plane
+_PLANE = 1e-3  # across it over its narrower extent, up to which points lie in one
+_BENT = 0.02  # narrower extent over the longer one, from which that plane is known
+_LEAST, _SHARE = 20, 0.15  # number and share of windows that must show planes
+_APART = 0.03  # sine of the angles between planes, under which they are parallel: a sorted grid
+_NEAR = 3e-3  # by how much half of these planes may miss the camera, over the cloud's extent
+_TUKEY, _EXACT = 4.0, 1e-9  # how many times as far as the median what counts may miss; that is none
+_EVEN = 0.2  # of a pixel that evenly set ones may be off
+_ROUNDS = 20
+_TRIED, _RULERS = 300, 3000  # from how many a first place is taken, and on how many it is tried
+
+
+def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find a camera's place [m], shape [3], and its direction of view, a unit vector, shape [3].
+
+    Args:
+        points: In the order of the file [m], shape [n, 3].
+
+    Returns:
+        None where the order of the points is not that of an image.
+    """
+    normals, offsets, weight = _planes(points)
+    if len(normals) < max(_LEAST, _SHARE * len(points) / _STRIDE):
+        return None
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    along, place = _common_line(normals, offsets, weight, extent)
+    if along is None:
+        return None
+    way = points - place
+    forward = way.mean(axis=0) - (way.mean(axis=0) @ along) * along
+    distance = float(np.linalg.norm(forward))
+    forward /= distance
+    depth = way @ forward
+    if depth.min() <= 0.05 * distance:
+        return None
+    eye = place + _even_place(way @ along, depth) * along
+    way = points - eye
+    column, row = way @ along / depth, way @ np.cross(forward, along) / depth
+    turn = _turn(column, row)
+    if turn is None:
+        return None
+    forward = np.cos(turn) * forward + np.sin(turn) * np.cross(forward, along)
+    return eye, forward
+
+
+def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Planes of consecutive points: normals [w, 3], offsets [m], and how wide they are [m^2]."""
+    start = np.arange(0, len(points) - _WINDOW + 1, _STRIDE)
+    group = points[start[:, None] + np.arange(_WINDOW)]
+    middle = group.mean(axis=1)
+    offset = group - middle[:, None]
+    values, axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)
+    size = np.sqrt(np.maximum(values, 0.0))
+    flat = (size[:, 0] < _PLANE * size[:, 1]) & (size[:, 1] > _BENT * size[:, 2])
+    normal = axes[flat][:, :, 0]
+    return normal, np.einsum("wj,wj->w", normal, middle[flat]), values[flat, 1]
+
+
+def _common_line(normals: np.ndarray, offsets: np.ndarray, weight: np.ndarray, extent: float,
+                 ) -> tuple[np.ndarray | None, np.ndarray]:
+    """Direction [3] of the line in which most of the planes meet, and a point on it [m].
+
+    Windows over the end of a line lie in no plane with the camera: two planes propose a line, the
+    one that most others pass is taken.
+    """
+    rng = np.random.default_rng(0)
+    best, least, miss = None, np.inf, None
+    for one, other in rng.integers(len(normals), size=(_TRIED, 2)):
+        along = np.cross(normals[one], normals[other])
+        size = float(np.linalg.norm(along))
+        if size < _APART:
+            continue
+        place = np.linalg.lstsq(np.stack([normals[one], normals[other], along / size]),
+                                np.array([offsets[one], offsets[other], 0.0]), rcond=None)[0]
+        missed = _missed(normals, offsets, along / size, place, extent)
+        if np.median(missed) < least:
+            best, least, miss = (along / size, place), float(np.median(missed)), missed
+    if best is None or least > _NEAR:
+        return None, np.zeros(3)
+    for _ in range(_ROUNDS):
+        near = miss <= _TUKEY * max(least, _EXACT)
+        own, part = normals[near], weight[near]
+        axes = np.linalg.eigh((own * part[:, None]).T @ own)[1]
+        along, across = axes[:, 0], axes[:, 1:]
+        flat = own @ across
+        place = across @ np.linalg.solve((flat * part[:, None]).T @ flat,
+                                         (flat * part[:, None]).T @ offsets[near])
+        miss = _missed(normals, offsets, along, place, extent)
+        if np.median(miss) > least:
+            break
+        best, least = (along, place), float(np.median(miss))
+    return best
+
+
+def _missed(normals: np.ndarray, offsets: np.ndarray, along: np.ndarray, place: np.ndarray,
+            extent: float) -> np.ndarray:
+    """By how much planes miss a line, over the cloud's extent, and in radians, shape [w]."""
+    return np.abs(normals @ along) + np.abs(normals @ place - offsets) / extent
+
+
+def _even_place(side: np.ndarray, depth: np.ndarray) -> float:
+    """Where along that line [m] the camera is: three pixels in a row look evenly apart from it."""
+    image, inverse = side / depth, 1 / depth
+    bend = image[:-2] - 2 * image[1:-1] + image[2:]
+    change = inverse[:-2] - 2 * inverse[1:-1] + inverse[2:]
+    known = np.abs(change) > 1e-9 * float(np.median(inverse))
+    if not known.any():
+        return 0.0
+    bend, change = bend[known], change[known]
+    # Most pixels beside each other in the file are so in the image: of the places that threes of
+    # them ask for, the one that suits most.
+    tried = np.linspace(0, len(bend) - 1, _TRIED).astype(int)
+    ruler = np.linspace(0, len(bend) - 1, _RULERS).astype(int)
+    place, most = 0.0, -1
+    for start in bend[tried] / change[tried]:
+        step = np.median(np.abs(image[ruler + 1] - image[ruler] - start * (
+            inverse[ruler + 1] - inverse[ruler])))
+        even = int((np.abs(bend[ruler] - start * change[ruler]) < _EVEN * step).sum())
+        if even > most:
+            place, most = float(start), even
+    for _ in range(_ROUNDS):
+        step = np.median(np.abs(np.diff(image - place * inverse)))
+        even = np.abs(bend - place * change) < _EVEN * step
+        place = float(bend[even] @ change[even] / max(float(change[even] @ change[even]), 1e-300))
+    return place
+
+
+def _turn(column: np.ndarray, row: np.ndarray) -> float | None:
+    """Angle [rad] to turn the view by so that pixels of all lines are as wide.
+
+    Seen from askew they are p (cos a + row sin a) wide.
+    """
+    width, at = np.abs(np.diff(column)), (row[1:] + row[:-1]) / 2
+    pitch = float(np.median(width))
+    even = np.abs(width - pitch) < 2 * _EVEN * pitch
+    for _ in range(_ROUNDS):
+        if even.sum() < _LEAST:
+            return None
+        slope, start = np.polyfit(at[even], width[even], 1)
+        off = np.abs(width - start - slope * at)
+        even = off < min(_EVEN * pitch, _TUKEY * float(np.median(off[even])) + _EXACT * pitch)
+    return float(np.arctan2(slope, start))
