@@ -22,6 +22,12 @@ def _forest(*chains):
     return np.vstack(chains), np.vstack(edges)
 
 
+def _joined(nodes, edges, thickness, spread=0.0, limit=0.3):
+    count = len(nodes)
+    return join_pieces(nodes, edges, thickness, np.full(count, 20), np.full(count, spread),
+                       gap=0.03, bridge_limit=limit, up=Z, join_plants=False)
+
+
 def _fork_in_a_gap(gap: float):
     """A stem with a gap, whose twig starts out of it, nearer to each end than these are."""
     low, high = _line([0, 0, 0], [0, 0, 0.3]), _line([0, 0, 0.3 + gap], [0, 0, 0.7])
@@ -36,8 +42,7 @@ def test_the_stem_does_not_go_along_a_twig_and_back(gap: float) -> None:
     low, high, twig = _fork_in_a_gap(gap)
     nodes, edges = _forest(low, high, twig)
     thickness = np.concatenate([np.full(24, 0.008), np.full(12, 0.005)])
-    joined = join_pieces(nodes, edges, thickness, np.full(len(nodes), 20), gap=0.03,
-                         bridge_limit=0.3, up=Z, join_plants=False)
+    joined = _joined(nodes, edges, thickness)
     assert joined.label.max() == 0
     assert sorted(joined.bridges[0].tolist()) == [11, 12]
     one, other = joined.bridges[1]
@@ -56,6 +61,29 @@ def test_an_end_prefers_what_it_points_at() -> None:
     best = nodes[found.other[0]] if found.other[0] < 40 else nodes[found.one[0]]
     assert best[2] == pytest.approx(0.30, abs=0.03)
     assert np.all(np.diff(found.price) >= 0)
+
+
+def test_stems_are_joined_before_twigs() -> None:
+    """A thin twig's end does not take the stem's: the stem's bridge is shorter for its thickness.
+
+    The twig points at the lower stem's end, and the upper part of the stem leans away.
+    """
+    low, high = _line([0, 0, 0], [0, 0, 0.3]), _line([0.03, 0, 0.4], [0.13, 0, 0.7])
+    twig = _line([-0.06, 0, 0.36], [-0.18, 0, 0.48])
+    nodes, edges = _forest(low, high, twig)
+    joined = _joined(nodes, edges, np.repeat([0.01, 0.01, 0.002], 12))
+    assert sorted(joined.bridges[0].tolist()) == [11, 12]
+    assert joined.label.max() == 0
+
+
+def test_a_tip_beyond_a_gap_is_reached_straight_on() -> None:
+    """What is left of a tip is one node: an end that goes straight on to it comes from far."""
+    stem, tip = _line([0, 0, 0], [0, 0, 0.5]), np.array([[0.0, 0.0, 0.6]])
+    nodes, edges = np.vstack([stem, tip]), np.stack([np.arange(11), np.arange(1, 12)], axis=1)
+    thickness = np.full(13, 0.008)
+    assert _joined(nodes, edges, thickness, 0.012, 0.15).label.max() == 0
+    aside = nodes + np.outer(np.arange(13) == 12, [0.08, 0, -0.03])
+    assert _joined(aside, edges, thickness, 0.012, 0.15).label.max() == 1
 
 
 def test_a_bridge_bends_as_its_ends_do() -> None:

@@ -36,6 +36,7 @@ def _joined(*chains, **options):
         begin += len(chain)
     count = len(nodes)
     return join_pieces(nodes, np.vstack(edges), np.full(count, 0.01), np.full(count, 20),
+                       np.full(count, 0.01),
                        **({"gap": 0.03, "bridge_limit": 0.3, "up": Z, "join_plants": False}
                           | options))
 

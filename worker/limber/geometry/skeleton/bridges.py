@@ -3,8 +3,8 @@
 The shortest way over a gap is often wrong: where a fork is missing, it leads from the stem along a
 twig and back. An end of a piece goes on in its own direction, meets another end that comes towards
 it and is about as thick, or the side of a thicker piece at the angle that twigs stand at. How far
-that is from what was found prices a hypothesis; the cheapest ones are taken first, and what they
-fill in can carry the next.
+that is from what was found prices a hypothesis; the cheapest ones for their thickness are taken
+first, so that stems come before twigs, and what they fill in can carry the next.
 """
 
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Ends:
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Possible bridges, cheapest first.
+    """Possible bridges, cheapest for their thickness first.
 
     Attributes:
         one: Node at the end that reaches out, shape [h].
@@ -77,7 +77,9 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> En
     ends = [node for node, others in enumerate(near) if len(others) <= 1]
     direction, radius = np.zeros((len(ends), 3)), np.empty(len(ends))
     for place, end in enumerate(ends):
+        # Points are missing beside an end too, where it looks thinner than it is.
         chain = _straight_chain(nodes, near, end, _CHAIN * thickness[end])
+        chain = _straight_chain(nodes, near, end, _CHAIN * float(thickness[chain].max()))
         radius[place] = float(np.median(thickness[chain]))
         if len(chain) > 1:
             direction[place] = _direction(nodes[chain])
@@ -115,7 +117,11 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
             parts.append(_priced(nodes, thickness, axis, ends, end_of, place, others, limit))
     parts.append(_blind(nodes, label, largest, limit))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    order = np.argsort(columns[3], kind="stable")
+    thick = thickness.copy()
+    thick[ends.node] = ends.radius
+    thick = np.where(columns[4] == np.pi, np.minimum(thick[columns[0]], thick[columns[1]]),
+                     thick[columns[0]])
+    order = np.argsort(columns[3] / np.maximum(thick, 1e-12), kind="stable")
     return Hypotheses(*(column[order] for column in columns))
 
 
@@ -176,13 +182,13 @@ def _direction(chain: np.ndarray) -> np.ndarray:
 
 
 def _axes(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Direction of the axis at each node, without sign, shape [n, 3]."""
+    """Direction of the axis at each node, without sign; zero at single nodes, shape [n, 3]."""
     sums = np.zeros((len(nodes), 3, 3))
     way = nodes[edges[:, 1]] - nodes[edges[:, 0]]
     square = way[:, :, None] * way[:, None, :]
     np.add.at(sums, edges[:, 0], square)
     np.add.at(sums, edges[:, 1], square)
-    return np.linalg.eigh(sums)[1][:, :, 2]
+    return np.linalg.eigh(sums)[1][:, :, 2] * (np.trace(sums, axis1=1, axis2=2) > 0)[:, None]
 
 
 def _turned(direction: np.ndarray, way: np.ndarray, radius: float) -> np.ndarray:
@@ -201,6 +207,7 @@ def _priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, ends: En
     length = np.maximum(np.linalg.norm(way, axis=1), 1e-12)
     turn = _turned(direction, way, radius)
     stand = np.arccos(np.clip(np.abs(np.einsum("kj,kj->k", way, axis[others])) / length, 0, 1))
+    stand = np.where(axis[others].any(axis=1), stand, _STAND[0])
     thicker = np.log(radius / np.maximum(thickness[others], 1e-12))
     side = _SIDE + ((stand - _STAND[0]) / _STAND[1])**2 + _RATIO * np.maximum(thicker, 0)
     other_end = end_of[others]

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import (
 )
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.contraction.pieces import Joined, join_pieces
+from limber.geometry.skeleton.contraction.pieces import Joined, join_pieces, specks
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -62,21 +62,30 @@ def curve_graph(points: np.ndarray, contracted: np.ndarray, *, gap_factor: float
     drawn = np.linalg.norm(points - contracted, axis=1)
     thickness = _smoothed(drawn, contracted)
     owner = _cover(contracted, np.maximum(0.8 * thickness, 1.5 * spacing))
-    count = int(owner.max()) + 1
-    support = np.bincount(owner, minlength=count)
-    nodes = _means(owner, contracted)
-    radius = np.bincount(owner, thickness, count) / support
+    merged = specks(_means(owner, contracted), _node_links(owner, links),
+                    _means(owner, thickness[:, None])[:, 0], np.bincount(owner))
+    _, owner = np.unique(merged[owner], return_inverse=True)
+    support = np.bincount(owner)
+    nodes, radius = _means(owner, contracted), _means(owner, thickness[:, None])[:, 0]
     edges = _node_links(owner, links)
     length = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     graph = CurveGraph(nodes, edges, radius, support)
     graph.edges, graph.loops = _spanning_forest(nodes, edges, length, radius)
     typical = float(np.median(np.linalg.norm(
         nodes[graph.edges[:, 0]] - nodes[graph.edges[:, 1]], axis=1))) if len(edges) else spacing
-    joined = join_pieces(graph.nodes, graph.edges, radius, support, gap=gap_factor * typical,
-                         bridge_limit=bridge_limit, up=up, join_plants=join_plants)
+    joined = join_pieces(graph.nodes, graph.edges, radius, support, spreads(points, owner, nodes),
+                         gap=gap_factor * typical, bridge_limit=bridge_limit, up=up,
+                         join_plants=join_plants)
     kept = keep_largest(graph, joined, gap_factor * typical)
     graph.owner = np.where(kept, np.cumsum(kept) - 1, -1)[owner]
     return graph
+
+
+def spreads(points: np.ndarray, owner: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """How far each node's points reach from it [m], shape [n]."""
+    spread = np.zeros(len(nodes))
+    np.maximum.at(spread, owner, np.linalg.norm(points - nodes[owner], axis=1))
+    return spread
 
 
 def neighbour_links(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -184,7 +193,7 @@ def _cover(contracted: np.ndarray, reach: np.ndarray) -> np.ndarray:
 
 def _means(owner: np.ndarray, points: np.ndarray) -> np.ndarray:
     support = np.bincount(owner)
-    return np.stack([np.bincount(owner, points[:, k]) for k in range(3)], axis=1) / support[:, None]
+    return np.stack([np.bincount(owner, column) for column in points.T], axis=1) / support[:, None]
 
 
 def _node_links(owner: np.ndarray, links: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from limber.geometry.skeleton.contraction.curve_graph import (
     CurveGraph,
     keep_largest,
     neighbour_links,
+    spreads,
 )
 from limber.geometry.skeleton.contraction.pieces import join_pieces
 
@@ -76,8 +77,8 @@ def level_graph(points: np.ndarray, source: np.ndarray, *, gap_factor: float,
     graph = CurveGraph(nodes, edges, thickness, support)
     step = np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
     gap = gap_factor * (float(np.median(step)) if len(step) else spacing)
-    joined = join_pieces(nodes, edges, thickness, support, gap=gap, bridge_limit=bridge_limit,
-                         up=up, join_plants=join_plants)
+    joined = join_pieces(nodes, edges, thickness, support, spreads(points, owner, nodes), gap=gap,
+                         bridge_limit=bridge_limit, up=up, join_plants=join_plants)
     kept = keep_largest(graph, joined, gap)
     graph.owner = np.where(kept, np.cumsum(kept) - 1, -1)[owner]
     return graph

@@ -11,7 +11,10 @@ from limber.geometry.skeleton.bridges import Ends, Hypotheses, filled, free_ends
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any size
-_REACH = 5.0  # the longest bridge beyond, in what the smaller piece reaches
+# The longest bridge beyond, in what the smaller piece reaches; and where it goes straight on.
+_REACH, _REACH_STRAIGHT, _STRAIGHT_ON = 5.0, 10.0, 1.5
+# Length in thicknesses, under which a piece tells no direction; and if it has few points.
+_SPECK, _SPECK_FEW, _FEW = 5.0, 10.0, 30
 _PLANT_SHARE = 0.2  # of all points, from which a piece may be a plant of its own
 _BASE_SHARE = 0.12  # of a piece's reach, up to which a bridge starts at its base
 _FAR_SHARE = 0.3  # from which it starts far from its base
@@ -27,6 +30,7 @@ class Joined:
         nodes: All nodes [m], those along bridges after the given ones, shape [n, 3].
         thickness: First radii [m], shape [n].
         support: Number of points of each node, none along bridges, shape [n].
+        spread: How far its points reach from each node [m], 0 along bridges, shape [n].
         edges: All edges, the bridges included, shape [e, 2].
         bridges: Node pairs that were joined, shape [b, 2].
         prices: What each bridge cost over its length: 1 where an end goes straight on into
@@ -38,6 +42,7 @@ class Joined:
     nodes: np.ndarray
     thickness: np.ndarray
     support: np.ndarray
+    spread: np.ndarray
     edges: np.ndarray
     bridges: np.ndarray
     prices: np.ndarray
@@ -46,7 +51,8 @@ class Joined:
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
-                *, gap: float, bridge_limit: float, up: np.ndarray, join_plants: bool) -> Joined:
+                spread: np.ndarray, *, gap: float, bridge_limit: float, up: np.ndarray,
+                join_plants: bool) -> Joined:
     """Join pieces over gaps by the bridges that their directions and radii speak for.
 
     The smaller piece of a long bridge must have some length itself: so a severed twig comes back to
@@ -59,20 +65,26 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
         edges: Node pairs of a forest, shape [e, 2].
         thickness: First radii [m], shape [n].
         support: Number of points of each node, shape [n].
+        spread: How far its points reach from each node [m], shape [n].
         gap: Steps up to this length [m] are no gap (the paper's gamma rule).
         bridge_limit: No bridge is longer [m], unless its end points straight at what it reaches.
         up: Which way is up, shape [3].
         join_plants: Join even what looks like two plants.
     """
-    state = Joined(nodes, thickness, support, edges, np.empty((0, 2), np.int64), np.empty(0),
-                   np.empty((0, 2), np.int64), _labels(len(nodes), edges))
+    state = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
+                   np.empty(0), np.empty((0, 2), np.int64), _labels(len(nodes), edges))
+    # Single nodes tell no direction: unless an end goes straight on to one, they come last.
+    alone = True
     while True:
         weight = np.bincount(state.label, state.support)
         if len(weight) == 1:
             break
         found = hypotheses(state.nodes, state.edges, state.thickness, state.label, weight,
                            bridge_limit)
-        chosen = _mutual(found, state, weight, gap, bridge_limit, up, join_plants)
+        chosen = _mutual(found, state, weight, gap, bridge_limit, up, join_plants, alone)
+        if not chosen and alone:
+            alone = False
+            continue
         if not chosen:
             break
         ends = free_ends(state.nodes, state.edges, state.thickness)
@@ -85,16 +97,20 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
 
 
 def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, limit: float,
-            up: np.ndarray, join_plants: bool) -> list[int]:
+            up: np.ndarray, join_plants: bool, alone: bool) -> list[int]:
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first."""
     best: dict[int, int] = {}
     first: list[tuple[int, int, int]] = []
+    single = np.bincount(state.label) == 1
     for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
         a, b = int(state.label[one]), int(state.label[other])
         if a in best and b in best:
             continue
-        if not _allowed(state, weight, (int(one), int(other)), float(found.length[place]), gap,
-                        limit, up, join_plants):
+        if alone and (single[a] or single[b]) and (
+                found.price[place] > _STRAIGHT_ON * found.length[place]):
+            continue
+        if not _allowed(state, weight, (int(one), int(other)), float(found.length[place]),
+                        float(found.price[place]), gap, limit, up, join_plants):
             continue
         if a not in best and b not in best:
             first.append((place, a, b))
@@ -103,14 +119,18 @@ def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, li
     return [place for place, a, b in first if best[a] == best[b] == place]
 
 
-def _allowed(state: Joined, weight: np.ndarray, pair: tuple[int, int], length: float, gap: float,
-             limit: float, up: np.ndarray, join_plants: bool) -> bool:
+def _allowed(state: Joined, weight: np.ndarray, pair: tuple[int, int], length: float, price: float,
+             gap: float, limit: float, up: np.ndarray, join_plants: bool) -> bool:
     """Whether the smaller piece is large enough for the bridge, and no plant of its own."""
     a, b = state.label[list(pair)]
     small, end = (a, pair[0]) if weight[a] <= weight[b] else (b, pair[1])
-    own = state.nodes[state.label == small]
-    reach = float(np.linalg.norm(own - state.nodes[end], axis=1).max()) + state.thickness[end]
-    if length > max(_REACH * reach, _SHORT * limit):
+    own = state.label == small
+    reach = float((np.linalg.norm(state.nodes[own] - state.nodes[end], axis=1)
+                   + np.maximum(state.spread, state.thickness)[own]).max())
+    # An end may go far straight on to what is left of its tip; that itself points anywhere.
+    straight = price < _STRAIGHT_ON * length and a != small
+    farthest = (_REACH_STRAIGHT if straight else _REACH) * reach
+    if length > max(farthest, _SHORT * limit):
         return False
     large = min(weight[a], weight[b]) > _PLANT_SHARE * state.support.sum()
     return not (large and length > gap and not join_plants
@@ -126,8 +146,27 @@ def _bridge(state: Joined, ends: Ends, found: Hypotheses, place: int, step: floa
     state.nodes = np.vstack([state.nodes, curve])
     state.thickness = np.concatenate([state.thickness, thick])
     state.support = np.concatenate([state.support, np.zeros(len(curve), state.support.dtype)])
+    state.spread = np.concatenate([state.spread, np.zeros(len(curve))])
     state.bridges = np.vstack([state.bridges, [one, other]])
     state.prices = np.append(state.prices, found.price[place] / found.length[place])
+
+
+def specks(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
+           ) -> np.ndarray:
+    """A number for each node, shape [n]: its own, but one for all of a piece too short to point.
+
+    Of a few points of a branch contraction makes a short line in any direction; whoever is joined
+    to it in its middle finds no end to go on from.
+    """
+    label = _labels(len(nodes), edges)
+    low, high = np.full((label.max() + 1, 3), np.inf), np.full((label.max() + 1, 3), -np.inf)
+    np.minimum.at(low, label, nodes)
+    np.maximum.at(high, label, nodes)
+    thick = np.zeros(label.max() + 1)
+    np.maximum.at(thick, label, thickness)
+    few = np.bincount(label, support) < _FEW
+    short = np.linalg.norm(high - low, axis=1) < np.where(few, _SPECK_FEW, _SPECK) * thick
+    return np.where(short[label], len(nodes) + label, np.arange(len(nodes)))
 
 
 def second_base(skeleton: Skeleton, up: np.ndarray) -> np.ndarray | None:
