@@ -18,7 +18,7 @@ from benchmarks.scan_cases import (
     single_view_case,
 )
 from benchmarks.scan_plants import crown_case, leafy_case
-from benchmarks.scan_scores import points_on_axes, score, seen_part
+from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_part
 from limber.alignment import Alignment
 from limber.errors import LimberError
 from limber.geometry.reconstruct import ReconstructSettings
@@ -113,10 +113,14 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     manifest = json.loads((branch / "branch.json").read_text())
     aligned = read_fitted(branch / "skeleton.csv")
     found = aligned.moved(Alignment.model_validate(manifest["alignment"]).undo(aligned.nodes))
-    scored = score(seen_part(case.truth, case.points), found)
-    scored |= {"seed": case.seed, "left_out": result["left_out_twigs"],
+    seen = seen_part(case.truth, case.points)
+    # Wood that no point shows is in no mesh; it is told beside.
+    shown = cylinder_volume(seen) / cylinder_volume(case.truth)
+    scored = score(seen, found)
+    scored |= {"seed": case.seed, "left_out": result["left_out_twigs"], "shown": shown,
                "unsaid_m": unsaid_length(aligned, branch),
-               "volume": result["mesh_volume_m3"] / case.volume - 1 if case.volume else 0.0}
+               "volume": result["mesh_volume_m3"] / (shown * case.volume) - 1 if case.volume else (
+                   0.0)}
     if case.leaf is not None:
         scored["leaf_points_on_stems"] = points_on_axes(case.points[case.leaf], case.truth, found)
     return scored, found

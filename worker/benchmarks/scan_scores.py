@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 
 _STEP = 0.001  # [m] between the places on the axes that are compared
@@ -47,9 +48,14 @@ class Dense:
 def seen_part(truth: Skeleton, points: np.ndarray) -> Skeleton:
     """The truth as far as a scan shows it: ends beyond the last point near them are cut off.
 
-    A stretch between points is asked for, whatever its length; what lies past all points is not.
+    A stretch between points is asked for, whatever its length; what lies past all points is not,
+    nor is a twig none of whose own points were seen: those of its carrier do not show its foot.
     """
-    distance, _ = cKDTree(points).query(truth.nodes)
+    run, distance = truth.branch[nearest_cylinders(truth, points)[0]], np.full(
+        truth.node_count, np.inf)
+    for number in np.unique(run):
+        own = truth.branch == number
+        distance[own] = cKDTree(points[run == number]).query(truth.nodes[own])[0]
     shown = distance < truth.radius + 2 * _STEP + 0.25 * truth.radius
     below = shown.copy()
     for node in range(truth.node_count - 1, 0, -1):
@@ -62,6 +68,12 @@ def seen_part(truth: Skeleton, points: np.ndarray) -> Skeleton:
     parent = truth.parent[below]
     parent = np.where(np.arange(len(parent)) == 0, -1, (np.cumsum(below) - 1)[parent])
     return Skeleton.from_edges(truth.nodes[below], parent, truth.radius[below])
+
+
+def cylinder_volume(skeleton: Skeleton) -> float:
+    """Volume of a skeleton's cylinders [m^3], forks counted twice."""
+    length = np.linalg.norm(skeleton.nodes[1:] - skeleton.nodes[skeleton.parent[1:]], axis=1)
+    return float(np.pi * (length * skeleton.radius[1:]**2).sum())
 
 
 def fork_matches(truth: Skeleton, found: Skeleton) -> tuple[int, np.ndarray]:
