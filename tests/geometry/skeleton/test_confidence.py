@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.geometry.skeleton.confidence import assessed, shares
+from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
 from limber.geometry.skeleton.files import read_fitted, write_cylinders
 from limber.geometry.skeleton.radii.axis_fit import tapered
 from limber.geometry.skeleton.skeleton import (
@@ -114,3 +114,24 @@ def test_what_is_filled_in_limits_no_radius() -> None:
         state = np.where(np.arange(41) < 12, first, MEASURED).astype(np.int8)
         told = tapered(Skeleton.from_edges(stem.nodes, stem.parent, radius, radius_state=state))
         assert (told.radius_state == LIMITED).any() == limited
+
+
+def test_twigs_more_likely_not_there_are_dropped_and_told() -> None:
+    """A twig without points goes, with place and length; one of many stays."""
+    points = np.vstack([_tube(0, 0.4, 0.008, 6000), _twig_points(0.004, 900)])
+    sure = assessed(_stem(0.008, 0.004), points, 0.0003)
+    assert likely(sure, 0.5)[0] is sure and likely(sure, 0.5)[1] == []
+    told = assessed(_stem(0.008, 0.004), _tube(0, 0.4, 0.008, 6000), 0.0003)
+    assert likely(told, 0.0)[0].branch_count == 2 and likely(told, 0.5)[0].branch_count == 1
+    twig = likely(told, 0.5)[1][0]
+    assert twig["length"] == pytest.approx(0.1) and twig["probability"] < 0.5
+    assert twig["at"] == pytest.approx([0.1, 0, 0.2])
+
+
+def test_axes_through_leaves_are_doubted_as_others_are() -> None:
+    """Without a fit too a twig of few points is less sure than the stem; radii stay."""
+    points = np.vstack([_tube(0, 0.4, 0.008, 6000), _twig_points(0.004, 20)])
+    stem = _stem(0.008, 0.004)
+    told = doubted(stem, points, 0.0003)
+    assert told.probability[told.branch == 1].max() < 0.9 < told.probability[5]
+    np.testing.assert_array_equal(told.radius, stem.radius)

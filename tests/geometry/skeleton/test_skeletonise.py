@@ -146,3 +146,26 @@ def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch):
     monkeypatch.setattr("limber.geometry.skeleton.radii.axis_fit._PROBE", 2)
     near = skeletonise(points, root=root).skeleton
     assert not np.allclose(near.radius_sigma, exact.radius_sigma, rtol=0.02)
+
+
+def test_the_order_of_the_points_changes_nothing() -> None:
+    """The same scan shuffled gives the same skeleton, and points keep their own node."""
+    points = generate_branch(12, length=0.4, fork_count=1, point_spacing=0.003).cloud.points
+    first, order = skeletonise(points), np.random.default_rng(3).permutation(len(points))
+    again = skeletonise(points[order])
+    np.testing.assert_allclose(again.skeleton.nodes, first.skeleton.nodes, atol=1e-9)
+    np.testing.assert_array_equal(again.node_of_point, first.node_of_point[order])
+
+
+def test_an_end_is_not_left_beyond_the_points() -> None:
+    """Where contraction overshoots a cut end, the root is brought back to where points are."""
+    from limber.geometry.skeleton.radii.axis_fit import AxisFit
+    from limber.geometry.skeleton.skeleton import Skeleton
+    from limber.geometry.skeleton.skeletonise import _with_full_tips
+
+    points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
+    z = np.concatenate([[-0.03, -0.001], np.linspace(0.01, 0.29, 29)])
+    axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
+                               np.full(31, 0.01))
+    fit = AxisFit(axis, np.zeros(0), np.zeros(0), 0.001)
+    assert abs(_with_full_tips(axis, points, fit).nodes[0, 2]) < 0.008

@@ -54,8 +54,8 @@ class SkeletonSettings(Settings):
     """How the skeleton is made."""
 
     groups: ClassVar[Groups] = {
-        "shape": ("contraction_points", "gap_factor", "bridge_limit", "prune", "plants",
-            "radii", "radius_low", "radius_high"),
+        "shape": ("contraction_points", "gap_factor", "bridge_limit", "prune", "twig_probability",
+            "plants", "radii", "radius_low", "radius_high"),
     }
     experts = ("contraction_points", "gap_factor", "bridge_limit", "radius_low", "radius_high")
 
@@ -68,6 +68,9 @@ class SkeletonSettings(Settings):
     prune: float = Field(
         2.5, ge=0, description="A twig stays if it reaches so many radii of its carrier beyond "
         "the carrier's axis.")
+    twig_probability: float = Field(
+        0.5, ge=0, le=1, description="Drop twigs that are less likely there than that; 0 keeps "
+        "all.")
     plants: Literal["refuse", "largest", "joined"] = Field(
         "refuse", description="Two plants in one cloud: refuse, take the largest, or join them.")
     radii: Literal["fit", "paper"] = Field(

@@ -54,9 +54,7 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
         points: The scan [m], shape [m, 3].
         noise: Standard deviation of the points [m].
     """
-    segment, residual = nearest_cylinders(skeleton, points)
-    near = np.abs(residual) < np.maximum(skeleton.radius[segment], 3 * noise)
-    count = np.bincount(segment[near], minlength=skeleton.node_count)
+    segment, count = _counted(skeleton, points, noise)
     spacing = _spacing(skeleton, points, segment, noise)
     state, radius = skeleton.radius_state.copy(), skeleton.radius.copy()
     sigma = np.sqrt(skeleton.radius_sigma**2 + (_MODEL * radius)**2
@@ -66,19 +64,50 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     loose = np.maximum(sigma / radius, np.where(coarse, _FIT, _FIT_NOISE))
     rough = np.isin(state, (LIMITED, INTERPOLATED))
     sigma = np.where(rough, np.maximum(sigma, _ROUGH_SIGMA * radius), sigma)
-    gap = np.zeros(skeleton.node_count)
     for run, members in enumerate(skeleton.runs()):
         own = members if run == 0 else members[1:]
         _blend(radius, sigma, state, own, members[0] if run else -1, vague, loose)
-        step = np.linalg.norm(np.diff(skeleton.nodes[members], axis=0), axis=1)
-        gap[members[1:]] = _long_gaps(count[members[1:]] == 0, step, radius[members[1:]],
-                                      spacing[members[1:]])
-        bridged = members[1:][gap[members[1:]] > 0]
-        state[bridged] = BRIDGED
-        sigma[bridged] = np.maximum(sigma[bridged], _BRIDGED_SIGMA * radius[bridged])
+    gap = _gaps(skeleton, radius, count, spacing)
+    state[gap > 0] = BRIDGED
+    sigma = np.where(gap > 0, np.maximum(sigma, _BRIDGED_SIGMA * radius), sigma)
     told = replace(skeleton, radius=radius, radius_sigma=sigma, radius_state=state)
     return replace(told, probability=_probability(told, twig_evidence(told, count, noise),
                                                   node_evidence(told, gap, noise)))
+
+
+def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
+    """Return the skeleton with the probabilities of its nodes alone; radii stay as they are.
+
+    Args:
+        skeleton: Led through the points; its radii are not fitted.
+        points: The scan [m], shape [m, 3].
+        noise: Standard deviation of the points [m].
+    """
+    segment, count = _counted(skeleton, points, noise)
+    gap = _gaps(skeleton, skeleton.radius, count, _spacing(skeleton, points, segment, noise))
+    state = np.where(gap > 0, BRIDGED, skeleton.radius_state).astype(np.int8)
+    told = replace(skeleton, radius_state=state)
+    return replace(told, probability=_probability(told, twig_evidence(told, count, noise),
+                                                  node_evidence(told, gap, noise)))
+
+
+def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
+    """Drop side runs that are less likely there than ``least``, and what they carry.
+
+    Returns:
+        The skeleton, and of each run dropped its ``length`` [m], its tip's place ``at`` [m] and
+        its ``probability``.
+    """
+    runs = skeleton.runs()
+    told = np.ones(len(runs))
+    for run, members in enumerate(runs[1:], start=1):
+        told[run] = min(float(skeleton.probability[members[1:]].max()),
+                        told[skeleton.branch[members[0]]])
+    dropped = [{"length": float(np.linalg.norm(np.diff(skeleton.nodes[runs[run]], axis=0),
+                                               axis=1).sum()),
+                "at": skeleton.nodes[runs[run][-1]], "probability": float(told[run])}
+               for run in np.flatnonzero(told < least)]
+    return (skeleton.subset(told[skeleton.branch] >= least) if dropped else skeleton), dropped
 
 
 def shares(skeleton: Skeleton) -> dict[str, float]:
@@ -131,6 +160,25 @@ def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.n
 def _logistic(evidence: np.ndarray, odds: tuple[float, ...]) -> np.ndarray:
     start, *slopes = odds
     return 1 / (1 + np.exp(-(start + evidence @ np.array(slopes))))
+
+
+def _counted(skeleton: Skeleton, points: np.ndarray, noise: float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """The node that each point belongs to, shape [m], and how many lie on each, shape [n]."""
+    segment, residual = nearest_cylinders(skeleton, points)
+    near = np.abs(residual) < np.maximum(skeleton.radius[segment], 3 * noise)
+    return segment, np.bincount(segment[near], minlength=skeleton.node_count)
+
+
+def _gaps(skeleton: Skeleton, radius: np.ndarray, count: np.ndarray, spacing: np.ndarray,
+          ) -> np.ndarray:
+    """Length [m] of the long stretch without points that each node lies in, or 0, shape [n]."""
+    gap = np.zeros(skeleton.node_count)
+    for members in skeleton.runs():
+        step = np.linalg.norm(np.diff(skeleton.nodes[members], axis=0), axis=1)
+        own = members[1:]
+        gap[own] = _long_gaps(count[own] == 0, step, radius[own], spacing[own])
+    return gap
 
 
 def _spacing(skeleton: Skeleton, points: np.ndarray, segment: np.ndarray, noise: float,

@@ -114,6 +114,10 @@ def warnings(result: Any) -> list[str]:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
     if len(result.loops) > _NAMED:
         texts.append(f"{len(result.loops) - _NAMED} shorter closed loops were opened too.")
+    if result.unlikely:
+        longest = max(twig["length"] for twig in result.unlikely)
+        texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were dropped: "
+                     "more likely than not they are not there (--twig-probability).")
     if result.second_base is not None:
         texts.append(f"The plant stands on a second base, at {_place(result.second_base)}: two "
                      "plants that touch? Cut out one of them (--crop-low, --crop-high).")

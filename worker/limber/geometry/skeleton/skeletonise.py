@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.geometry.settings import SkeletonSettings
-from limber.geometry.skeleton.confidence import assessed, shares
+from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
 from limber.geometry.skeleton.contraction.curve_graph import (
     CurveGraph,
     curve_graph,
@@ -70,6 +70,8 @@ class SkeletonResult:
         pruned: Number of spurs pruned.
         second_base: Where the plant seems to stand on the ground a second time [m], shape [3].
         other_root: An end that is about as likely the root [m], shape [3].
+        unlikely: Twigs dropped as more likely not there: ``length`` [m], ``at`` [m, 3],
+            ``probability``.
         leafy: Most points lay on no cylinder, and axes were led through the middle of leaves.
     """
 
@@ -85,6 +87,7 @@ class SkeletonResult:
     second_base: np.ndarray | None = None
     other_root: np.ndarray | None = None
     leafy: bool = False
+    unlikely: list[dict] = field(default_factory=list)
 
     @property
     def warnings(self) -> list[str]:
@@ -95,11 +98,13 @@ class SkeletonResult:
         """Return the result in another frame; ``move`` takes points [n, 3] there."""
         bridges = [bridge | {"from": move(bridge["from"][None])[0],
                              "to": move(bridge["to"][None])[0]} for bridge in self.bridges]
-        split_off = [piece | {"at": move(piece["at"][None])[0]} for piece in self.split_off]
+        split_off, unlikely = ([part | {"at": move(part["at"][None])[0]} for part in parts]
+                               for parts in (self.split_off, self.unlikely))
         base, other = (None if place is None else move(place[None])[0]
                        for place in (self.second_base, self.other_root))
         return replace(self, skeleton=self.skeleton.moved(move(self.skeleton.nodes)),
-                       bridges=bridges, split_off=split_off, second_base=base, other_root=other)
+                       bridges=bridges, split_off=split_off, unlikely=unlikely, second_base=base,
+                       other_root=other)
 
     def report(self) -> dict[str, Any]:
         """Numbers for the stage's result."""
@@ -108,6 +113,7 @@ class SkeletonResult:
                 "bridges": self.bridges, "length_shares": shares(self.skeleton),
                 "doubtful_run_count": len({int(run) for run in self.skeleton.branch[
                     self.skeleton.probability < 0.5]}), "split_off": self.split_off,
+                "unlikely_twigs": self.unlikely,
                 "loop_lengths_m": self.loops, "pruned_spur_count": self.pruned}
 
 
@@ -127,7 +133,17 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     Raises:
         InputError: the cloud is not branch-like.
     """
-    settings = settings or SkeletonSettings()
+    # What is chosen point by point must not depend on the file's order: the same tree, shuffled or
+    # turned, is to give the same skeleton. By distance alone, covers would grow from the middle.
+    order = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
+    order = order[np.random.default_rng(0).permutation(len(points))]
+    found = _of_ordered(points[order], settings or SkeletonSettings(), root, up, camera, progress)
+    place = np.argsort(order)
+    return replace(found, node_of_point=found.node_of_point[place], residual=found.residual[place])
+
+
+def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray | None,
+                up: np.ndarray | None, camera: bool, progress: Progress) -> SkeletonResult:
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
     thin = thinned(points, settings.contraction_points)
     check_no_sheet(points[thin])
@@ -167,6 +183,10 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
         first, pruned = _first_skeleton(graph, settings, start)
         fitted, more = _through_leaves(first, some, fitted, settings, diagonal), 0
         segment, residual = nearest_cylinders(fitted.skeleton, points)
+    kept, unlikely = likely(fitted.skeleton, settings.twig_probability)
+    if unlikely:
+        fitted = replace(fitted, skeleton=kept)
+        segment, residual = nearest_cylinders(kept, points)
     if settings.radii == "paper":
         radius = median_radii(fitted.skeleton, points)
         low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
@@ -176,7 +196,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     result = SkeletonResult(
         fitted.skeleton, contraction, segment, residual, fitted.noise, graph.bridges,
         graph.split_off, graph.loops, pruned + more,
-        second_base(fitted.skeleton, up), other_root, leafy)
+        second_base(fitted.skeleton, up), other_root, leafy, unlikely)
     progress(1.0, "skeleton", nodes=fitted.skeleton.node_count)
     return result
 
@@ -190,9 +210,13 @@ def given_skeleton(skeleton: Skeleton, points: np.ndarray) -> SkeletonResult:
 
 
 def thinned(points: np.ndarray, limit: int) -> np.ndarray:
-    """Indices of at most ``limit`` points, one from each cell of a grid that fits that number."""
+    """Indices of at most ``limit`` points, one from each cell of a grid that fits that number.
+
+    The grid lies along the cloud's own axes, so that a turned one is thinned alike.
+    """
     if len(points) <= limit:
         return np.arange(len(points))
+    points = points @ own_axes(points)
     low = points.min(axis=0)
     # Points lie on a surface: cells grow with the square root of how many there are too many.
     size = float(np.median(cKDTree(points).query(
@@ -207,6 +231,16 @@ def thinned(points: np.ndarray, limit: int) -> np.ndarray:
             return np.sort(first)
         size *= max(1.03, np.sqrt(len(first) / limit))
     return np.sort(first)
+
+
+def own_axes(points: np.ndarray) -> np.ndarray:
+    """The directions in which a cloud extends, farthest first, as columns, shape [3, 3].
+
+    Each points to where the cloud has its longer tail.
+    """
+    offset = points - points.mean(axis=0)
+    axes = np.linalg.eigh(offset.T @ offset)[1][:, ::-1]
+    return axes * np.where(((offset @ axes)**3).sum(axis=0) < 0, -1.0, 1.0)
 
 
 def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, start: int,
@@ -303,9 +337,9 @@ def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
         skeleton = skeleton.moved(_evened(skeleton))
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
     skeleton = _with_full_tips(tapered(limited(skeleton, low, high)), points, fit)
-    return replace(fit, skeleton=replace(
-        skeleton, radius_sigma=0.25 * skeleton.radius,
-        radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8)))
+    skeleton = replace(skeleton, radius_sigma=0.25 * skeleton.radius,
+                       radius_state=np.full(skeleton.node_count, INTERPOLATED, np.int8))
+    return replace(fit, skeleton=doubted(skeleton, points, fit.noise))
 
 
 def _evened(skeleton: Skeleton) -> np.ndarray:
@@ -394,7 +428,9 @@ def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleto
             continue
         direction /= length
         radius = skeleton.radius[end]
-        mine = points[(segment == end) | (segment == (before if not is_root else inner))]
+        # The contraction may overshoot an end by far: then the next cylinder has its points.
+        beside = np.flatnonzero(skeleton.parent == inner) if is_root else [end, before]
+        mine = points[np.isin(segment, [inner, *beside] if is_root else beside)]
         offset = mine - nodes[end]
         along = offset @ direction
         across = np.linalg.norm(offset - along[:, None] * direction, axis=1)
