@@ -143,7 +143,7 @@ def test_a_path_without_numbers_is_refused(tmp_path, mesh):
     for name, text in (("words", "x_m,y_m,z_m\n1,2,three\n"), ("nan", "x_m,y_m,z_m\n1,2,nan\n"),
                        ("empty", "x_m,y_m,z_m\n"), ("columns", "x,y\n1,2\n")):
         files = {"plans/p.json": "{}", "plans/p.csv": text}
-        with pytest.raises(BranchFolderError, match=r"p\.csv"):
+        with pytest.raises(InputError, match=r"p\.csv"):
             scene_data(_branch(tmp_path / name, mesh, plan__p=files))
 
 

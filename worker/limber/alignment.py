@@ -1,7 +1,9 @@
 """From the coordinates of the file that a branch was made from to the branch's own, and back."""
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+_Row = tuple[float, float, float]
 
 
 class Alignment(BaseModel):
@@ -11,12 +13,19 @@ class Alignment(BaseModel):
     ``rotation`` the upright turn. All three are kept so that a result can be taken back.
     """
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-    scale: float = 1.0
+    scale: float = Field(1.0, gt=0)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[tuple[float, float, float], ...] = (
-        (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    rotation: tuple[_Row, _Row, _Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    @field_validator("rotation")
+    @classmethod
+    def _is_a_turn(cls, rows: tuple[_Row, _Row, _Row]) -> tuple[_Row, _Row, _Row]:
+        turn = np.array(rows)
+        if not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3:
+            raise ValueError("a turn has rows of length 1 at right angles")
+        return rows
 
     def apply(self, points: np.ndarray) -> np.ndarray:
         """Take input coordinates, shape [n, 3], to branch coordinates [m]."""

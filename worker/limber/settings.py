@@ -5,14 +5,25 @@ A model is the one source of an option's name, type, range, default and help; of
 unit of a value stands in its description in square brackets.
 """
 
+import math
 import re
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
 from limber.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+def _with_length(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    length = math.hypot(*vector)
+    if not 1e-9 < length < math.inf:
+        raise ValueError("a direction has a length")
+    return vector
+
+
+Direction = Annotated[tuple[float, float, float], AfterValidator(_with_length)]
+"""A direction: three numbers that are not all 0; of any length."""
 
 Groups = dict[str, tuple[str, ...]]
 """Title to the names of the fields that stand under it."""
@@ -29,7 +40,7 @@ class Settings(BaseModel):
         experts: Fields that only ``--help-all`` shows.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     groups: ClassVar[Groups] = {}
     experts: ClassVar[tuple[str, ...]] = ()

@@ -95,9 +95,9 @@ def test_units_become_metres(tmp_path):
     ("a.xyz", b"nan 2 3\n4 nan 6\n", "finite"),
     ("a.csv", b"x,y,w\n1,2,3\n", "z are missing"),
     ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\n"
-              b"property float y\nproperty float z\nend_header\n1234", "cannot be read"),
-    ("a.pcd", b"nonsense", "cannot be read"),
-    ("a.laz", b"nonsense", "cannot be read"),
+              b"property float y\nproperty float z\nend_header\n1234", "announces"),
+    ("a.pcd", b"nonsense", "no header"),
+    ("a.laz", b"nonsense", "not a LAS"),
     ("a.docx", b"nonsense", "suffix"),
 ])
 def test_bad_files_are_named(tmp_path, name, content, complaint):

@@ -33,7 +33,6 @@ import hashlib
 import itertools
 import json
 import re
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,8 +42,10 @@ from pydantic import ValidationError
 from limber.batch.toml_lines import Place, line_of, toml_lines
 from limber.batch.units import in_unit
 from limber.errors import InputError
+from limber.files import require_file
 from limber.jobs import Limits
 from limber.plain import plain
+from limber.reading import read_text, read_toml
 from limber.settings import Settings
 from limber.stages.registry import stage_description, stage_schema, stage_summaries
 
@@ -108,14 +109,11 @@ def read_jobs(path: Path) -> JobFile:
     Raises:
         InputError: it is no TOML, or says what cannot be run; every problem with its line.
     """
+    require_file(Path(path), "A job file")
     try:
-        text = Path(path).read_text(encoding="utf-8")
-        content = tomllib.loads(text)
-    except FileNotFoundError:
-        raise InputError(f"There is no file {path}.", "A job file was expected.",
-                         "Check the path.") from None
-    except (OSError, UnicodeDecodeError, RecursionError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} is no readable TOML ({error}).", "",
+        content, text = read_toml(path, "a job file"), read_text(path, "a job file")
+    except InputError as error:
+        raise InputError(error.seen, "A job file is TOML, and its numbers are finite.",
                          "`limber batch --help` shows what a job file looks like.") from error
     return _Reader(Path(path), content, toml_lines(text)).read()
 

@@ -1,8 +1,11 @@
 """Generated branches: true axes, radii and Young's modulus, and a scan of them with faults."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import cKDTree
 
 from limber.geometry.cloud.cloud import Cloud
@@ -11,8 +14,10 @@ from limber.geometry.skeleton.control_points import FRACTIONS, control_points
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import frames, tangents
 from limber.geometry.surface.surface import Surface
+from limber.reading import checked_as, read_json
 from limber.settings import checked_settings
 
+_Positive = Annotated[float, Field(gt=0)]
 _STEP = 0.004  # [m] between nodes of the true axes
 
 
@@ -218,3 +223,22 @@ def _seen_from_one_side(points: np.ndarray, normals: np.ndarray, spec: BranchSpe
     nearest = np.full(which.max() + 1, -np.inf)
     np.maximum.at(nearest, which.ravel(), depth)
     return (normals @ view > 0.1) & (depth > nearest[which.ravel()] - spec.radius_root)
+
+
+class _Truth(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    young_pa: list[_Positive]
+    fractions: list[Annotated[float, Field(ge=0, le=1)]]
+    control_points_m: list[tuple[float, float, float]]
+
+
+def read_truth(path: Path) -> dict[str, Any]:
+    """Return the content of ``truth.json``: what a generated branch was made with.
+
+    Raises:
+        InputError: it cannot be read, or is no such file.
+    """
+    content = read_json(path, "what a branch was made with")
+    checked_as(path, _Truth, content, "what a branch was made with")
+    return content

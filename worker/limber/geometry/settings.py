@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from limber.settings import Groups, Settings
+from limber.settings import Direction, Groups, Settings
 
 GRASP_FRACTION = 2.0 / 3.0
 """Where a branch is held, along its main path, if nothing is said."""
@@ -112,7 +112,7 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     }
 
     unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
-    up: tuple[float, float, float] = Field(
+    up: Direction = Field(
         (0.0, 0.0, 1.0), description="Which way is up in the file's axes.")
     root: tuple[float, float, float] | None = Field(
         None, description="A point near the root, in the file's coordinates; else the thick end.")
@@ -152,7 +152,7 @@ class MeshSurfaceSettings(Settings):
     experts = ("mesh_time_limit", "mesh_memory_limit_mb")
 
     unit: Literal["m", "cm", "mm", "in"] = Field("m", description="Unit of the file.")
-    up: tuple[float, float, float] = Field(
+    up: Direction = Field(
         (0.0, 0.0, 1.0), description="Which way is up in the file's axes.")
     root: tuple[float, float, float] | None = Field(
         None, description="A point near the end that is held, in the file's coordinates; else "

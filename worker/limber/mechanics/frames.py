@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from limber.errors import InputError
 from limber.files import write_atomically
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
 from limber.mechanics.strain import StrainState, strain_state
+from limber.reading import read_json_as
 
 _PC2_HEADER = struct.Struct("<12siiffi")
 
@@ -53,7 +55,48 @@ def read_pc2(path: Path) -> tuple[np.ndarray, float, float]:
         raise InputError(f"{path} is not a whole PC2 file.", "It is damaged or of another kind.",
                          "Write it again.")
     body = np.frombuffer(data, "<f4", offset=_PC2_HEADER.size)
+    if not (frames > 0 and count > 0 and np.isfinite(body).all()
+            and np.isfinite([start, rate]).all()):
+        raise InputError(f"{path} has no frames, or places that are not finite.",
+                         "Nothing can move so.", "Write it again.")
     return body.reshape(frames, count, 3), start, rate
+
+
+class FramesFile(BaseModel):
+    """Content of ``frames/NAME.json`` as far as it is read: lists with a number a frame."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    frame_count: int | None = Field(None, ge=1)
+    rate: float = Field(24.0, gt=0, le=1e6)
+    times_s: list[float] | None = None
+    energies_j: list[float] | None = None
+    kinetic_energies_j: list[float] | None = None
+    min_det_f: list[float] | None = None
+    largest_principal_strains: list[float] | None = None
+    grasp_forces_n: list[tuple[float, float, float]] | None = None
+
+    @model_validator(mode="after")
+    def _one_length(self) -> "FramesFile":
+        for name in ("times_s", "energies_j", "kinetic_energies_j", "min_det_f",
+                     "largest_principal_strains", "grasp_forces_n"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            if self.frame_count is None:
+                self.frame_count = len(values)
+            if len(values) != self.frame_count:
+                raise ValueError(f"{name} has {len(values)} entries, not {self.frame_count}")
+        return self
+
+
+def read_frames_file(path: Path) -> FramesFile:
+    """Read what is said of the frames of a motion.
+
+    Raises:
+        InputError: it cannot be read, or its lists do not fit each other.
+    """
+    return read_json_as(path, FramesFile, "what is said of a motion's frames")
 
 
 def surface_fields(mesh: TetMesh, states: Sequence[StrainState]) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
 from limber.geometry.cloud.camera import Camera, SeenCloud, depth_to_cloud, read_camera
+from limber.geometry.cloud.pixels import read_pixels
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.perception.tracking import Anchor, CurveTracker, rest_offset
 from limber.progress import SILENT, Progress
@@ -103,14 +104,8 @@ def list_frames(folder: Path, kind: str) -> list[tuple[float, Path]]:
 
 def read_depth(path: Path, camera: Camera) -> np.ndarray:
     """Read a 16-bit depth image into metres, shape [height, width]; 0 is no reading."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image, float) / camera.depth_scale
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path} cannot be read as a depth image ({error}).",
-                         "A 16-bit PNG was expected.", "Check the file.") from error
+    pixels = read_pixels(path, "a 16-bit PNG of depths")
+    return (pixels if pixels.ndim == 2 else pixels[..., 0]) / camera.depth_scale
 
 
 def write_depth(path: Path, depth: np.ndarray, camera: Camera) -> None:

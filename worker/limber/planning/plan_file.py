@@ -24,12 +24,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
 from limber.plain import plain
 from limber.planning.cost import arc_lengths
 from limber.planning.limits import UNITS, Limits
 from limber.planning.resolve import ResolvedPath, SolvedPoses
+from limber.reading import checked_as, read_json
 
 FORMAT = 2
 SPEED = 0.02
@@ -76,6 +78,55 @@ class Way:
     phases: tuple[str, ...] | None = None
     stresses: np.ndarray | None = None
     axial_forces: np.ndarray | None = None
+
+
+class _Told(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+
+class PathScores(_Told):
+    """What is said of one of the two paths, on the full model."""
+
+    length_m: float | None = None
+    energy_integral_jm: float | None = None
+    energy_sum_nmm: float | None = None
+    peak_energy_j: float | None = None
+    peak_force_n: float | None = None
+
+
+class PlanGoal(_Told):
+    """What is to reach which ball."""
+
+    kind: str = "grasp"
+    position_m: tuple[float, float, float] | None = None
+    tolerance_m: float | None = Field(None, gt=0)
+
+
+class PlanCertificate(_Told):
+    """How far the path is from the best at most."""
+
+    gap_percent: float | None = None
+
+
+class PlanStep(_Told):
+    """A moment of a planner."""
+
+    iteration: int
+    cost: float | None
+
+
+class PlanSummary(_Told):
+    """Of a plan's file, what others read beside its columns."""
+
+    goal: PlanGoal = PlanGoal()
+    planner: str | None = None
+    seed: int | None = None
+    baseline: PathScores = PathScores()
+    plan: PathScores = PathScores()
+    certificate: PlanCertificate | None = None
+    energy_saved_percent: float | None = None
+    length_added_percent: float | None = None
+    convergence: dict[str, list[PlanStep]] = {}
 
 
 @dataclass(frozen=True)
@@ -163,9 +214,9 @@ def read_plan(path: Path) -> PlanFile:
         InputError: it is no plan, damaged, or of a newer program.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = read_json(path, "a plan")
         version = content.get("format_version", 1)
-    except (OSError, ValueError, AttributeError) as error:
+    except AttributeError as error:
         raise _not_a_plan(path, str(error)) from error
     if version not in (1, FORMAT):
         raise InputError(f"{path} is a plan of format {version}.",
@@ -173,10 +224,22 @@ def read_plan(path: Path) -> PlanFile:
     try:
         ways = {name: _way(content[name]) for name in _WAYS}
         motion = _way(content["motion"]) if version > 1 else None
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise _not_a_plan(path, f"{type(error).__name__}: {error}") from error
+    checked_as(path, PlanSummary, content, "a plan")
     kept = {name: value for name, value in content.items() if name != "motion"}
     return PlanFile(version, kept, ways["baseline"], ways["plan"], motion)
+
+
+def read_plan_summary(path: Path) -> dict[str, Any]:
+    """Return what a plan's file says beside its columns, whatever of it there is.
+
+    Raises:
+        InputError: it is no plan, or damaged.
+    """
+    content = read_json(path, "a plan")
+    checked_as(path, PlanSummary, content, "a plan")
+    return content
 
 
 def _columns(way: Way) -> dict[str, Any]:

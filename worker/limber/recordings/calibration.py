@@ -17,7 +17,7 @@ class CalibrationEntry(BaseModel):
     millimetre.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pose_sigma_m: float = Field(
         1e-3, ge=0, description="Place of the gripper's frame in the branch's, each axis.")

@@ -1,6 +1,5 @@
 """Folders of images or clouds into a pull: PLY files, RGB-D frames in the layout of TUM."""
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
+from limber.geometry.cloud.files import read_points
+from limber.geometry.cloud.pixels import read_pixels
 from limber.progress import SILENT, Progress
+from limber.reading import checked_as, read_json, read_text
 from limber.recordings.tables import LENGTH_UNITS_M
 
 TUM_DEPTH_SCALE = 5000.0
@@ -28,7 +30,7 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
     Raises:
         InputError: fewer than two files, or names without times and no rate.
     """
-    from plyfile import PlyData, PlyElement, PlyParseError
+    from plyfile import PlyData, PlyElement
 
     files = sorted(source.glob("*.ply"))
     if len(files) < 2:
@@ -39,14 +41,14 @@ def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = 
     for index, file in enumerate(files):
         progress(index / len(files), "copying clouds")
         try:
-            vertex = PlyData.read(str(file))["vertex"]
-        except (PlyParseError, KeyError, OSError, ValueError):
+            read = read_points(file).points
+        except InputError:
             # A frame that was being written when the recorder stopped.
             broken.append(file.name)
             continue
-        points = np.zeros(len(vertex), [("x", "f4"), ("y", "f4"), ("z", "f4")])
-        for axis in "xyz":
-            points[axis] = np.asarray(vertex[axis]) * scale
+        points = np.zeros(len(read), [("x", "f4"), ("y", "f4"), ("z", "f4")])
+        for axis, values in zip("xyz", read.T, strict=True):
+            points[axis] = values * scale
         target = folder / "clouds" / f"{_stamp(file, index, settings):.6f}.ply"
         PlyData([PlyElement.describe(points, "vertex")], byte_order="<").write(str(target))
     if len(files) - len(broken) < 2:
@@ -117,12 +119,15 @@ def tum_list(path: Path) -> list[tuple[float, str]]:
     """
     if not path.is_file():
         return []
-    lines = [line.split(None, 1) for line in path.read_text(encoding="utf-8-sig").splitlines()
+    lines = [line.split(None, 1) for line in read_text(path, "a list of time stamps").splitlines()
              if line.strip() and not line.lstrip().startswith("#")]
     if lines and len(lines[-1]) < 2:
         lines = lines[:-1]
     try:
-        return [(float(stamp), rest.strip()) for stamp, rest in lines]
+        entries = [(float(stamp), rest.strip()) for stamp, rest in lines]
+        if not np.isfinite([stamp for stamp, _ in entries]).all():
+            raise ValueError("a time stamp is not finite")
+        return entries
     except ValueError as error:
         raise InputError(f"{path} is not a list of time stamps ({error}).",
                          "Each line is `timestamp file` or `timestamp tx ty tz qx qy qz qw`.",
@@ -130,29 +135,36 @@ def tum_list(path: Path) -> list[tuple[float, str]]:
 
 
 def _listed(source: Path, what: str, settings: Any) -> list[tuple[float, Path]]:
-    named = [(stamp, source / file) for stamp, file in tum_list(source / f"{what}.txt")]
+    named = [(stamp, _inside(source, file)) for stamp, file in tum_list(source / f"{what}.txt")]
     found = named or [(_stamp(file, index, settings), file) for index, file in enumerate(
         sorted(path for path in (source / what).glob("*") if path.suffix.lower() in
                (".png", ".jpg", ".jpeg")))]
     return sorted(dict(found).items())
 
 
+def _inside(source: Path, name: str) -> Path:
+    """The file that a list names, which lies in the recording's folder.
+
+    Raises:
+        InputError: it lies elsewhere.
+    """
+    path = source / name
+    if "\0" in name or not path.resolve().is_relative_to(source.resolve()):
+        raise InputError(f"A list in {source} names {name[:100]!r}.",
+                         "It leads out of the recording's folder.", "Correct the list.")
+    return path
+
+
 def _camera(source: Path, image: Path) -> Camera:
     if (source / "camera.toml").is_file():
         return read_camera(source / "camera.toml")
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(image) as opened:
-            width, height = opened.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{image} cannot be read as a depth image ({error}).",
-                         "A 16-bit PNG was expected.", "Check the file.") from error
+    height, width = read_pixels(image, "a 16-bit PNG of depths").shape[:2]
     for name in ("calibration.txt", "intrinsics.txt", "camera.txt"):
         if (source / name).is_file():
             fx, fy, cx, cy = _four_numbers(source / name)
-            return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy,
-                          depth_scale=TUM_DEPTH_SCALE)
+            return checked_as(source / name, Camera, {
+                "width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy,
+                "depth_scale": TUM_DEPTH_SCALE}, "fx fy cx cy")
     for name in ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json"):
         if (source / name).is_file():
             return _open3d_camera(source / name)
@@ -163,7 +175,7 @@ def _camera(source: Path, image: Path) -> Camera:
 
 
 def _four_numbers(path: Path) -> list[float]:
-    words = [word for line in path.read_text(encoding="utf-8-sig").splitlines()
+    words = [word for line in read_text(path, "fx fy cx cy").splitlines()
              if not line.lstrip().startswith("#") for word in line.replace(",", " ").split()]
     try:
         numbers = [float(word) for word in words]
@@ -180,13 +192,13 @@ def _four_numbers(path: Path) -> list[float]:
 
 def _open3d_camera(path: Path) -> Camera:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, "a camera intrinsic of Open3D")
         matrix = [float(value) for value in content["intrinsic_matrix"]]
         # Column by column.
         return Camera(width=int(content["width"]), height=int(content["height"]), fx=matrix[0],
                       fy=matrix[4], cx=matrix[6], cy=matrix[7],
                       depth_scale=float(content.get("depth_scale", 1000.0)))
-    except (ValueError, KeyError, IndexError, TypeError) as error:
+    except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
         raise InputError(f"{path} is no camera intrinsic of Open3D ({error!r}).",
                          "width, height and intrinsic_matrix (9 numbers) were expected.",
                          "Write camera.toml instead.") from error
@@ -200,8 +212,11 @@ def _placed(camera: Camera, source: Path, start: float, end: float) -> tuple[Cam
         return camera, []
     try:
         rows = np.array([[stamp, *map(float, text.split()[:7])] for stamp, text in listed])
-        if rows.shape[1] != 8 or np.any(np.linalg.norm(rows[:, 4:], axis=1) < 1e-6):
+        if rows.shape[1] != 8 or not np.isfinite(rows).all():
             raise ValueError("tx ty tz qx qy qz qw are needed in every line")
+        turn = np.linalg.norm(rows[:, 4:], axis=1)
+        if not ((turn > 1e-6) & np.isfinite(turn)).all():
+            raise ValueError("a quaternion of length 0 is no turn")
     except ValueError as error:
         raise InputError(f"{path} is no trajectory ({error}).",
                          "Each line is `timestamp tx ty tz qx qy qz qw`.",
@@ -226,7 +241,7 @@ def _masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
     """For each frame a mask's file, an array of bool, or None."""
     if settings.yolo_weights:
         return _yolo_masks(source, stamps, settings)
-    listed = [(stamp, source / file) for stamp, file in tum_list(source / "mask.txt")]
+    listed = [(stamp, _inside(source, file)) for stamp, file in tum_list(source / "mask.txt")]
     if not listed:
         # Without a list a mask has its depth image's name.
         depth = dict(_listed(source, "depth", settings))
@@ -279,7 +294,10 @@ def _stamp(file: Path, index: int, settings: Any) -> float:
     if settings.rate_hz is not None:
         return index / settings.rate_hz
     try:
-        return float(file.stem)
+        stamp = float(file.stem)
+        if not np.isfinite(stamp):
+            raise ValueError("not finite")
+        return stamp
     except ValueError as error:
         raise InputError(f"The file name {file.name} is no time stamp.",
                          "Frames need times.", "Give --rate-hz.") from error

@@ -11,6 +11,7 @@ import numpy as np
 from limber.alignment import Alignment
 from limber.constants import GRAVITY
 from limber.errors import InputError
+from limber.geometry.cloud.apart import read_apart
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
 from limber.recordings.calibration import WITHOUT_GRIPPER
@@ -89,21 +90,17 @@ def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
     Raises:
         InputError: not a C3D file, or one without points.
     """
-    import ezc3d
-
-    try:
-        data = ezc3d.c3d(str(path))
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as C3D ({error}).",
-                         "Marker tracks were expected.", "Check the file.") from error
-    points = data["data"]["points"][:3]
+    # Compiled code reads it, which a mangled file may abort.
+    data = read_apart("c3d", path)
+    points, labels = data["points"], [str(label) for label in data["labels"]]
     if not points.size:
         raise InputError(f"{path} has no points.", "Marker tracks were expected.",
                          "Export the trajectories as well.")
-    unit = (data["parameters"]["POINT"].get("UNITS", {}).get("value") or ["mm"])[0].strip()
-    scale = LENGTH_UNITS_M.get(unit.lower(), 1e-3)
-    labels = [str(label) for label in data["parameters"]["POINT"]["LABELS"]["value"]]
-    rate = float(data["header"]["points"]["frame_rate"])
+    scale = LENGTH_UNITS_M.get(str(data["unit"]).lower(), 1e-3)
+    rate = float(data["rate"])
+    if not (np.isfinite(rate) and rate > 0) or np.isinf(points).any():
+        raise InputError(f"{path} has {rate:g} frames a second, or places that are not finite.",
+                         "Without times and places there is no motion.", "Export it again.")
     positions = np.moveaxis(points, 0, -1).transpose(1, 0, 2) * scale
     # An unseen marker is written as (0, 0, 0) by many programs, as NaN by others.
     positions[np.all(positions == 0.0, axis=2)] = np.nan

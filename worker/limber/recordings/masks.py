@@ -8,19 +8,13 @@ import numpy as np
 from scipy import ndimage
 
 from limber.errors import InputError, MissingDependencyError, WorkError
+from limber.geometry.cloud.pixels import read_pixels
 
 
 def read_mask(path: Path) -> np.ndarray:
     """Read a mask image; nonzero is branch. Returns shape [height, width] of bool."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert("L") if image.mode not in ("I", "I;16") else image)
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"{path} cannot be read as an image ({error}).", "A mask was expected.",
-                         "Check the file.") from error
-    return pixels > 0
+    pixels = read_pixels(path, "a mask")
+    return (pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)) > 0
 
 
 def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,

@@ -5,7 +5,6 @@ frame and the wrench that the gripper exerts on the branch; ``markers.csv`` has 
 Depth frames and clouds enter as files, and become points in :mod:`limber.perception`.
 """
 
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.errors import InputError
 from limber.plain import plain
+from limber.reading import read_toml
 from limber.recordings.calibration import CalibrationEntry
 from limber.recordings.streams import Stream, read_stream, write_stream
 
@@ -28,7 +28,7 @@ Vector = tuple[float, float, float]
 class GraspEntry(BaseModel):
     """Where and how the gripper holds the branch at rest."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     point_m: Vector = Field(description="Centre of the grasp patch at rest, branch frame.")
     radius_m: float = Field(gt=0, description="Nodes within this distance are held.")
@@ -38,7 +38,7 @@ class GraspEntry(BaseModel):
 class SensorEntry(BaseModel):
     """What is known of the sensors' noise and range."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     position_sigma_m: float = Field(1e-3, gt=0)
     force_sigma_n: float = Field(0.1, gt=0)
@@ -50,7 +50,7 @@ class SensorEntry(BaseModel):
 class SwingEntry(BaseModel):
     """How a branch that swings was let go; its load is the force in ``robot.csv``."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     start: Literal["held", "loaded"] = Field(
         "held", description="held: in its shape at rest, until its weight and the load act; "
@@ -64,7 +64,7 @@ class SwingEntry(BaseModel):
 class PullEntry(BaseModel):
     """Content of ``pull.toml``."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     format_version: Literal[1] = 1
     observation: Literal["markers", "clouds", "depth", "none"] = "markers"
@@ -187,11 +187,9 @@ def read_entry(path: Path) -> PullEntry:
     Raises:
         InputError: missing, not TOML, or an entry that makes no sense (named).
     """
+    content = read_toml(path, "the description of a pull (`limber import-pull` makes one)")
     try:
-        return PullEntry.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).", "It describes the pull.",
-                         "Make the pull with `limber import-pull` or `limber record`.") from error
+        return PullEntry.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

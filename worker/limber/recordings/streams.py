@@ -159,6 +159,8 @@ def _read_rows(path: Path) -> _Rows:
         is_last = number == len(lines)
         try:
             numbers = [float(part) if part.strip() else np.nan for part in fields]
+            if np.isinf(numbers).any():
+                raise ValueError("a number that is not finite")
         except ValueError:
             numbers = []
         # Without an end of line even a last line of full length may have lost digits.

@@ -274,7 +274,9 @@ def _add_rotation(values: dict[str, np.ndarray], titles: list[Title], stream: St
     at = {title.plain: k for k, title in enumerate(titles)}
     if all(name in at for name in ("qx", "qy", "qz", "qw")):
         quaternion = stream.values[:, [at["qx"], at["qy"], at["qz"], at["qw"]]]
-        known = np.isfinite(quaternion).all(axis=1) & np.any(quaternion != 0, axis=1)
+        # One of length 0 is no turn.
+        length = np.linalg.norm(quaternion, axis=1)
+        known = np.isfinite(length) & (length > 1e-6)
         turns = np.full((len(stream), 3), np.nan)
         turns[known] = Rotation.from_quat(quaternion[known]).as_rotvec()
     else:
@@ -333,9 +335,10 @@ def _number(text: str, comma: bool) -> float | None:
     if text.lower() in _EMPTY:
         return np.nan
     try:
-        return float(text.replace(",", ".") if comma else text)
+        number = float(text.replace(",", ".") if comma else text)
     except ValueError:
         return None
+    return None if np.isinf(number) else number
 
 
 def _first_numbers(path: Path, rows: list[list[str]]) -> tuple[int, int]:

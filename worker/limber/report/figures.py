@@ -208,10 +208,9 @@ def _order_colour(order: int) -> str:
 
 
 def _cloud_points(branch: Branch) -> np.ndarray:
-    from plyfile import PlyData
+    from limber.geometry.cloud.files import read_cloud
 
-    vertices = PlyData.read(branch.path("cloud.ply"))["vertex"]
-    points = np.column_stack([vertices[name] for name in "xyz"]).astype(float)
+    points = read_cloud(branch.path("cloud.ply")).points
     return points[:: max(1, len(points) // _SHOWN_POINTS)]
 
 

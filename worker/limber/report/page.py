@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -13,11 +12,15 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError
+from limber.estimation.estimate_file import read_estimate
 from limber.geometry.skeleton import qsm
 from limber.geometry.skeleton.doubts import Doubt, doubtful_parts
 from limber.geometry.skeleton.qsm import Caliper
+from limber.mechanics.frames import read_frames_file
 from limber.optional import require_extra
+from limber.planning.field.energy_field import EnergyField
 from limber.progress import SILENT, Progress
+from limber.reading import read_arrays
 from limber.report import figures
 from limber.report.tables import (
     caliper_rows,
@@ -31,7 +34,7 @@ from limber.report.tables import (
     order_rows,
     share_rows,
 )
-from limber.stages.loading import load_skeleton
+from limber.stages.loading import load_skeleton, load_targets
 from limber.store import Branch
 from limber.version import VERSION
 
@@ -92,7 +95,7 @@ def _held_back(branch: Branch) -> list[Section]:
     """What makes the estimate unsure, and what would help: before anything else is read."""
     if not branch.has("estimate.json"):
         return []
-    estimate = json.loads(branch.path("estimate.json").read_text(encoding="utf-8"))
+    estimate = read_estimate(branch.path("estimate.json"))
     rows = cause_rows(estimate)
     if not rows:
         return []
@@ -183,9 +186,8 @@ def _cylinders(branch: Branch, calipers: Sequence[Caliper]) -> Section:
 
 
 def _targets(branch: Branch) -> list[dict[str, Any]]:
-    if not branch.has("targets.json"):
-        return []
-    return json.loads(branch.path("targets.json").read_text(encoding="utf-8"))["targets"]
+    return [{"name": target.name, "position_m": target.position, "mass_kg": target.mass}
+            for target in load_targets(branch)]
 
 
 def _mesh(branch: Branch) -> Section:
@@ -236,7 +238,7 @@ def _estimate(branch: Branch) -> Section:
         return section
     from limber.report import estimate_figures
 
-    estimate = json.loads(branch.path("estimate.json").read_text(encoding="utf-8"))
+    estimate = read_estimate(branch.path("estimate.json"))
     virtual = _virtual_result(branch)
     section.tables.append(("Estimated against true" if virtual else "Estimated",
                            modulus_rows(estimate, virtual)))
@@ -267,8 +269,7 @@ def _simulations(branch: Branch) -> list[Callable[[Branch], Section]]:
 def _simulation(branch: Branch, key: str) -> Section:
     entry = branch.manifest.stages[key]
     section = Section(f"Simulated motion: {entry.settings['name']}")
-    frames = json.loads(branch.path(f"frames/{entry.settings['name']}.json")
-                        .read_text(encoding="utf-8"))
+    frames = read_frames_file(branch.path(f"frames/{entry.settings['name']}.json")).model_dump()
     section.draw(figures.motion(frames), "Strain and kinetic energy, and the force on the grasp, "
                                          "over time.")
     if not entry.result["converged"]:
@@ -287,10 +288,11 @@ def _energy(branch: Branch) -> Section:
     if not branch.has("energy.npz"):
         section.missing = "limber energy NAME.branch"
         return section
-    with np.load(branch.path("energy.npz"), allow_pickle=False) as data:
-        section.draw(figures.energy_samples(data), "Strain energy of the sampled grasp poses "
-                                                   "against the distance from rest, and the force.")
-        error = {key: float(data[key]) for key in ("energy_error", "force_error") if key in data}
+    EnergyField.read(branch.path("energy.npz"))  # what is shown has been checked
+    data = read_arrays(branch.path("energy.npz"), "an energy field")
+    section.draw(figures.energy_samples(data), "Strain energy of the sampled grasp poses "
+                                               "against the distance from rest, and the force.")
+    error = {key: float(data[key]) for key in ("energy_error", "force_error") if key in data}
     result = branch.manifest.stages["energy"].result
     section.text.append(
         f"{result['sample_count']} poses solved, {result['rejected_count']} rejected. Held-out "

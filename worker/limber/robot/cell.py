@@ -4,7 +4,6 @@
 angles in radians, masses in kilograms. The branch's frame is that of its folder (z up).
 """
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,6 +12,7 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from limber.errors import InputError
+from limber.reading import read_toml
 from limber.robot.arms import ARMS, Arm, arm_named
 from limber.robot.kinematics import inverted, matrices
 from limber.store import plain, write_atomically
@@ -269,14 +269,7 @@ def read_cell(path: str | Path) -> Cell:
             (the field is named).
     """
     path = Path(path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).", "It describes the robot's cell.",
-                         "Make one with `limber robot calibrate`, or copy the README's.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: {error}.", "It is not TOML.",
-                         "Correct that line.") from error
+    content = read_toml(path, "the description of a robot's cell (TOML)")
     try:
         return Cell.model_validate(content)
     except ValidationError as error:

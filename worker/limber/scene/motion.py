@@ -1,21 +1,18 @@
 """What moves in a scene: frames with their values, marks along them, and what was observed."""
 
-import json
-import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from limber.errors import BranchFolderError, InputError
-from limber.mechanics.frames import read_pc2
+from limber.mechanics.frames import FramesFile, read_frames_file, read_pc2
+from limber.reading import read_arrays, require_shapes
 from limber.recordings.recording import read_pull
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale
 from limber.scene.shape import add_scalar
 from limber.store import Branch
 
-_STILL_RATE = 24.0
 _FRAME_SCALARS = {
     "strain_energy_density_j_m3": ("strain_energy", "strain energy density", "J/m³", "inferno"),
     "principal_strain": ("strain", "largest principal strain", "", "inferno"),
@@ -45,7 +42,7 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
     if name is None:
         return
     positions = _read_frames(branch.path(f"frames/{name}.pc2"), len(data.arrays["vertices"]))
-    about = _about(branch, name)
+    about = _about(branch, name, len(positions))
     _add_times(data, name, about, len(positions))
     data.arrays["frame_bounds"] = np.array(
         [bound(positions.reshape(-1, 3), axis=0) for bound in (np.min, np.max)], float)
@@ -67,7 +64,7 @@ def add_observation(data: SceneData, branch: Branch, shown: str | None) -> None:
         return
     try:
         pull = read_pull(branch.path(f"pulls/{name}"))
-    except (InputError, OSError, tomllib.TOMLDecodeError) as error:
+    except InputError as error:
         data.info["notes"].append(f"pull {name} cannot be shown: {error}")
         return
     data.info["observation"] = {"pull": name}
@@ -98,43 +95,47 @@ def _finished(branch: Branch, name: str) -> str:
                 if f"frames/{name}.pc2" in entry.writes), default="")
 
 
-def _about(branch: Branch, name: str) -> dict[str, Any]:
+def _about(branch: Branch, name: str, count: int) -> FramesFile:
     if not branch.has(f"frames/{name}.json"):
-        return {}
-    about = json.loads(branch.path(f"frames/{name}.json").read_text(encoding="utf-8"))
-    return about if isinstance(about, dict) else {}
+        return FramesFile(frame_count=count)
+    path = branch.path(f"frames/{name}.json")
+    about = read_frames_file(path)
+    if about.frame_count not in (None, count):
+        raise BranchFolderError(f"{path} speaks of {about.frame_count} frames; there are {count}.",
+                                "They do not belong together.", "Run the stage again.")
+    return about
 
 
-def _add_times(data: SceneData, name: str, about: dict[str, Any], count: int) -> None:
+def _add_times(data: SceneData, name: str, about: FramesFile, count: int) -> None:
     """Say when each frame is; a path without times plays one pose a frame."""
-    times = about.get("times_s")
-    is_timed = isinstance(times, list) and len(times) == count
-    rate = float(about.get("rate") or _STILL_RATE)
+    times, rate = about.times_s, about.rate
+    is_timed = times is not None
     data.arrays["frame_times"] = np.asarray(times, float) if is_timed else np.arange(count) / rate
     data.info["frames"] = {"name": name, "file": f"frames/{name}.pc2", "count": count,
                            "rate_hz": rate, "is_timed": is_timed}
 
 
-def _add_values(data: SceneData, branch: Branch, name: str, about: dict[str, Any],
+def _add_values(data: SceneData, branch: Branch, name: str, about: FramesFile,
                 positions: np.ndarray) -> None:
     count, vertex_count = positions.shape[:2]
     for key, array in _FRAME_VALUES.items():
-        if len(about.get(key) or ()) == count:
-            data.arrays[array] = np.asarray(about[key], float)
+        if (values := getattr(about, key)) is not None:
+            data.arrays[array] = np.asarray(values, float)
     if not branch.has(f"frames/{name}.npz"):
         return
-    with np.load(branch.path(f"frames/{name}.npz"), allow_pickle=False) as content:
-        for key, (scalar, title, unit, colours) in _FRAME_SCALARS.items():
-            if key not in content.files:
-                continue
-            values = np.asarray(content[key], np.float32)
-            if values.shape != (count, vertex_count) or not np.isfinite(values).all():
-                continue
-            data.arrays[f"frame_scalar:{scalar}"] = values
-            data.info["frame_scalars"][scalar] = colour_scale(values, title, unit, colours)
-            worst, word = (values.min(axis=0), "least") if scalar == "det_f" else (
-                values.max(axis=0), "peak")
-            add_scalar(data, scalar, worst.astype(float), f"{word} {title}", unit, colours)
+    path = branch.path(f"frames/{name}.npz")
+    content = read_arrays(path, "values of a motion's frames")
+    for key, (scalar, title, unit, colours) in _FRAME_SCALARS.items():
+        # Those of another motion, or of a part of it, are left out.
+        if key not in content or content[key].shape != (count, vertex_count):
+            continue
+        require_shapes(path, content, {key: (count, vertex_count)}, "values of a motion's frames")
+        values = content[key].astype(np.float32)
+        data.arrays[f"frame_scalar:{scalar}"] = values
+        data.info["frame_scalars"][scalar] = colour_scale(values, title, unit, colours)
+        worst, word = (values.min(axis=0), "least") if scalar == "det_f" else (
+            values.max(axis=0), "peak")
+        add_scalar(data, scalar, worst.astype(float), f"{word} {title}", unit, colours)
 
 
 def _add_carried(data: SceneData, positions: np.ndarray, is_plan: bool) -> None:

@@ -1,13 +1,11 @@
 """Paths to a goal in a scene: their points, poses and energies, what was searched, the goal."""
 
-import csv
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from limber.errors import BranchFolderError
+from limber.planning.plan_file import read_plan_summary
+from limber.reading import read_arrays, read_columns, require_shapes
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of
 from limber.store import Branch
@@ -29,13 +27,14 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
         if not plans:
             return None
         plan = max(plans, key=lambda name: branch.manifest.stages[f"plan:{name}"].finished)
-    summary = json.loads(branch.require(f"plans/{plan}.json", f"plan --name {plan}").read_text(
-        encoding="utf-8"))
+    summary = read_plan_summary(
+        branch.require(f"plans/{plan}.json", f"plan --name {plan}"))
     planned = "gentle" if summary.get("planner") == "eikonal" else "D-RRT*"
     for key, name, title in (("plan", plan, planned), ("baseline", f"{plan}-baseline", "RRT*")):
         if not branch.has(f"plans/{name}.csv"):
             continue
-        _add_path(data, key, _table(branch.path(f"plans/{name}.csv")))
+        table = read_columns(branch.path(f"plans/{name}.csv"), _POSITION, "the table of a path")
+        _add_path(data, key, table)
         data.info["paths"][key] = {"title": title, "note": _path_note(summary.get(key) or {})}
     gap = (summary.get("certificate") or {}).get("gap_percent")
     if gap is not None and "plan" in data.info["paths"]:
@@ -54,11 +53,14 @@ def add_hemisphere(data: SceneData, branch: Branch) -> None:
     """Add the half ball about the base in which the grasp may be taken, once it was sampled."""
     if not branch.has("energy.npz"):
         return
-    with np.load(branch.path("energy.npz"), allow_pickle=False) as content:
-        if {"chart_base_m", "arc_length_m"} <= set(content.files):
-            data.info["hemisphere"] = {
-                "centre_m": np.asarray(content["chart_base_m"], float).tolist(),
-                "radius_m": float(content["arc_length_m"]), "axis": [0.0, 0.0, 1.0]}
+    path = branch.path("energy.npz")
+    content = read_arrays(path, "an energy field")
+    if {"chart_base_m", "arc_length_m"} <= set(content):
+        require_shapes(path, content, {"chart_base_m": (3,), "arc_length_m": ()},
+                       "an energy field")
+        data.info["hemisphere"] = {
+            "centre_m": content["chart_base_m"].tolist(),
+            "radius_m": float(content["arc_length_m"]), "axis": [0.0, 0.0, 1.0]}
 
 
 def _add_path(data: SceneData, key: str, table: dict[str, np.ndarray]) -> None:
@@ -111,24 +113,6 @@ def _add_energy_scale(data: SceneData) -> None:
         data.info["path_energy"] = scale
         for key, values in energies.items():
             data.arrays[f"path_color:{key}"] = colours_of(values, scale)
-
-
-def _table(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a path; x_m, y_m and z_m are there and finite."""
-    with open(path, encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    try:
-        table = {name: np.array([float(row[name]) for row in rows])
-                 for name in (rows[0] if rows else ()) if name is not None}
-        points = np.column_stack([table[name] for name in _POSITION]) if rows else np.empty(0)
-    except (KeyError, TypeError, ValueError) as error:
-        raise BranchFolderError(f"{path} is not a path ({error}).",
-                                "Columns x_m, y_m and z_m with numbers were expected.",
-                                "Run `limber plan` again.") from error
-    if len(points) == 0 or not np.isfinite(points).all():
-        raise BranchFolderError(f"{path} has no finite points.", "There is nothing to show.",
-                                "Run `limber plan` again.")
-    return {name: values for name, values in table.items() if np.isfinite(values).all()}
 
 
 def _path_note(summary: dict[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from limber.errors import BranchFolderError
+from limber.reading import read_columns
 from limber.robot.arms import arm_named
 from limber.robot.kinematics import link_frames, matrices
 from limber.scene.arrays import SceneData
@@ -20,7 +20,7 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     """Add the arm in each frame of the plan's motion, once `limber execute` has checked it.
 
     Raises:
-        BranchFolderError: the dry run's table is damaged.
+        InputError: the dry run's table is damaged.
     """
     entry = branch.manifest.stages.get(f"execute-preview:{plan}")
     name = f"executions/{plan}-preview.csv"
@@ -28,15 +28,11 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     # A dry run of an older Limber does not say which arm it was.
     if entry is None or grasps is None or "model" not in entry.result or not branch.has(name):
         return
-    table = np.atleast_1d(np.genfromtxt(branch.path(name), delimiter=",", names=True))
-    if not {*_POSE, *_JOINTS} <= set(table.dtype.names or ()):
-        raise BranchFolderError(f"{branch.folder / name} is no table of a dry run.",
-                                "Columns with poses and joints were expected.",
-                                f"Run `limber execute --name {plan}` again.")
+    table = read_columns(branch.path(name), (*_POSE, *_JOINTS), "the table of a dry run")
     places, joints = (np.column_stack([table[column] for column in columns])
                       for columns in (_POSE, _JOINTS))
     rows = _rows(places, grasps)
-    if rows is None or not np.isfinite(joints).all():
+    if rows is None:
         return
     arm = arm_named(entry.result["model"])
     base = matrices(np.asarray(entry.result["base_pose"], float))

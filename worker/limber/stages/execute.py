@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import time
@@ -13,6 +14,7 @@ from pydantic import Field
 
 from limber.errors import InputError, SafetyStop, WorkError
 from limber.progress import SILENT, Progress
+from limber.reading import read_columns, read_text
 from limber.robot.attendant import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs
@@ -136,12 +138,13 @@ def _positions(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
     """
     whole = branch.has(f"plans/{name}-motion.csv")
     path = branch.require(f"plans/{name}-motion.csv" if whole else f"plans/{name}.csv", "plan")
-    table = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
-    if table.size < 2 or not {"x_m", "phase" if whole else "s_m"} <= set(table.dtype.names or ()):
-        raise InputError(f"{path} is no path.", "", "Plan again.")
+    table = read_columns(path, ("x_m", "y_m", "z_m"), "the table of a path")
     planned = np.column_stack([table[column] for column in ("x_m", "y_m", "z_m")])
     if whole:
-        planned = planned[table["phase"] != "return"]
+        rows = csv.DictReader(read_text(path, "the table of a motion").splitlines())
+        planned = planned[[row.get("phase") != "return" for row in rows]]
+    if len(planned) < 2:
+        raise InputError(f"{path} has {len(planned)} points.", "That is no path.", "Plan again.")
     way = float(np.linalg.norm(planned[0] - rest))
     leading = rest + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
         planned[0] - rest)

@@ -5,11 +5,11 @@ computation comes through here.
 """
 
 import hashlib
-import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
@@ -22,12 +22,37 @@ from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_mass
 from limber.mechanics.model import BranchModel
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
+from limber.reading import read_json_as
 from limber.recordings.checks import clean
 from limber.recordings.recording import Pull, read_pull
 from limber.store import Branch
 
 TARGETS_FORMAT = 1
 """Version of ``targets.json``."""
+
+_Vector = tuple[float, float, float]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+
+class _Mass(_Entry):
+    mass_kg: float = Field(ge=0)
+    attached_m: _Vector
+    centre_m: _Vector | None = None
+    inertia_kg_m2: tuple[_Vector, _Vector, _Vector] | None = None
+
+
+class _Target(_Entry):
+    name: str
+    position_m: _Vector
+    mass_kg: float = Field(ge=0)
+
+
+class _Targets(_Entry):
+    format_version: int
+    targets: list[_Target]
 
 
 def load_mesh(branch: Branch) -> TetMesh:
@@ -54,7 +79,8 @@ def load_masses(branch: Branch) -> list[dict[str, Any]]:
     """Return what reconstruct found beside the mesh: twigs left out of it, and leaves."""
     if not branch.has("point_masses.json"):
         return []
-    return json.loads(branch.path("point_masses.json").read_text(encoding="utf-8"))
+    found = read_json_as(branch.path("point_masses.json"), list[_Mass], "a list of masses")
+    return [mass.model_dump(exclude_unset=True, exclude_none=True) for mass in found]
 
 
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
@@ -76,12 +102,11 @@ def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
     """
     if not branch.has("targets.json"):
         return ()
-    known = json.loads(branch.path("targets.json").read_text(encoding="utf-8"))
-    if known.get("format_version") != TARGETS_FORMAT:
-        raise InputError(f"{branch.folder}/targets.json has format {known.get('format_version')}.",
+    known = read_json_as(branch.path("targets.json"), _Targets, "a list of targets")
+    if known.format_version != TARGETS_FORMAT:
+        raise InputError(f"{branch.folder}/targets.json has format {known.format_version}.",
                          f"This program knows format {TARGETS_FORMAT}.", "Update Limber.")
-    return tuple(NamedTarget(t["name"], tuple(t["position_m"]), t["mass_kg"])
-                 for t in known["targets"])
+    return tuple(NamedTarget(t.name, t.position_m, t.mass_kg) for t in known.targets)
 
 
 def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,12 +30,13 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
         InputError: no load, nothing estimated yet, or no such pull.
         WorkError: the branch finds no equilibrium under the load.
     """
+    from limber.estimation.estimate_file import read_estimate
     from limber.estimation.predict import predict_rest, require_one_load
     from limber.stages.loading import load_subject
 
     require_one_load(settings)
     branch = Branch.open(branch_folder)
-    known = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
+    known = read_estimate(branch.require("estimate.json", "estimate"))
     entry = _entry(branch, settings.pull)
     subject = load_subject(branch, EstimateSettings(
         fractions=tuple(known["fractions"]),

@@ -239,6 +239,7 @@ def _eye(camera_path: Path | None) -> np.ndarray | None:
 
 def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     """Take along the truth that `limber generate` wrote beside the cloud, in the branch's frame."""
+    from limber.geometry.generated import read_truth
     from limber.geometry.skeleton.files import read_swc
     from limber.geometry.surface.surface import Surface
 
@@ -246,7 +247,7 @@ def _copy_truth(cloud_path: Path, stage: Any, alignment: Alignment) -> bool:
     skeleton_path = cloud_path.parent / "truth_skeleton.swc"
     if not (source.is_file() and skeleton_path.is_file()):
         return False
-    truth = json.loads(source.read_text(encoding="utf-8"))
+    truth = read_truth(source)
     if truth.get("cloud_sha256") != file_digest(cloud_path):
         return False
     skeleton = read_swc(skeleton_path)

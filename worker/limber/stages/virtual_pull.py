@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -76,13 +75,14 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
     scan allows.
     """
     from limber.estimation.virtual_pull import true_branch
+    from limber.geometry.generated import read_truth
     from limber.geometry.skeleton.files import read_swc
     from limber.stages.loading import load_mesh
 
     known: dict[str, Any] = {}
     where = "skeleton.swc"
     if branch.has("truth/truth.json"):
-        told = json.loads(branch.path("truth/truth.json").read_text(encoding="utf-8"))
+        told = read_truth(branch.path("truth/truth.json"))
         known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
         where = "truth/skeleton.swc"
     body = load_mesh(branch) if _is_meshed_body(branch) else None

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.alignment import Alignment
 from limber.errors import BranchFolderError, InputError
+from limber.reading import read_json
 from limber.version import VERSION
 
 FORMAT_VERSION = 2
@@ -76,15 +77,15 @@ def read_manifest(folder: Path) -> Manifest:
         BranchFolderError: there is none, or it is damaged or of a newer format.
     """
     path = folder / MANIFEST
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.is_file():
         raise BranchFolderError(
             f"{folder} has no {MANIFEST}.", "So it is not a branch folder.",
-            "Name a folder that `limber reconstruct` or `limber mesh` made.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+            "Name a folder that `limber reconstruct` or `limber mesh` made.")
+    try:
+        content = read_json(path, "a manifest")
+    except InputError as error:
         raise BranchFolderError(
-            f"{path} is not readable JSON ({error}).", "The manifest is damaged.",
+            error.seen, "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
     version = content.get("format_version") if isinstance(content, dict) else None
     if isinstance(version, int) and version > FORMAT_VERSION:

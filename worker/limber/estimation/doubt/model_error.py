@@ -5,7 +5,6 @@ its mesh too stiff, the fit is as good and the modulus wrong. Both are known oth
 says how sure each radius is, and a finer mesh how much stiffer this one is than the body.
 """
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces
+from limber.reading import read_columns
 from limber.sparse import NotPositiveDefiniteError
 
 RADIUS_POWER = 4.0
@@ -76,13 +76,11 @@ def geometry_error(cylinders: Path, mesh: TetMesh, weights: np.ndarray) -> np.nd
     Returns:
         Shape [K], or None where no radius has a deviation.
     """
-    with open(cylinders, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    if not rows or "radius_sigma" not in rows[0]:
+    names = ("sx", "sy", "sz", "ex", "ey", "ez", "radius")
+    table = read_columns(cylinders, names, "a cylinder model")
+    if "radius_sigma" not in table:
         return None
-    columns = np.array([[float(row[name]) for name in
-                         ("sx", "sy", "sz", "ex", "ey", "ez", "radius", "radius_sigma")]
-                        for row in rows])
+    columns = np.column_stack([table[name] for name in (*names, "radius_sigma")])
     relative = columns[:, 7] / np.maximum(columns[:, 6], 1e-12)
     if not np.any(relative > 0):
         return None

@@ -3,7 +3,6 @@
 Camera axes: x right, y down, z forward, as OpenCV and TUM's RGB-D data have them.
 """
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
+from limber.reading import read_toml
 
 
 class Camera(BaseModel):
@@ -22,7 +22,7 @@ class Camera(BaseModel):
     for millimetres). The noise of a stereo camera's depth is ``disparity_sigma_px z^2 / (fx b)``.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     width: int = Field(gt=0)
     height: int = Field(gt=0)
@@ -130,12 +130,9 @@ def read_camera(path: Path) -> Camera:
     Raises:
         InputError: missing, or an entry makes no sense (named).
     """
+    content = read_toml(path, "a camera's intrinsics, without which depth images mean nothing,")
     try:
-        return Camera.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}).",
-                         "Depth images mean nothing without the camera's intrinsics.",
-                         "Write width, height, fx, fy, cx, cy, depth_scale and pose.") from error
+        return Camera.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}.",

@@ -6,6 +6,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.pixels import read_pixels
 
 
 def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = None) -> Cloud:
@@ -32,11 +33,5 @@ def read_depth(depth_path: Path, camera_path: Path, mask_path: Path | None = Non
 
 
 def _image(path: Path) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        image = np.asarray(Image.open(path))
-    except (OSError, UnidentifiedImageError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as an image ({error}).",
-                         "A PNG was expected.", "Check the file.") from error
+    image = read_pixels(path, "a PNG")
     return image if image.ndim == 2 else image.max(axis=2)

@@ -11,12 +11,17 @@ import numpy as np
 
 from limber.constants import UNIT_METRES
 from limber.errors import InputError, MissingDependencyError
+from limber.geometry.cloud.announced import check_las, check_pcd, check_ply
+from limber.geometry.cloud.apart import las_arrays, read_apart
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.text import read_table
+from limber.reading import read_arrays
 
 _AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("X", "Y", "Z"),
          ("//X", "Y", "Z"))
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("Nx", "Ny", "Nz"))
+_FARTHEST = 1e15
+"""No coordinate lies beyond, whatever its unit."""
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("R", "G", "B"))
 
 
@@ -63,14 +68,14 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
     if len(cloud) == 0:
         raise InputError(f"{path} has no points.", "A point cloud was expected.",
                          "Export it again.")
-    finite = np.isfinite(cloud.points).all(axis=1)
+    finite = (np.abs(cloud.points) < _FARTHEST).all(axis=1)
     if not finite.any():
         raise InputError(f"{path}: none of {len(cloud)} points is finite.",
                          "Coordinates must be numbers; NaN and infinity are not.",
                          "Export it again.")
     if finite.all():
         return cloud
-    # Depth cameras' drivers write NaN where a pixel saw nothing.
+    # Drivers of depth cameras write NaN, or the largest number, where a pixel saw nothing.
     return replace(cloud.subset(finite), not_finite=cloud.not_finite + int((~finite).sum()))
 
 
@@ -97,6 +102,7 @@ def _from_columns(names: list[str], columns: dict[str, np.ndarray]) -> Cloud:
 def _read_ply(path: Path) -> Cloud:
     from plyfile import PlyData
 
+    check_ply(path)
     content = PlyData.read(str(path))
     if "vertex" not in content:
         raise InputError(f"{path} has no vertices.", "A cloud is an element `vertex`.",
@@ -110,6 +116,7 @@ def _read_ply(path: Path) -> Cloud:
 def _read_pcd(path: Path) -> Cloud:
     from pypcd4 import PointCloud
 
+    check_pcd(path)
     content = PointCloud.from_path(path)
     names = [name for name in content.fields if name != "_"]
     columns = {name: np.asarray(content.pc_data[name]).ravel() for name in names}
@@ -128,20 +135,15 @@ def _read_text(path: Path) -> Cloud:
 
 
 def _read_las(path: Path) -> Cloud:
-    import laspy
+    check_las(path)
+    # Of a LAZ file compiled code makes points, which aborts on mangled ones.
+    arrays = read_apart("las", path) if _is_packed(path) else las_arrays(path)
+    return Cloud(arrays.pop("points"), arrays)
 
-    content = laspy.read(path)
-    attributes = {}
-    names = set(content.point_format.dimension_names)
-    if {"red", "green", "blue"} <= names:
-        color = np.stack([np.asarray(content[c]) for c in ("red", "green", "blue")], axis=1)
-        # 16 bits a channel by the standard, though many programs write 8.
-        attributes["color"] = color // 257 if color.max(initial=0) > 255 else color
-    for name in sorted(names - {"X", "Y", "Z", "red", "green", "blue"}):
-        values = np.asarray(content[name])
-        if values.ndim == 1 and values.any():
-            attributes[name] = values
-    return Cloud(np.asarray(content.xyz, np.float64), attributes)
+
+def _is_packed(path: Path) -> bool:
+    with open(path, "rb") as stream:
+        return bool(stream.read(105)[104] & 0xC0)
 
 
 def _read_vertices(path: Path) -> Cloud:
@@ -150,20 +152,18 @@ def _read_vertices(path: Path) -> Cloud:
     mesh = trimesh.load(path, process=False)
     if isinstance(mesh, trimesh.Scene):
         parts = [g.vertices for g in mesh.geometry.values()]
-        return Cloud(np.vstack(parts).astype(np.float64) if parts else np.empty((0, 3)))
-    points = np.asarray(mesh.vertices, np.float64)
+        points = np.vstack(parts).astype(np.float64) if parts else np.empty((0, 3))
+    else:
+        points = np.asarray(mesh.vertices, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{path} has vertices of {points.shape[-1]} numbers.",
+                         "A vertex has three.", "Export it again.")
     # STL repeats a vertex in each of its triangles.
     return Cloud(np.unique(points, axis=0) if path.suffix.lower() == ".stl" else points)
 
 
-def _read_npz(path: Path) -> Cloud:
-    with np.load(path, allow_pickle=False) as content:
-        arrays = {name: content[name] for name in content.files}
-    return _from_arrays(path, arrays)
-
-
-def _read_npy(path: Path) -> Cloud:
-    return _from_arrays(path, {"points": np.load(path, allow_pickle=False)})
+def _read_arrays(path: Path) -> Cloud:
+    return _from_arrays(path, read_arrays(path, "a point cloud"))
 
 
 def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> Cloud:
@@ -187,7 +187,7 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
     ".pts": _read_text, ".xyzrgb": _read_text,
     ".las": _read_las, ".laz": _read_las,
     ".obj": _read_vertices, ".stl": _read_vertices, ".off": _read_vertices,
-    ".npz": _read_npz, ".npy": _read_npy,
+    ".npz": _read_arrays, ".npy": _read_arrays,
 }
 """Suffix to reader; each may raise what its package raises, :func:`read_points` explains it."""
 

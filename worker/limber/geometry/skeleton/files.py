@@ -46,6 +46,7 @@ def read_swc(path: Path, *, scale: float | None = None) -> Skeleton:
         raise InputError(f"{path} has no nodes.", "It is empty or not an SWC file.",
                          "Choose another file.")
     table = np.array(rows, float)
+    _require_whole(path, table[:, [0, 5]])
     parent = _parents(path, table[:, 0].astype(np.int64), table[:, 5].astype(np.int64))
     factor = header_scale if scale is None else scale
     return Skeleton.from_edges(table[:, 1:4] * factor, parent, table[:, 4] * factor)
@@ -77,6 +78,7 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
                          "All nine columns are numbers.", "Correct the file.") from error
+    _require_whole(path, table[:, :2])
     parent = _parents(path, table[:, 0].astype(np.int64), table[:, 1].astype(np.int64))
     roots = np.flatnonzero(parent < 0)
     if len(roots) != 1:
@@ -127,6 +129,12 @@ def read_fitted(path: Path) -> Skeleton:
                          "It was written by another program or an older Limber.",
                          "Reconstruct the scan again.")
     return skeleton
+
+
+def _require_whole(path: Path, numbers: np.ndarray) -> None:
+    if not (np.abs(numbers) < 2**53).all():
+        raise InputError(f"{path} has an id or a parent that is no whole number.",
+                         "Ids name the nodes.", "Correct the file.")
 
 
 def _number(path: Path, text: str) -> float:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from limber.errors import InputError
+from limber.geometry.cloud.announced import check_ply
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,8 @@ class Surface:
         if not path.is_file():
             raise InputError(f"There is no file {path}.", "", "Check the path.")
         try:
+            if path.suffix.lower() == ".ply":
+                check_ply(path)
             mesh = trimesh.load_mesh(path, process=True)
         except Exception as error:  # trimesh's readers raise whatever their parsers raise
             raise InputError(f"{path} cannot be read as a surface ({error}).",

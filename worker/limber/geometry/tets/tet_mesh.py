@@ -114,6 +114,32 @@ class TetMesh:
             digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
+    def check(self, path: Path) -> None:
+        """Refuse a mesh as read from ``path`` that nothing can be computed on.
+
+        Raises:
+            InputError: places or data that are not finite, nodes that are not there, or moduli
+                and densities that are not positive.
+        """
+        data = {**self.point_data, **self.cell_data}
+        counts = dict.fromkeys(self.point_data, self.node_count)
+        counts |= dict.fromkeys(self.cell_data, self.tet_count)
+        trouble = ""
+        if self.nodes.ndim != 2 or self.nodes.shape[1] != 3 or not np.isfinite(self.nodes).all():
+            trouble = "nodes that are no places"
+        elif not (self.tet_count and self.tets.ndim == 2 and self.tets.shape[1] in (4, 10)
+                  and self.tets.min() >= 0 and self.tets.max() < self.node_count):
+            trouble = "tetrahedra of nodes that are not there"
+        for name, values in data.items():
+            if values.dtype.kind not in "iufb" or len(values) != counts[name] or not (
+                    np.isfinite(values).all()):
+                trouble = trouble or f"data {name} that are no finite number for each"
+            elif name in ("young", "density") and not (values > 0).all():
+                trouble = trouble or f"data {name} that are not positive"
+        if trouble:
+            raise InputError(f"{path} has {trouble}.", "Nothing can be computed on it.",
+                             "It is damaged; make it anew.")
+
     def write(self, path: Path) -> None:
         """Write a VTU file that ParaView opens."""
         import meshio
@@ -134,11 +160,13 @@ class TetMesh:
             InputError: the file has no tetrahedra or cannot be read.
         """
         # Not meshio.read: it prints and calls sys.exit where a file is damaged.
-        from meshio import ReadError, vtu
+        from meshio import vtu
 
         try:
             mesh = vtu.read(path)
-        except (ReadError, OSError, ValueError, SyntaxError, KeyError) as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # of XML, base64, zlib, numpy and its own
             raise InputError(f"{path} cannot be read as a mesh ({error}).",
                              "A VTU file with tetrahedra was expected.",
                              "Check the file, or make it anew.") from error
@@ -147,8 +175,10 @@ class TetMesh:
                 cell_data = {name: np.asarray(parts[number])
                              for name, parts in mesh.cell_data.items()}
                 point_data = {name: np.asarray(v) for name, v in mesh.point_data.items()}
-                return cls(np.asarray(mesh.points, float), np.asarray(block.data, np.int64),
-                           cell_data, point_data)
+                found = cls(np.asarray(mesh.points, float), np.asarray(block.data, np.int64),
+                            cell_data, point_data)
+                found.check(path)
+                return found
         kinds = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells"
         raise InputError(f"{path} holds {kinds}.", "Tetrahedra were expected.",
                          "Use `limber mesh` to fill a closed surface with tetrahedra.")

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from limber.errors import MeshingError, MissingDependencyError
+from limber.errors import InputError, MeshingError, MissingDependencyError
 from limber.geometry.settings import MeshSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetwild_process import run_tetwild
 from limber.progress import SILENT, Progress
+from limber.reading import read_arrays, require_shapes
 
 _CACHE_VERSION = 1
 _LEFT_OUT_LIMIT = 0.02  # of the volume: fewer twigs than that are not worth fTetWild's time
@@ -188,10 +189,11 @@ def _cache_place(surface: Surface, *numbers: float) -> Path:
 
 def _from_cache(place: Path) -> tuple[np.ndarray, np.ndarray] | None:
     try:
-        with np.load(place) as stored:
-            return stored["nodes"], stored["tets"]
-    except (OSError, ValueError, KeyError):
+        stored = read_arrays(place, "tetrahedra")
+        require_shapes(place, stored, {"nodes": ("n", 3), "tets": ("t", 4)}, "tetrahedra")
+    except InputError:
         return None  # not there, or cut short: it is made anew
+    return stored["nodes"], stored["tets"]
 
 
 def _to_cache(place: Path, nodes: np.ndarray, tets: np.ndarray) -> None:

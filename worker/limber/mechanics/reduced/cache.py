@@ -16,7 +16,6 @@ import contextlib
 import hashlib
 import os
 import time
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from limber.mechanics.reduced.model import FORMAT, ReducedModel, build_reduced
 from limber.mechanics.reduced.state import ReducedSettings
 from limber.mechanics.reduced.training import Snapshots
 from limber.progress import SILENT, Progress
+from limber.reading import read_arrays
 
 LIMIT_BYTES = 2 << 30
 """How much all models of a folder may take: a dozen of a branch of some thousand tetrahedra."""
@@ -86,12 +86,11 @@ class ReducedCache:
         if not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as data:
-                held = {name.removeprefix(SNAPSHOT_PREFIX): data[name] for name in data.files
-                        if name.startswith(SNAPSHOT_PREFIX)}
+            held = {name.removeprefix(SNAPSHOT_PREFIX): values
+                    for name, values in read_arrays(path, "a reduced model").items()
+                    if name.startswith(SNAPSHOT_PREFIX)}
             found = ReducedModel.read(path), Snapshots.from_arrays(held)
-        except (InputError, OSError, ValueError, KeyError, TypeError, EOFError,
-                zipfile.BadZipFile) as error:
+        except (InputError, OSError, ValueError, KeyError, TypeError) as error:
             self._progress.warn(f"{path.name} in the cache of reduced models was damaged"
                       f" ({type(error).__name__}); it is removed, and the model learnt again")
             with contextlib.suppress(OSError):

@@ -12,7 +12,6 @@ How far to trust it: :mod:`limber.mechanics.reduced.refresh`.
 
 import copy
 import time
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,6 +44,7 @@ from limber.mechanics.reduced.training import (
 )
 from limber.mechanics.reduced.training_poses import TrainingPoses
 from limber.progress import SILENT, Progress
+from limber.reading import read_arrays
 
 FORMAT = 3
 _STATIC = ReducedStaticSettings()
@@ -360,13 +360,8 @@ class ReducedModel:
         Raises:
             InputError: it is not one, or of another format.
         """
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files
-                          if not name.startswith("snapshot_")}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path} cannot be read ({error}).",
-                             "A reduced model was expected.", "Build it again.") from error
+        arrays = {name: values for name, values in read_arrays(path, "a reduced model").items()
+                  if not name.startswith("snapshot_")}
         if int(arrays.get("format", -1)) != FORMAT:
             raise InputError(f"{path} has another format.", "", "Build it again.")
         grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],

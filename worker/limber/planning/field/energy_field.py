@@ -19,6 +19,7 @@ from limber.planning.field.chart import Chart, mapped, pulled_back_size
 from limber.planning.field.radial import RadialInterpolant, gradient_at, value_at
 from limber.planning.field.trust import TrustRegion, trusted_at
 from limber.progress import SILENT, Progress
+from limber.reading import read_arrays, require_shapes
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,21 @@ _OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
 LOADS = ("strain", "stress", "axial_force", "torque")
 """What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
 gripper's force along the branch [N], outward positive, and its torque [Nm]."""
+_SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
+           "min_det_f": ("m",), "rejected_poses": ("q", 6)}
+_OPTIONAL_SHAPES = {
+    "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
+    "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
+    "axial_forces_n": ("m",),
+    "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
+    "force_error": (),
+    **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
+       for name, shape in {
+           "shape": (), "smoothing": (), "scale": (), "shift": (3,), "centres": (f"{fit} m", 3),
+           "value_weights": (f"{fit} m", f"{fit} c"),
+           "gradient_weights": (f"{fit} g", 3, f"{fit} c"),
+           "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
+"""Of the arrays in a file; equal letters are equal lengths."""
 _CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
 
 
@@ -259,8 +275,10 @@ class EnergyField:
             InputError: the file is not an energy field.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
+            arrays = read_arrays(path, "an energy field")
+            require_shapes(path, arrays, _SHAPES | {
+                name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
+                           "an energy field")
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],

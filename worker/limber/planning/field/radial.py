@@ -152,7 +152,16 @@ class RadialInterpolant:
                 if name.startswith(prefix)}
         plain = {"kernel": str(part.pop("kernel")), "shape": float(part.pop("shape")),
                  "smoothing": float(part.pop("smoothing")), "scale": float(part.pop("scale"))}
-        return cls(**plain, **{name: np.ascontiguousarray(value) for name, value in part.items()})
+        powers = np.ascontiguousarray(part.pop("powers"), np.int64)
+        found = cls(**plain, powers=powers, **{
+            name: np.ascontiguousarray(value, float) for name, value in part.items()})
+        if found.kernel not in KERNELS or not (found.scale > 0 and found.shape > 0):
+            raise ValueError(f"no kernel {found.kernel} of shape {found.shape}")
+        if len(found.gradient_weights) not in (0, len(found.centres)) or not (
+                (powers >= 0) & (powers <= 8)).all() or len(found.value_weights) != len(
+                found.centres):
+            raise ValueError("weights that do not fit their samples")
+        return found
 
 
 def _frame(points: np.ndarray) -> tuple[np.ndarray, float]:

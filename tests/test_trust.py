@@ -1,0 +1,149 @@
+"""Files of a branch folder with right checksums and wrong content: errors, never tracebacks."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.files import file_digest
+from limber.scene.data import scene_data
+from limber.settings import checked_settings
+from limber.store import Branch
+
+EXAMPLE = Path(__file__).parents[1] / "blend_files" / "bending_branch"
+
+
+@pytest.fixture
+def damaged(tmp_path):
+    """Gives a branch in which one file is another, with the checksum that goes with it."""
+    folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
+
+    def make(name: str, content: bytes) -> Branch:
+        (folder / name).write_bytes(content)
+        manifest = json.loads((folder / "branch.json").read_text())
+        manifest["files"][name] = {"sha256": file_digest(folder / name), "bytes": len(content),
+                                   "stage": "estimate"}
+        (folder / "branch.json").write_text(json.dumps(manifest))
+        return Branch.open(folder)
+    return make
+
+
+def _changed(name: str, *path: object, value: object) -> bytes:
+    content = json.loads((EXAMPLE / name).read_text())
+    place = content
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    return json.dumps(content).encode()
+
+
+@pytest.mark.parametrize(("name", "path", "value"), [
+    ("plans/to-goal.json", ["goal"], []), ("plans/to-goal.json", ["plan", "length_m"], "x"),
+    ("frames/to-goal.json", ["rate"], -1), ("frames/to-goal.json", ["energies_j"], [1.0, None]),
+    ("frames/to-goal.json", ["frame_count"], 10**30)])
+def test_json_of_plans_and_frames(damaged, name, path, value):
+    """What a scene shows of them is checked when they are read."""
+    with pytest.raises(InputError, match=Path(name).name):
+        scene_data(damaged(name, _changed(name, *path, value=value)))
+
+
+@pytest.mark.parametrize("name", ["frames/to-goal.npz", "frames/to-goal.json", "energy.npz",
+                                  "mesh.vtu", "plans/to-goal.csv", "frames/to-goal.pc2"])
+def test_files_of_noise(damaged, name):
+    """Bytes that are nothing at all."""
+    noise = np.random.default_rng(3).bytes(500)
+    with pytest.raises(InputError, match=Path(name).name):
+        scene_data(damaged(name, noise))
+
+
+@pytest.mark.parametrize(("path", "value"), [
+    (["fractions"], [0.2]), (["young_pa", 1], -5.0), (["covariance", 2], None),
+    (["poisson"], 3), (["groups", 0], 99), (["causes"], [1])])
+def test_an_estimate_that_does_not_fit_itself(damaged, path, value):
+    """`limber predict` and the report refuse it, and say where."""
+    from limber.estimation.settings import PredictSettings
+    from limber.stages.predict import predict
+
+    branch = damaged("estimate.json", _changed("estimate.json", *path, value=value))
+    with pytest.raises(InputError, match=r"estimate\.json"):
+        predict(branch.folder, PredictSettings(weight=1.0))
+
+
+@pytest.mark.parametrize("content", [
+    [{"mass_kg": -1, "attached_m": [0, 0, 0]}], [{"mass_kg": 1}], {"a": 1},
+    [{"mass_kg": 1, "attached_m": [0, 0, None]}], [{"mass_kg": 1, "attached_m": [0, 0]}]])
+def test_point_masses(damaged, content):
+    """No negative mass, no place without three numbers."""
+    from limber.stages.loading import load_point_masses
+
+    with pytest.raises(InputError, match=r"point_masses\.json"):
+        load_point_masses(damaged("point_masses.json", json.dumps(content).encode()))
+
+
+def test_a_mesh_whose_data_are_no_numbers(damaged):
+    """A modulus of NaN, and a tetrahedron of a node that is not there."""
+    from limber.geometry.tets.tet_mesh import TetMesh
+    from limber.stages.loading import load_mesh
+
+    mesh = TetMesh.read(EXAMPLE / "mesh.vtu")
+    for wrong in (mesh.with_data(cell_data={"young": np.full(mesh.tet_count, np.nan)}),
+                  TetMesh(mesh.nodes, mesh.tets + mesh.node_count - 5)):
+        path = EXAMPLE.parent / "none"
+        with pytest.raises(InputError):
+            wrong.check(path)
+    noise = (EXAMPLE / "mesh.vtu").read_bytes()[:-3000]
+    with pytest.raises(InputError, match=r"mesh\.vtu"):
+        load_mesh(damaged("mesh.vtu", noise))
+
+
+def test_an_alignment_that_is_no_turn(damaged):
+    """A manifest's turn has rows at right angles, its scale is above 0."""
+    for key, value in (("scale", 0.0), ("rotation", [[0, 0, 0]] * 3)):
+        content = _changed("branch.json", "alignment", key, value=value)
+        with pytest.raises(InputError, match=r"branch\.json"):
+            damaged("branch.json", content)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 0.0), (np.nan, 0.0, 1.0), (np.inf, 0.0, 0.0)])
+def test_a_direction_has_a_length(up):
+    """`--up 0 0 0` is refused by name."""
+    from limber.geometry.settings import ReconstructSettings
+
+    with pytest.raises(InputError, match="--up"):
+        checked_settings(ReconstructSettings, {"up": up})
+
+
+def test_options_are_finite():
+    """`--camera-at nan`, and every other option."""
+    from limber.stages.scene import STAGE
+
+    name = next(name for model in (STAGE.settings, STAGE.inputs, STAGE.options)
+                for name in model.model_fields if name == "camera_at")
+    model = next(model for model in (STAGE.settings, STAGE.inputs, STAGE.options)
+                 if name in model.model_fields)
+    with pytest.raises(InputError, match="--camera-at"):
+        checked_settings(model, {"camera_at": (np.nan, 0.0, 1.0)})
+
+
+def test_lists_of_a_recording_stay_in_its_folder(tmp_path):
+    """A depth list that names a file elsewhere is refused; so are turns of length 0."""
+    from PIL import Image
+
+    from limber.recordings.frames import copy_rgbd
+    from limber.recordings.settings import ImportSettings
+
+    (tmp_path / "in" / "depth").mkdir(parents=True)
+    for name in ("in/depth/1.png", "in/depth/2.png", "secret.png"):
+        Image.fromarray(np.full((4, 6), 700, np.uint16)).save(tmp_path / name)
+    source = tmp_path / "in"
+    (source / "calibration.txt").write_text("40 40 3 2")
+    (source / "depth.txt").write_text("1.0 depth/1.png\n2.0 ../secret.png\n")
+    with pytest.raises(InputError, match="out of the recording's folder"):
+        copy_rgbd(source, tmp_path / "out", ImportSettings())
+    (source / "depth.txt").unlink()
+    (source / "groundtruth.txt").write_text("1 0 0 0 0 0 0 0\n2 0 0 0 0 0 0 1\n")
+    with pytest.raises(InputError, match="quaternion"):
+        copy_rgbd(source, tmp_path / "out", ImportSettings())

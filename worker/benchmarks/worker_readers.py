@@ -1,0 +1,512 @@
+"""Every reader of files that others may have written: good files of each kind, and who reads them.
+
+Files of a branch folder are put into a copy of one with their checksums set right, as somebody
+would who wants to do harm; then whatever shows or computes with them is called.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.files import file_digest
+from limber.store import Branch
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of file.
+
+    Attributes:
+        kind: How files are changed: ``text``, ``json``, ``npz``, ``binary``.
+        make: Writes good files into a folder, from a template branch; returns them.
+        read: Reads a file; gets the template as well.
+        may_lack: NaN is a word for "not measured" there.
+    """
+
+    kind: str
+    make: Callable[[Path, Path], list[Path]]
+    read: Callable[[Path, Path], Any]
+    may_lack: bool = False
+
+
+def _points() -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.column_stack([rng.normal(0, 0.01, (60, 2)), np.linspace(0, 0.5, 60)])
+
+
+def _ply(_template: Path, folder: Path) -> list[Path]:
+    from plyfile import PlyData, PlyElement
+
+    table = np.zeros(60, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1")])
+    for axis, values in zip("xyz", _points().T, strict=True):
+        table[axis] = values
+    face = np.zeros(4, [("vertex_indices", "i4", (3,))])
+    files = []
+    for name, is_text in (("binary.ply", False), ("text.ply", True)):
+        files.append(folder / name)
+        PlyData([PlyElement.describe(table, "vertex"), PlyElement.describe(face, "face")],
+                text=is_text).write(str(files[-1]))
+    return files
+
+
+def _pcd(_template: Path, folder: Path) -> list[Path]:
+    from pypcd4 import Encoding, PointCloud
+
+    cloud = PointCloud.from_xyz_points(_points().astype(np.float32))
+    files = []
+    for encoding in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED):
+        files.append(folder / f"{encoding.value}.pcd")
+        cloud.save(files[-1], encoding=encoding)
+    return files
+
+
+def _las(suffix: str, _template: Path, folder: Path) -> list[Path]:
+    import laspy
+
+    files = []
+    for version, form in (("1.2", 3), ("1.4", 6)):
+        header = laspy.LasHeader(point_format=form, version=version)
+        header.scales = np.full(3, 1e-4)
+        content = laspy.LasData(header)
+        content.x, content.y, content.z = _points().T
+        files.append(folder / f"{form}{suffix}")
+        content.write(str(files[-1]))
+    return files
+
+
+def _texts(_template: Path, folder: Path) -> list[Path]:
+    plain, headed = folder / "a.xyz", folder / "b.csv"
+    np.savetxt(plain, _points(), "%.5f")
+    np.savetxt(headed, _points(), "%.5f", ",", header="x,y,z", comments="")
+    return [plain, headed]
+
+
+def _meshes(suffix: str, _template: Path, folder: Path) -> list[Path]:
+    import trimesh
+
+    path = folder / f"box{suffix}"
+    trimesh.creation.box((0.1, 0.1, 0.4)).export(path)
+    return [path]
+
+
+def _arrays(suffix: str, _template: Path, folder: Path) -> list[Path]:
+    path = folder / f"cloud{suffix}"
+    if suffix == ".npy":
+        np.save(path, _points())
+    else:
+        np.savez_compressed(path, points=_points(), intensity=np.ones(60))
+    return [path]
+
+
+def _cloud(_template: Path, path: Path) -> Any:
+    from limber.geometry.cloud.files import read_points
+
+    cloud = read_points(path)
+    return cloud.points
+
+
+def _pixels(_template: Path, folder: Path) -> list[Path]:
+    from PIL import Image
+
+    path = folder / "depth.png"
+    depth = np.full((24, 32), 900, np.uint16)
+    depth[:, 15:18] = 700
+    Image.fromarray(depth).save(path)
+    return [path]
+
+
+def _depth(_template: Path, path: Path) -> Any:
+    from limber.geometry.cloud.depth_files import read_depth
+
+    with tempfile.TemporaryDirectory() as folder:
+        return read_depth(path, _camera_file(_template, Path(folder))[0]).points
+
+
+def _mask(_template: Path, path: Path) -> Any:
+    from limber.recordings.masks import read_mask
+
+    return read_mask(path)
+
+
+def _camera_file(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "camera.toml"
+    path.write_text("width = 32\nheight = 24\nfx = 40.0\nfy = 40.0\ncx = 15.5\ncy = 11.5\n"
+                    "depth_scale = 1000.0\npose = [0.0, -1.0, 0.3, -1.57, 0.0, 0.0]\n")
+    return [path]
+
+
+def _camera(_template: Path, path: Path) -> Any:
+    from limber.geometry.cloud.camera import depth_to_cloud, read_camera
+
+    camera = read_camera(path)
+    if camera.width * camera.height > 10_000:
+        return camera
+    return camera, depth_to_cloud(camera, np.ones((camera.height, camera.width)))
+
+
+def _intrinsics(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "camera_intrinsic.json"
+    path.write_text(json.dumps({"width": 32, "height": 24, "depth_scale": 1000.0,
+                                "intrinsic_matrix": [40.0, 0, 0, 0, 40.0, 0, 15.5, 11.5, 1]}))
+    return [path]
+
+
+def _rgbd(name: str, _template: Path, path: Path) -> Any:
+    """An RGB-D folder with one of its lists changed."""
+    from limber.recordings.frames import copy_rgbd
+    from limber.recordings.settings import ImportSettings
+
+    with tempfile.TemporaryDirectory() as place:
+        source, target = Path(place, "in"), Path(place, "out")
+        (source / "depth").mkdir(parents=True)
+        target.mkdir()
+        image = _pixels(_template, Path(place))[0]
+        for stamp in ("1.0", "1.1", "1.2"):
+            shutil.copyfile(image, source / "depth" / f"{stamp}.png")
+        _rgbd_lists(_template, source)
+        if name == "camera_intrinsic.json":
+            (source / "calibration.txt").unlink()
+        shutil.copyfile(path, source / name)
+        copy_rgbd(source, target, ImportSettings())
+        from limber.geometry.cloud.camera import read_camera
+
+        return read_camera(target / "camera.toml")
+
+
+def _rgbd_lists(_template: Path, folder: Path) -> list[Path]:
+    stamps = ("1.0", "1.1", "1.2")
+    (folder / "depth.txt").write_text("# list\n" + "".join(
+        f"{stamp} depth/{stamp}.png\n" for stamp in stamps))
+    (folder / "groundtruth.txt").write_text("# pose\n" + "".join(
+        f"{stamp} 0.1 0.2 0.3 0 0 0 1\n" for stamp in stamps))
+    (folder / "calibration.txt").write_text("40.0 40.0 15.5 11.5\n")
+    return [folder / "depth.txt", folder / "groundtruth.txt", folder / "calibration.txt"]
+
+
+def _rgbd_list(name: str, template: Path, folder: Path) -> list[Path]:
+    return [path for path in _rgbd_lists(template, folder) if path.name == name]
+
+
+def _c3d(_template: Path, folder: Path) -> list[Path]:
+    import ezc3d
+
+    made = ezc3d.c3d()
+    made["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    made["parameters"]["POINT"]["LABELS"]["value"] = ["a", "b", "c"]
+    made["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    made["data"]["points"] = np.random.default_rng(1).uniform(10, 500, (4, 3, 40))
+    path = folder / "markers.c3d"
+    made.write(str(path))
+    return [path]
+
+
+def _read_c3d(_template: Path, path: Path) -> Any:
+    from limber.recordings.importing import markers_from_c3d
+
+    return markers_from_c3d(path)
+
+
+def _tables(_template: Path, folder: Path) -> list[Path]:
+    times = np.linspace(0, 2, 50)
+    markers, force = folder / "markers.csv", folder / "force.csv"
+    np.savetxt(markers, np.column_stack([times, *(np.sin(times + k) for k in range(6))]), "%.6g",
+               ",", header="t_s,a_x_m,a_y_m,a_z_m,b_x_m,b_y_m,b_z_m", comments="")
+    np.savetxt(force, np.column_stack([0.01 * times, 2 * times]), "%.6g", ";",
+               header="Displacement (mm);Force (N)", comments="")
+    return [markers, force]
+
+
+def _table(_template: Path, path: Path) -> Any:
+    from limber.recordings.force_slope import read_force_displacement
+    from limber.recordings.tables import marker_stream, read_table
+
+    if "force" in path.name:
+        return read_force_displacement(path, unit=None, force_unit=None)
+    read_table(path)
+    return marker_stream(path)[0]
+
+
+def _nominal(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "nominal.csv"
+    path.write_text("label,x_m,y_m,z_m\na,0,0,0.1\nb,0,0,0.2\nc,0.1,0,0.2\n")
+    return [path]
+
+
+def _read_nominal(_template: Path, path: Path) -> Any:
+    from limber.recordings.registration import read_nominal
+
+    return read_nominal(path)
+
+
+def _calipers(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "calipers.csv"
+    path.write_text("along_m,diameter_mm\n0.05,12.1\n0.1,11.4\n0.2,9.0\n")
+    return [path]
+
+
+def _read_calipers(_template: Path, path: Path) -> Any:
+    from limber.geometry.skeleton.qsm import read_calipers
+
+    return read_calipers(path)
+
+
+def _edits(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "edits.json"
+    path.write_text(json.dumps([{"do": "radius", "at": [0, 0, 0.2], "radius": 0.01},
+                                {"do": "root", "at": [0, 0, 0]},
+                                {"do": "confirm", "at": [0, 0, 0.3]}]))
+    return [path]
+
+
+def _read_edits(_template: Path, path: Path) -> Any:
+    from limber.geometry.skeleton.edits import read_edits
+
+    return read_edits(path)
+
+
+def _jobs(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "jobs.toml"
+    path.write_text(
+        'out = "results"\ntime_limit = "1 h"\nmemory_limit = "4 GB"\nworkers = 2\n[[job]]\n'
+        'scans = ["*.xyz"]\n[[job.stage]]\nrun = "reconstruct"\nunit = "mm"\n'
+        '[[job.stage]]\nrun = "energy"\nsamples = 60\ndeflection = 0.4\n[job.sweep]\n'
+        '"energy.seed" = [1, 2]\n')
+    return [path]
+
+
+def _read_jobs(_template: Path, path: Path) -> Any:
+    from limber.batch.job_file import read_jobs
+
+    (path.parent / "a.xyz").write_text("0 0 0\n")
+    read_jobs(path)
+
+
+def _cell(_template: Path, folder: Path) -> list[Path]:
+    from benchmarks.robot_faults import cell_for
+    from limber.robot.cell import write_cell
+
+    path = folder / "cell.toml"
+    write_cell(path, cell_for("127.0.0.71"))
+    return [path]
+
+
+def _read_cell(_template: Path, path: Path) -> Any:
+    from limber.robot.cell import read_cell
+
+    return read_cell(path)
+
+
+def _commands(_template: Path, folder: Path) -> list[Path]:
+    path = folder / "commands.jsonl"
+    path.write_text("\n".join(json.dumps(one) for one in (
+        {"command": "hello", "protocol": 2, "id": 1},
+        {"command": "grasp", "vertex": 4, "mode": "pinned", "radius_m": 0.01},
+        {"command": "move", "pose": [0.1, 0, 0.4, 0, 0, 0], "grasp": 1},
+        {"command": "young", "young_pa": [1e8, 1e8]},
+        {"command": "loads", "loads": [{"point": [0, 0, 0.3], "force_n": [0, 0, -1]}]})) + "\n")
+    return [path]
+
+
+def _read_commands(_template: Path, path: Path) -> Any:
+    """What a session does with lines: each is a command, or is answered with an error."""
+    from limber.session.protocol import Lines, NotUnderstood, parse_command
+
+    understood = []
+    for line in Lines().feed(path.read_bytes()):
+        if line is None:
+            continue
+        try:
+            understood.append(parse_command(line))
+        except NotUnderstood:
+            continue
+    return understood
+
+
+def _template_file(name: str, template: Path, folder: Path) -> list[Path]:
+    target = folder / Path(name).name
+    shutil.copyfile(template / name, target)
+    return [target]
+
+
+def _swc(_template: Path, path: Path) -> Any:
+    from limber.geometry.skeleton.files import read_swc
+
+    return read_swc(path)
+
+
+def _surface(_template: Path, path: Path) -> Any:
+    from limber.geometry.surface.surface import Surface
+
+    return Surface.read(path)
+
+
+@cache
+def _work_copy(template: Path) -> Path:
+    place = Path(tempfile.mkdtemp(prefix="limber-fuzz-branch-"))
+    import atexit
+
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    return Path(shutil.copytree(template, place / "work.branch"))
+
+
+def _in_folder(name: str, act: Callable[[Branch], Any], template: Path, path: Path) -> Any:
+    """Act on a branch whose file ``name`` is ``path``, with the right checksum."""
+    work = _work_copy(template)
+    kept = {file: (work / file).read_bytes() if (work / file).exists() else None
+            for file in (name, "branch.json")}
+    try:
+        (work / name).write_bytes(path.read_bytes())
+        if name != "branch.json":
+            manifest = json.loads(kept["branch.json"])
+            entry = {"sha256": file_digest(path), "bytes": path.stat().st_size, "stage": "mesh"}
+            manifest["files"][name] = manifest["files"].get(name, {}) | entry
+            (work / "branch.json").write_text(json.dumps(manifest))
+        return act(Branch.open(work))
+    finally:
+        for file, content in kept.items():
+            if content is None:
+                (work / file).unlink()
+            else:
+                (work / file).write_bytes(content)
+
+
+def _shown(branch: Branch) -> Any:
+    from limber.scene.data import scene_data
+    from limber.stages.loading import load_targets
+
+    data = scene_data(branch, targets=load_targets(branch))
+    return {name: values for name, values in data.arrays.items()
+            if not name.startswith("observation")}
+
+
+def _computed(branch: Branch) -> Any:
+    from limber.stages.loading import load_branch, load_skeleton
+
+    load_skeleton(branch)
+    return load_branch(branch, gravity=False).model.mesh
+
+
+def _shown_and_computed(branch: Branch) -> Any:
+    return _shown(branch), _computed(branch)
+
+
+def _masses(branch: Branch) -> Any:
+    from limber.stages.loading import load_masses, load_point_masses
+
+    return load_masses(branch), load_point_masses(branch)
+
+
+def _planned(branch: Branch) -> Any:
+    """A plan's JSON and tables as scene and report show them."""
+    from limber.planning.plan_file import read_plan
+    from limber.report.tables import comparison_rows
+
+    plan = read_plan(branch.path("plans/to-goal.json"))
+    comparison_rows(plan.summary)
+    return _shown(branch), plan.plan, plan.baseline, plan.motion
+
+
+def _sampled(branch: Branch) -> Any:
+    from limber.planning.field.energy_field import EnergyField
+
+    field = EnergyField.read(branch.path("energy.npz"))
+    return _shown(branch), field.energy(field.samples.positions[:3])
+
+
+def _estimated(branch: Branch) -> Any:
+    """An estimate as the report tells it, and as `limber predict` takes it up to its solve."""
+    from limber.estimation.estimate_file import read_estimate
+    from limber.report.tables import cause_rows, deviation_rows, held_out_rows, modulus_rows
+
+    known = read_estimate(branch.path("estimate.json"))
+    modulus_rows(known, None), cause_rows(known), deviation_rows(known), held_out_rows(known)
+    return known
+
+
+def _pulled(branch: Branch) -> Any:
+    from limber.recordings.checks import clean
+    from limber.recordings.recording import read_pull
+
+    return clean(read_pull(branch.path("pulls/pull-1"))), _shown(branch)
+
+
+def _opened(branch: Branch) -> Any:
+    branch.damages()
+    return branch.gravity, _shown(branch)
+
+
+def _made(name: str, text: str, _template: Path, folder: Path) -> list[Path]:
+    path = folder / name
+    path.write_text(text)
+    return [path]
+
+
+def _json_file(name: str, content: Any) -> Callable[[Path, Path], list[Path]]:
+    return partial(_made, name, json.dumps(content))
+
+
+_MASSES = [{"mass_kg": 0.01, "attached_m": [0, 0, 0.2], "centre_m": [0.01, 0, 0.22],
+            "inertia_kg_m2": [[1e-6, 0, 0], [0, 1e-6, 0], [0, 0, 1e-6]]},
+           {"mass_kg": 0.02, "attached_m": [0, 0, 0.3]}]
+_TARGETS = {"format_version": 1, "targets": [
+    {"name": "fruit", "position_m": [0.0, 0.0, 0.3], "mass_kg": 0.1}]}
+
+
+def _branch_file(name: str, kind: str, act: Callable[[Branch], Any], make: Any = None,
+                 may_lack: bool = False) -> Reader:
+    return Reader(kind, make or partial(_template_file, name), partial(_in_folder, name, act),
+                  may_lack)
+
+
+READERS: dict[str, Reader] = {
+    "PLY": Reader("binary", _ply, _cloud), "PCD": Reader("binary", _pcd, _cloud),
+    "XYZ": Reader("text", _texts, _cloud),
+    "LAS": Reader("binary", partial(_las, ".las"), _cloud),
+    "LAZ": Reader("binary", partial(_las, ".laz"), _cloud),
+    "OBJ": Reader("text", partial(_meshes, ".obj"), _cloud),
+    "STL": Reader("binary", partial(_meshes, ".stl"), _cloud),
+    "OFF": Reader("text", partial(_meshes, ".off"), _cloud),
+    "NPZ": Reader("npz", partial(_arrays, ".npz"), _cloud),
+    "NPY": Reader("binary", partial(_arrays, ".npy"), _cloud),
+    "PNG depth": Reader("binary", _pixels, _depth), "PNG mask": Reader("binary", _pixels, _mask),
+    "camera TOML": Reader("text", _camera_file, _camera),
+    "intrinsics JSON": Reader("json", _intrinsics, partial(_rgbd, "camera_intrinsic.json")),
+    **{f"RGB-D {name}": Reader("text", partial(_rgbd_list, name), partial(_rgbd, name))
+       for name in ("depth.txt", "groundtruth.txt", "calibration.txt")},
+    "C3D": Reader("binary", _c3d, _read_c3d, True),
+    "tables CSV": Reader("text", _tables, _table, True),
+    "nominal CSV": Reader("text", _nominal, _read_nominal),
+    "calipers CSV": Reader("text", _calipers, _read_calipers),
+    "edits JSON": Reader("json", _edits, _read_edits),
+    "job TOML": Reader("text", _jobs, _read_jobs),
+    "cell TOML": Reader("text", _cell, _read_cell),
+    "session commands": Reader("text", _commands, _read_commands),
+    "branch.json": _branch_file("branch.json", "json", _opened),
+    "SWC": Reader("text", partial(_template_file, "skeleton.swc"), _swc),
+    "surface PLY": Reader("binary", partial(_template_file, "surface.ply"), _surface),
+    "QSM CSV": _branch_file("skeleton.csv", "text", _shown_and_computed),
+    "VTU": _branch_file("mesh.vtu", "text", _shown_and_computed),
+    "cloud.ply": _branch_file("cloud.ply", "binary", _shown),
+    "point_masses.json": _branch_file("point_masses.json", "json", _masses,
+                                      _json_file("point_masses.json", _MASSES)),
+    "targets.json": _branch_file("targets.json", "json", _shown_and_computed,
+                                 _json_file("targets.json", _TARGETS)),
+    "pull.toml": _branch_file("pulls/pull-1/pull.toml", "text", _pulled, may_lack=True),
+    "robot.csv": _branch_file("pulls/pull-1/robot.csv", "text", _pulled, may_lack=True),
+    "markers.csv": _branch_file("pulls/pull-1/markers.csv", "text", _pulled, may_lack=True),
+    "estimate.json": _branch_file("estimate.json", "json", _estimated),
+    "energy.npz": _branch_file("energy.npz", "npz", _sampled),
+    "frames JSON": _branch_file("frames/to-goal.json", "json", _shown),
+    "frames NPZ": _branch_file("frames/to-goal.npz", "npz", _shown),
+    "PC2": _branch_file("frames/to-goal.pc2", "binary", _shown),
+    "plan JSON": _branch_file("plans/to-goal.json", "json", _planned),
+    "plan CSV": _branch_file("plans/to-goal.csv", "text", _planned),
+}
+"""Readers by name."""

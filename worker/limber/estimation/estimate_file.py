@@ -1,0 +1,140 @@
+"""The file ``estimate.json``, read back: what the report and predictions take from it, checked."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from limber.reading import checked_as, read_json
+
+_Positive = Annotated[float, Field(gt=0)]
+_Share = Annotated[float, Field(ge=0, le=1)]
+_Maybe = float | None
+_Vector = tuple[float, float, float]
+_Rows = list[list[_Maybe]]
+
+
+class _Told(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+
+class _Cause(_Told):
+    cause: str
+    share: float
+    deviation: float
+    advice: str
+
+
+class _Score(_Told):
+    rms_m: _Maybe = None
+    rms_force_n: _Maybe = None
+    relative_distance: _Maybe = None
+    relative_force: _Maybe = None
+    in_fit: bool = True
+
+
+class _Deviation(_Told):
+    sensor: list[_Maybe] | None = None
+    geometry: list[_Maybe] | None = None
+    mesh: list[_Maybe] | None = None
+    path: list[_Maybe] | None = None
+    total: list[_Maybe] | None = None
+
+
+class _Evaluation(_Told):
+    parameters: list[_Maybe] = []
+    loss_m2: _Maybe = None
+
+
+class _Pull(_Told):
+    name: str
+    times_s: list[float]
+    observed_m: list[list[tuple[_Maybe, _Maybe, _Maybe]]]
+    simulated_m: list[list[tuple[_Maybe, _Maybe, _Maybe]]]
+    all_times_s: list[float]
+    measured_force_n: list[tuple[_Maybe, _Maybe, _Maybe]]
+    simulated_force_n: list[tuple[_Maybe, _Maybe, _Maybe]]
+    point_residual: _Rows = []
+    force_residual: list[_Maybe] = []
+
+    @model_validator(mode="after")
+    def _of_one_length(self) -> "_Pull":
+        shown, count = len(self.times_s), len(self.all_times_s)
+        widths = {len(frame) for frame in (*self.observed_m, *self.simulated_m)}
+        if {len(self.observed_m), len(self.simulated_m)} != {shown} or len(widths) > 1:
+            raise ValueError("frames of unequal size")
+        if {len(self.measured_force_n), len(self.simulated_force_n)} != {count}:
+            raise ValueError("as many forces as times were expected")
+        if len(self.point_residual) not in (0, count) or len(self.force_residual) not in (0, count):
+            raise ValueError("as many residuals as times were expected")
+        if len({len(row) for row in self.point_residual}) > 1:
+            raise ValueError("residuals of unequal length")
+        return self
+
+
+class _Truth(_Told):
+    young_pa: list[_Positive] | None = None
+    fractions: list[_Share] | None = None
+
+
+class _Estimate(_Told):
+    method: str
+    young_pa: list[_Positive] = Field(min_length=1)
+    young_mesh_pa: list[_Positive] | None = None
+    young_interval_pa: list[tuple[_Maybe, _Maybe]]
+    young_interval_sensor_pa: list[tuple[_Maybe, _Maybe]] | None = None
+    young_deviation: _Deviation | None = None
+    poisson: float = Field(gt=-1, lt=0.5)
+    density: _Positive | None = None
+    loss_m2: _Maybe
+    forward_count: int
+    converged: bool
+    is_weightless: bool = False
+    recording_spread: float = 0.0
+    field_form: list[float] | None = None
+    causes: list[_Cause] | None = None
+    held_out: dict[str, _Score] | None = None
+    warnings: list[str] = []
+    control_points_m: list[_Vector]
+    fractions: list[_Share]
+    parameters: list[str]
+    groups: list[Annotated[int, Field(ge=0)]]
+    covariance: _Rows
+    deviations_before_fit: list[_Maybe]
+    history: list[_Evaluation]
+    pulls: list[_Pull]
+    truth: _Truth | None = None
+
+    @model_validator(mode="after")
+    def _of_one_branch(self) -> "_Estimate":
+        count = len(self.young_pa)
+        told = self.young_deviation or _Deviation()
+        lists = {
+            "young_mesh_pa": self.young_mesh_pa, "young_interval_pa": self.young_interval_pa,
+            "young_interval_sensor_pa": self.young_interval_sensor_pa,
+            "control_points_m": self.control_points_m, "fractions": self.fractions,
+            "groups": self.groups,
+            **{f"young_deviation.{name}": getattr(told, name)
+               for name in ("sensor", "geometry", "mesh", "path", "total")}}
+        for name, values in lists.items():
+            if values and len(values) != count:
+                raise ValueError(f"{name} has {len(values)} entries for {count} moduli")
+        size = len(self.parameters)
+        if len(self.covariance) != size or any(len(row) != size for row in self.covariance):
+            raise ValueError(f"a covariance of {size} parameters was expected")
+        if any(group >= size for group in self.groups):
+            raise ValueError("a modulus in a group that is no parameter")
+        return self
+
+
+def read_estimate(path: Path) -> dict[str, Any]:
+    """Return the content of ``estimate.json``, checked: finite, and of one size throughout.
+
+    A number that was not measured is None there.
+
+    Raises:
+        InputError: it cannot be read, or is no estimate; says where.
+    """
+    content = read_json(path, "an estimate")
+    checked_as(path, _Estimate, content, "an estimate")
+    return content

@@ -1,0 +1,36 @@
+"""Images of a depth camera: depths and masks, read through one door."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import InputError
+
+LARGEST_PIXELS = 100_000_000
+"""Of one image: no camera has more, and a small file may claim to."""
+
+
+def read_pixels(path: Path, what: str) -> np.ndarray:
+    """Return the pixels of an image, shape [height, width] or [height, width, channels].
+
+    Raises:
+        InputError: it cannot be read as an image, or claims to be larger than any camera's.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            # Its size is judged here.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                width, height = image.size
+                if width * height > LARGEST_PIXELS:
+                    raise ValueError(f"{width} x {height} pixels")
+                return np.asarray(image.convert("L") if image.mode in ("1", "P") else image)
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow's readers raise whatever their parsers raise
+        raise InputError(f"{path} cannot be read as an image ({error}).",
+                         f"{what[0].upper()}{what[1:]} was expected.", "Check the file.",
+                         ) from error
