@@ -107,25 +107,15 @@ def test_an_alignment_that_is_no_turn(damaged):
             damaged("branch.json", content)
 
 
-@pytest.mark.parametrize("up", [(0.0, 0.0, 0.0), (np.nan, 0.0, 1.0), (np.inf, 0.0, 0.0)])
-def test_a_direction_has_a_length(up):
-    """`--up 0 0 0` is refused by name."""
+@pytest.mark.parametrize(("name", "value"), [
+    ("up", (0.0, 0.0, 0.0)), ("up", (np.nan, 0.0, 1.0)), ("up", (np.inf, 0.0, 0.0)),
+    ("camera_at", (np.nan, 0.0, 1.0)), ("young", np.inf)])
+def test_options_are_finite_and_directions_have_a_length(name, value):
+    """`--up 0 0 0`, `--camera-at nan` and their like are refused by name."""
     from limber.geometry.settings import ReconstructSettings
 
-    with pytest.raises(InputError, match="--up"):
-        checked_settings(ReconstructSettings, {"up": up})
-
-
-def test_options_are_finite():
-    """`--camera-at nan`, and every other option."""
-    from limber.stages.scene import STAGE
-
-    name = next(name for model in (STAGE.settings, STAGE.inputs, STAGE.options)
-                for name in model.model_fields if name == "camera_at")
-    model = next(model for model in (STAGE.settings, STAGE.inputs, STAGE.options)
-                 if name in model.model_fields)
-    with pytest.raises(InputError, match="--camera-at"):
-        checked_settings(model, {"camera_at": (np.nan, 0.0, 1.0)})
+    with pytest.raises(InputError, match=f"--{name.replace('_', '-')}"):
+        checked_settings(ReconstructSettings, {name: value})
 
 
 def test_lists_of_a_recording_stay_in_its_folder(tmp_path):

@@ -111,7 +111,8 @@ def test_what_holds_an_estimate_back_is_read_first(meshed: Branch):
         "young_deviation": {"sensor": [0.14], "geometry": None, "mesh": None, "total": [0.14]},
         "method": "gauss-newton", "forward_count": 1, "loss_m2": 1e-6, "converged": True,
         "warnings": [], "history": [], "pulls": [], "groups": [0], "parameters": ["E1"],
-        "covariance": [[0.02]], "deviations_before_fit": [0.2]}
+        "covariance": [[0.02]], "deviations_before_fit": [0.2], "poisson": 0.35,
+        "control_points_m": [[0.0, 0.0, 0.2]]}
     with meshed.stage("estimate") as stage:
         stage.path("estimate.json").write_text(json.dumps(full), encoding="utf-8")
     result = write_report(meshed.folder)

@@ -13,7 +13,7 @@ from pathlib import Path
 from limber.plain import plain
 from limber.progress import BarSink, Progress
 
-NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans")
+NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans", "worker")
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ computation comes through here.
 
 import hashlib
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -30,7 +30,8 @@ from limber.store import Branch
 TARGETS_FORMAT = 1
 """Version of ``targets.json``."""
 
-_Vector = tuple[float, float, float]
+_Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+_Vector = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
 class _Entry(BaseModel):

@@ -51,6 +51,7 @@ _OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
 LOADS = ("strain", "stress", "axial_force", "torque")
 """What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
 gripper's force along the branch [N], outward positive, and its torque [Nm]."""
+_WHAT = "an energy field (`limber energy --force` makes one)"
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
 _OPTIONAL_SHAPES = {
@@ -275,10 +276,10 @@ class EnergyField:
             InputError: the file is not an energy field.
         """
         try:
-            arrays = read_arrays(path, "an energy field")
+            arrays = read_arrays(path, _WHAT)
             require_shapes(path, arrays, _SHAPES | {
                 name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
-                           "an energy field")
+                           _WHAT)
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
