@@ -1,11 +1,14 @@
 """Paths to a goal in a scene: their points, poses and energies, what was searched, the goal."""
 
+import csv
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from limber.errors import BranchFolderError
 from limber.planning.plan_file import read_plan_summary
-from limber.reading import read_arrays, read_columns, require_shapes
+from limber.reading import read_arrays, read_columns, read_text, require_shapes
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of
 from limber.store import Branch
@@ -80,16 +83,15 @@ def _add_trees(data: SceneData, branch: Branch, plan: str) -> None:
     if not branch.has(f"plans/{plan}-trees.csv"):
         return
     path = branch.path(f"plans/{plan}-trees.csv")
-    with open(path, encoding="utf-8", newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = list(csv.DictReader(read_text(path, "search trees").splitlines()))
     for planner, key in _TREES.items():
         own = [row for row in rows if row.get("planner") == planner]
         if not own:
             continue
         try:
             nodes = np.array([[float(row[name]) for name in _POSITION] for row in own])
-            parents = np.array([int(row["parent"]) for row in own])
-        except (KeyError, TypeError, ValueError) as error:
+            parents = np.array([int(row["parent"]) for row in own], np.int64)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise _damaged_trees(path, str(error)) from error
         if not np.isfinite(nodes).all() or parents[0] != -1 or (
                 (parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
