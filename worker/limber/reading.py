@@ -81,15 +81,18 @@ def checked_as(path: str | os.PathLike, kind: type[Content], content: Any, what:
                          ) from error
 
 
-def read_toml(path: str | os.PathLike, what: str) -> dict[str, Any]:
+def read_toml(path: str | os.PathLike, what: str, *, finite: bool = True) -> dict[str, Any]:
     """Return the content of a TOML file; all its numbers are finite.
+
+    Args:
+        finite: False where the caller refuses what is not finite itself, by its name and line.
 
     Raises:
         InputError: it is none (the line is named), or a number in it is not finite.
     """
     text = read_text(path, what)
     try:
-        return tomllib.loads(text, parse_float=_finite)
+        return tomllib.loads(text, parse_float=_finite if finite else float)
     except (ValueError, RecursionError) as error:
         raise _unreadable(path, what, error) from error
 

@@ -269,7 +269,7 @@ def read_cell(path: str | Path) -> Cell:
             (the field is named).
     """
     path = Path(path)
-    content = read_toml(path, "the description of a robot's cell (TOML)")
+    content = read_toml(path, "the description of a robot's cell (TOML)", finite=False)
     try:
         return Cell.model_validate(content)
     except ValidationError as error:
