@@ -269,7 +269,8 @@ def read_cell(path: str | Path) -> Cell:
             (the field is named).
     """
     path = Path(path)
-    content = read_toml(path, "the description of a robot's cell (TOML)", finite=False)
+    content = read_toml(path, "the description of a robot's cell (TOML; `limber "
+                              "robot calibrate` makes one)", finite=False)
     try:
         return Cell.model_validate(content)
     except ValidationError as error:
