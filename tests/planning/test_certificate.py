@@ -11,12 +11,13 @@ from limber.planning.bound.certificate import certify
 from limber.planning.compare import plan_pair
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.trust import TrustRegion
-from limber.planning.goals import GraspGoal, TipGoal
+from limber.planning.goals import GraspGoal, TargetGoal
 from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import refine, violation
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
+from limber.planning.regions import Ball
 from limber.planning.settings import PlanSettings
 
 START = np.array([-0.06, -0.03, 0.02])
@@ -129,7 +130,7 @@ def test_from_the_rest_pose_and_for_the_tip(ridge_field):
     """A bound holds for a goal of the tip too, and is close."""
     wanted = ridge_field.tip(np.array([GOAL.position]))[0]
     problem = problem_on(ridge_field, start=ridge_field.rest.copy(),
-                         goal=TipGoal(tuple(wanted), 0.015))
+                         goal=TargetGoal(Ball(tuple(wanted), 0.015)))
     found = plan_gentle(problem)
     best = min(refine(path, problem)[1] for path in bulges(problem, 4))
     assert found.certificate.lower <= min(best, found.cost) * (1 + 1e-9)

@@ -8,10 +8,11 @@ import pytest
 
 from limber.errors import Cancelled, NoPathError
 from limber.planning.cost import CostWeights, measure_path
-from limber.planning.goals import GraspGoal, TipGoal, default_goal, goal_points
+from limber.planning.goals import GraspGoal, TargetGoal, default_goal, goal_points
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import plan_path
+from limber.planning.regions import Ball
 from limber.progress import Progress
 
 START = np.array([-0.13, 0.0, 0.0])
@@ -22,7 +23,7 @@ ENGINES = ["own", pytest.param("ompl", marks=pytest.mark.skipif(
 
 def make_problem(field, *, deformation, distance=0.3, goal=GOAL, **limits):
     limited = field.limited(**limits)
-    cost = CostWeights.between(field, START, np.array(goal.position),
+    cost = CostWeights.between(field, START, goal.centre(field),
                                   deformation=deformation, distance=distance)
     return PathProblem(START, goal_points(goal, field, limited),
                    lambda points: goal.distance(field, points) <= goal.tolerance,
@@ -123,10 +124,10 @@ def test_goal_behind_a_wall(ridge_field):
 
 def test_tip_goal_brings_the_tip_there(ridge_field):
     """Grasp positions for a tip goal put the tip, by the field, within the tolerance."""
-    goal = TipGoal((0.15, -0.05, 0.33), 0.01)
+    goal = TargetGoal(Ball((0.15, -0.05, 0.33), 0.01))
     points = goal_points(goal, ridge_field, ridge_field.limited())
     assert len(points) > 20
-    assert np.linalg.norm(ridge_field.tip(points) - goal.position, axis=1).max() <= 0.01
+    assert np.linalg.norm(ridge_field.tip(points) - goal.region.centre, axis=1).max() <= 0.01
     found = plan_path(make_problem(ridge_field, deformation=1.0, goal=goal),
                       Search(iterations=800, seed=1))
     assert goal.distance(ridge_field, found.points[-1:])[0] <= goal.tolerance + 1e-9

@@ -22,7 +22,7 @@ _PLACES = {
     "GraspSamples": "field.energy_field",
     "PlanSettings": "settings",
     "PlannedMotion": "plan",
-    "TipGoal": "goals",
+    "TargetGoal": "goals",
     "fit_field": "field.energy_field",
     "grasp_model_of": "field.grasp_model",
     "plan_motion": "plan",

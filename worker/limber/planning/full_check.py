@@ -4,7 +4,7 @@ import numpy as np
 
 from limber.planning.field.energy_field import EnergyField, GraspSamples
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals import Goal, TipGoal
+from limber.planning.goals import Goal, TargetGoal
 from limber.planning.limits import Limits
 from limber.planning.resolve import ResolvedPath, SolvedPoses
 
@@ -26,11 +26,10 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal) -> list
     told = told[:1] + ([f"and at {len(told) - 1} more poses"] if len(told) > 1 else [])
     whole = path.approach.joined(path.solved)
     told += [str(broken) for broken in limits.broken(whole)]
-    if path.is_whole and isinstance(goal, TipGoal):
-        off = float(np.linalg.norm(path.solved.tips[-1] - goal.position))
-        if off > goal.tolerance * (1.0 + _SLACK):
-            told.append(f"the tip ends {1e3 * off:.1f} mm from its goal where "
-                        f"{1e3 * goal.tolerance:.1f} mm is allowed")
+    if path.is_whole and isinstance(goal, TargetGoal):
+        off = float(goal.region.distance(goal.place(path.solved)[None])[0])
+        if off > goal.tolerance * _SLACK:
+            told.append(f"the {goal.name} ends {1e3 * off:.1f} mm outside its goal")
     return told
 
 

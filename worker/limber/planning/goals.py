@@ -1,4 +1,4 @@
-"""Where a path may end: the grasp at a place, or the branch's tip at a place."""
+"""Where a path may end: the grasp at a place, or a place on the branch in a region."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,6 +14,8 @@ from limber.planning.field.energy_field import (
     allowed_at,
     energy_at,
 )
+from limber.planning.regions import Region, ball
+from limber.planning.resolve import SolvedPoses
 
 
 class Goal(Protocol):
@@ -49,7 +51,7 @@ class GraspGoal:
         return np.linalg.norm(np.asarray(points) - self.position, axis=1)
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
-        inside = _ball(count, generator) * self.tolerance + self.position
+        inside = ball(count, generator) * self.tolerance + self.position
         inside[0] = self.position
         return inside
 
@@ -62,32 +64,51 @@ class GraspGoal:
 
 
 @dataclass(frozen=True)
-class TipGoal:
-    """The branch's tip (its flower) within ``tolerance`` [m] of ``position`` [m]."""
+class TargetGoal:
+    """A place on the branch within a region of space.
 
-    position: tuple[float, float, float]
-    tolerance: float
+    Attributes:
+        region: Where it shall be.
+        target: Number of the named target; None: the branch's tip.
+        name: Of the target.
+    """
+
+    region: Region
+    target: int | None = None
+    name: str = "tip"
+
+    @property
+    def tolerance(self) -> float:
+        """Distance of the region's middle from its outside [m]."""
+        return self.region.depth
 
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(field.tip(points) - self.position, axis=1)
+        return self.region.distance(field.tip(points, self.target)) + self.tolerance
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         # The region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
         points = field.region.draw(20 * count, generator)
         points = points[np.argsort(self.distance(field, points))[:count]]
-        target = self.position + _ball(count, generator) * (0.9 * self.tolerance)
+        wanted = self.region.draw(count, generator)
         for _ in range(8):
-            points = points + _damped_steps(field.tip_gradient(points),
-                                            target - field.tip(points))
+            outside = self.distance(field, points) > 0.5 * self.tolerance
+            steps = _damped_steps(field.tip_gradient(points, self.target),
+                                  wanted - field.tip(points, self.target))
+            points = points + np.where(outside[:, None], steps, 0.0)
         return points
 
     def centre(self, field: EnergyField) -> np.ndarray:
         points = self.guess(field, 50, np.random.default_rng(0))
         return points[np.argmin(self.distance(field, points))]
 
+    def place(self, states: SolvedPoses) -> np.ndarray:
+        """Return where the target is in the last of the states [m], shape [3]."""
+        return states.tips[-1] if self.target is None else states.targets[-1, self.target]
+
     def describe(self) -> dict:
-        return {"kind": "tip", "position_m": list(map(float, self.position)),
-                "tolerance_m": self.tolerance}
+        return {"kind": "tip" if self.target is None else "target", "target": self.name,
+                "position_m": self.region.middle.tolist(), "tolerance_m": self.tolerance,
+                "region": self.region.describe()}
 
 
 def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: int = 200,
@@ -149,7 +170,7 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
     for index in far[np.argsort(field.samples.energies[far])]:
         for shrink in (1.0, 0.95, 0.9, 0.85):
             position = field.rest + shrink * offset[index]
-            around = position + _ball(100, np.random.default_rng(0)) * tolerance
+            around = position + ball(100, np.random.default_rng(0)) * tolerance
             if field.region.contains(around).mean() > 0.5 and field.region.contains(position)[0]:
                 return GraspGoal(tuple(map(float, position)), tolerance)
     raise NoPathError("No far pose lies well inside the sampled region.",
@@ -162,7 +183,7 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     distance = goal.distance(field, points)
     nearest = points[np.argmin(distance)]
     place = ", ".join(f"{value:.3f}" for value in nearest)
-    what = "the tip" if isinstance(goal, TipGoal) else "the grasp"
+    what = f"the {goal.name}" if isinstance(goal, TargetGoal) else "the grasp"
     return NoPathError(
         f"No sampled pose brings {what} to the goal; the nearest misses it by "
         f"{distance.min():.3f} m, with the grasp at ({place}).",
@@ -174,12 +195,6 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
 
 def _place(point: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.3f}" for value in point) + ")"
-
-
-def _ball(count: int, generator: np.random.Generator) -> np.ndarray:
-    direction = generator.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return direction * generator.uniform(size=(count, 1)) ** (1 / 3)
 
 
 def _damped_steps(slope: np.ndarray, missing: np.ndarray) -> np.ndarray:

@@ -22,13 +22,15 @@ from limber.planning.cost import STEP, PathMeasures, measure_path, resample
 from limber.planning.field.energy_field import EnergyField, refit
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.full_check import broken_on_full_model, field_error, learnt
-from limber.planning.goals import Goal, GraspGoal, TipGoal, default_goal
+from limber.planning.goals import Goal, GraspGoal, TargetGoal, default_goal
 from limber.planning.limits import Limits
 from limber.planning.planners.tree_search import SearchTree
+from limber.planning.regions import Ball, BoxRegion, Region, View
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread
 
+_OWN = 0.003  # [m] of the surface about a target that does not hide it
 _WIDE_GAP = 5.0  # percent, above which the user is told in a warning
 
 
@@ -51,11 +53,12 @@ class PlannedMotion:
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
-                limits: Limits | None = None, workers: int | None = None,
+                limits: Limits | None = None, view: View | None = None, workers: int | None = None,
                 progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
-    ``limits`` are the settings' where not given; those of a robot's cell come in this way.
+    ``limits`` are the settings' where not given; those of a robot's cell come in this way, and
+    what its camera sees as ``view``.
 
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and it is planned anew, at most
@@ -68,7 +71,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         ConvergenceError: the branch cannot be solved along the shortest path.
     """
     one_thread()
-    goal = _goal(field, settings)
+    goal = _goal(field, grasp_model, settings, view)
     start = _start(field, goal, settings)
     limits = limits or Limits.of(settings)
     rounds: list[dict[str, Any]] = []
@@ -102,6 +105,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         if is_last:
             raise _refused(broken, settings)
         field = refit(field, learnt(field, grasp_model, plan, limits))
+    _require_sight(goal, grasp_model, plan)
     summary = _summary(field, goal, start, pair, baseline.require(), plan, settings)
     summary["rounds"] = rounds
     for message in _doubts(summary, baseline, plan):
@@ -119,16 +123,60 @@ def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:
         "or allow more --replans.")
 
 
-def _goal(field: EnergyField, settings: PlanSettings) -> Goal:
-    if settings.goal is not None and settings.tip_goal is not None:
-        raise InputError("Both --goal and --tip-goal are given.",
-                         "A path ends with the grasp or with the tip in a place, not both.",
+def _goal(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings,
+          view: View | None) -> Goal:
+    given = {"--goal": settings.goal, "--tip-goal": settings.tip_goal,
+             "--target-box": settings.target_box, "--in-view": settings.in_view or None}
+    asked = [name for name, value in given.items() if value is not None]
+    if len(asked) > 1:
+        raise InputError(f"{' and '.join(asked)} are given.", "A path ends in one goal.",
                          "Give one of them.")
-    if settings.tip_goal is not None:
-        return TipGoal(settings.tip_goal, settings.goal_tolerance)
+    if settings.target is not None and asked in ([], ["--goal"]):
+        raise InputError(f"--target {settings.target} is given without a place for it.",
+                         "A target alone says not where it shall be.",
+                         "Give --tip-goal, --target-box or --in-view as well.")
     if settings.goal is not None:
         return GraspGoal(settings.goal, settings.goal_tolerance)
-    return default_goal(field, settings.goal_tolerance)
+    if not asked:
+        return default_goal(field, settings.goal_tolerance)
+    if settings.tip_goal is not None:
+        region: Region = Ball(settings.tip_goal, settings.goal_tolerance)
+    elif settings.target_box is not None:
+        low, high = settings.target_box[:3], settings.target_box[3:]
+        if not np.all(np.less(low, high)):
+            raise InputError(f"The box from {low} to {high} m is empty.",
+                             "Its lower corner must be below the upper one in x, y and z.",
+                             "Correct --target-box.")
+        region = BoxRegion(low, high)
+    elif view is None:
+        raise InputError("--in-view is given, but no camera.", "A cell file says where it stands.",
+                         "Give --cell with a [camera].")
+    else:
+        region = view
+    return TargetGoal(region, *_target(grasp_model, settings.target))
+
+
+def _target(grasp_model: GraspModel, name: str | None) -> tuple[int | None, str]:
+    names = [target.name for target in grasp_model.branch.targets]
+    if name is None:
+        return None, "tip"
+    if name not in names:
+        raise InputError(f"The branch has no target {name}.",
+                         f"It has: {', '.join(names) or 'none'}.",
+                         "Name one with `limber target`.")
+    return names.index(name), name
+
+
+def _require_sight(goal: Goal, grasp_model: GraspModel, plan: ResolvedPath) -> None:
+    """Raise NoPathError where the branch itself hides the target from the camera at the end."""
+    if not (isinstance(goal, TargetGoal) and isinstance(goal.region, View)):
+        return
+    nodes = grasp_model.mesh.nodes + plan.solved.displacements[-1]
+    if goal.region.hidden_by(nodes[grasp_model.mesh.surface_faces()], goal.place(plan.solved),
+                             _OWN):
+        raise NoPathError(f"At the path's end the branch hides the {goal.name} from the camera.",
+                          "Paths are checked for sight, and not yet led to where there is some.",
+                          "Choose a --target-box on the camera's side, or move the camera.")
 
 
 def _start(field: EnergyField, goal: Goal, settings: PlanSettings) -> np.ndarray:
@@ -147,7 +195,7 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
              ) -> dict[str, Any]:
     before, after = baseline.measures, plan.measures
     return {
-        "goal": goal.describe() | {"chosen": settings.goal is None and settings.tip_goal is None},
+        "goal": goal.describe() | {"chosen": _is_chosen(settings)},
         "start_m": start, "seed": settings.seed, "planner": settings.planner,
         "engine": chosen_engine(settings.engine),
         "certificate": pair.certificate.describe(),
@@ -168,6 +216,10 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
         "length_added_percent": _change(before.length_m, after.length_m, 1),
         "convergence": {"baseline": pair.baseline.history, "plan": pair.plan.history},
     }
+
+
+def _is_chosen(settings: PlanSettings) -> bool:
+    return not (settings.goal or settings.tip_goal or settings.target_box or settings.in_view)
 
 
 def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:

@@ -26,7 +26,8 @@ class PlanSettings(Settings):
     """From where to where, what counts and what is not allowed."""
 
     groups: ClassVar[Groups] = {
-        "start and goal": ("goal", "tip_goal", "goal_tolerance", "start", "start_seed"),
+        "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "goal_tolerance",
+                           "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "max_stress", "workspace_low", "workspace_high"),
@@ -38,7 +39,15 @@ class PlanSettings(Settings):
         "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
         "chosen and named."))
     tip_goal: tuple[float, float, float] | None = Field(None, description=(
-        "Where the branch's tip (its flower) shall be, in the branch's frame [m]."))
+        "Where the branch's tip (its flower), or --target, shall be, in the branch's frame [m]."))
+    target: str | None = Field(None, description=(
+        "Named target (`limber target`) that --tip-goal, --target-box and --in-view speak of; "
+        "without it the tip."))
+    target_box: tuple[float, float, float, float, float, float] | None = Field(None, description=(
+        "Box that the target shall be in: lower corner, upper corner, in the branch's frame [m]."))
+    in_view: bool = Field(False, description=(
+        "The target shall be in the view of the cell's camera: in its picture, in its range, and "
+        "not hidden by the branch."))
     goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp starts [m]; default the rest pose."))

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from limber.planning.limits import Limits
     from limber.planning.plan import PlannedMotion
     from limber.planning.plan_file import Way
+    from limber.planning.regions import View
     from limber.robot.cell import Cell
 
 
@@ -107,7 +108,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     with branch.stage(key, settings, **inputs) as stage:
         field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
-        found = plan_motion(field, grasp_model, settings, limits=limits, workers=workers,
+        found = plan_motion(field, grasp_model, settings, limits=limits,
+                            view=in_cell and in_cell.view, workers=workers,
                             progress=progress)
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets))
         if in_cell is not None:
@@ -127,13 +129,15 @@ class _InCell:
 
     cell: Cell
     limits: Limits
+    view: View | None
 
     @classmethod
     def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress) -> _InCell:
-        from limber.stages.plan_cell import cell_for, cell_obstacles, limits_in
+        from limber.stages.plan_cell import cell_for, cell_obstacles, limits_in, view_of
 
         cell = cell_for(branch, path, progress)
-        return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)))
+        return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)),
+                   view_of(cell))
 
 
     def check_goal(self, settings: PlanSettings) -> None:

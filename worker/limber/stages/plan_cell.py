@@ -11,6 +11,7 @@ from limber.geometry.surface.surface import Surface
 from limber.planning.limits import Limits
 from limber.planning.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.plan_file import SPEED, Way
+from limber.planning.regions import View
 from limber.progress import Progress
 from limber.robot.belonging import check_branch
 from limber.robot.cell import BoxEntry, Cell, read_cell
@@ -57,6 +58,17 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
                              'Say unit = "mm" or "cm" in the cell file.')
         found.append(Solid(name, surface))
     return tuple(found)
+
+
+def view_of(cell: Cell) -> View | None:
+    """Return what the cell's camera sees; None without one that stands still."""
+    camera = cell.camera
+    if camera is None or camera.mount != "branch":
+        return None
+    (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    return View(matrices(np.array(camera.pose)),
+                (-cx / fx, (camera.width - cx) / fx, -cy / fy, (camera.height - cy) / fy),
+                camera.range_m)
 
 
 def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...]) -> Limits:

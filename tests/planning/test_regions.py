@@ -1,0 +1,74 @@
+"""Regions that a place on the branch may be brought into, and goals in them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.planning.field.energy_field import fit_field
+from limber.planning.goals import TargetGoal, goal_points
+from limber.planning.plan import _goal
+from limber.planning.regions import Ball, BoxRegion, View
+from limber.planning.settings import PlanSettings
+
+# A camera a metre along x that looks back at the origin; its picture is 0.6 m wide there.
+BACK = np.array([[0, 0, -1, 1], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
+VIEW = View(BACK, (-0.3, 0.3, -0.2, 0.2), (0.5, 1.5))
+BOX = BoxRegion((0.0, 0.0, 0.0), (0.2, 0.1, 0.4))
+
+
+@pytest.mark.parametrize("region", [Ball((0.1, 0.0, 0.2), 0.05), BOX, VIEW])
+def test_distances_bound_the_way_out(region):
+    """Drawn points are inside; the middle is the region's depth inside; a step changes a distance
+    by its length at most."""
+    generator = np.random.default_rng(3)
+    drawn = region.draw(300, generator)
+    assert region.distance(drawn).max() <= 1e-12
+    assert region.distance(region.middle[None])[0] == pytest.approx(-region.depth)
+    points = region.middle + generator.normal(size=(300, 3))
+    moved = points + 0.1 * generator.normal(size=(300, 3))
+    change = np.abs(region.distance(points) - region.distance(moved))
+    assert (change <= np.linalg.norm(points - moved, axis=1) + 1e-12).all()
+
+
+def test_a_view_ends_at_its_picture_and_its_range():
+    """Points on its borders, from the camera's own description."""
+    ahead = [[0.5, 0, 0], [-0.5, 0, 0], [0, 0.3, 0], [0, 0, 0.2], [0, 0, 0]]
+    assert VIEW.distance(np.array(ahead)) == pytest.approx([0, 0, 0, 0, -0.2 / np.hypot(1, 0.2)],
+                                                           abs=1e-12)
+    assert VIEW.distance(np.array([[0, 0.31, 0], [0, 0, -0.21], [0.6, 0, 0]])).min() > 0.0
+
+
+def test_a_surface_hides_what_is_behind_it():
+    """A triangle between; one behind the target, one beside the line and the target's own skin do
+    not hide it."""
+    wall = np.array([[[0.3, -1, -1], [0.3, 1, -1], [0.3, 0, 1]]], float)
+    place = np.zeros(3)
+    assert VIEW.hidden_by(wall, place, 0.003)
+    for shift in ([-0.5, 0, 0], [0, 2, 0], [-0.299, 0, 0]):
+        assert not VIEW.hidden_by(wall + shift, place, 0.003)
+
+
+def test_a_named_target_is_brought_into_a_box(ridge):
+    """Goal poses put that target, and not the tip, into the box by the field."""
+    samples = ridge.samples(count=80)
+    flower = 2.0 * samples.positions + [0.0, 0.1, 0.2]
+    field = fit_field(replace(samples, targets=flower[:, None]))
+    box = BoxRegion((0.1, 0.0, 0.1), (0.2, 0.15, 0.3))
+    points = goal_points(TargetGoal(box, 0, "flower"), field, field.limited())
+    found = 2.0 * points + [0.0, 0.1, 0.2]
+    assert len(points) > 20 and box.distance(found).max() < 2e-3
+    assert box.distance(1.5 * points + [0.0, 0.0, 0.3]).max() > 0.01
+
+
+@pytest.mark.parametrize(("settings", "words"), [
+    ({"goal": (0, 0, 1), "target_box": (0, 0, 0, 1, 1, 1)}, "--goal and --target-box"),
+    ({"target": "flower"}, "without a place"),
+    ({"target": "flower", "tip_goal": (0, 0, 1)}, "no target flower"),
+    ({"target_box": (0, 0, 1, 1, 1, 0)}, "empty"),
+    ({"in_view": True}, "no camera"),
+])
+def test_goals_that_make_no_sense_are_refused(small_model, ridge_field, settings, words):
+    with pytest.raises(InputError, match=words):
+        _goal(ridge_field, small_model, PlanSettings(**settings), None)
