@@ -17,6 +17,7 @@ from limber.mechanics.loaded import hang
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
 
+ARC_NAMES = tuple(branch.name for branch in BRANCHES)
 _GRAVITY = (0.0, 0.0, -9.80665)
 _DENSITY = 900.0
 

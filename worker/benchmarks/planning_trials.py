@@ -37,6 +37,8 @@ class Trial:
     gap: float = np.nan
     to_optimum: float = np.nan
     bound_to_optimum: float = np.nan
+    seconds_to_close: float = np.nan
+    tree_to_optimum: float = np.nan
     saved: dict[str, float] = field(default_factory=dict)
     added: dict[str, float] = field(default_factory=dict)
     check_seconds: float = np.nan
@@ -89,6 +91,11 @@ def _measure(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndar
     best = best_cost(problem, _OPTIMUM_STARTS, settings.seed)
     trial.to_optimum = cost / best
     trial.bound_to_optimum = certificate["lower_bound"] / min(best, cost)
+    close = [level["seconds"] for level in certificate["levels"] if level["upper"] <= 1.02 * best]
+    trial.seconds_to_close = min(close, default=np.nan)
+    if tree := summary["paths_on_field"].get("D-RRT*"):
+        trial.tree_to_optimum = (weights.energy * tree["energy_integral_jm"]
+                                 + weights.length * tree["length_m"]) / best
     gentle = summary["paths_on_field"]["eikonal"]
     for name, path in summary["paths_on_field"].items():
         if name.startswith("RRT*") or name == "straight line":

@@ -13,6 +13,7 @@ bound stays one. If closed cells separate start and goal, that proves that no pa
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from time import perf_counter
 
 import numpy as np
 from scipy.ndimage import binary_dilation, label, maximum_filter
@@ -51,7 +52,7 @@ class Certificate:
     Attributes:
         lower: No path to the goal costs less.
         upper: Cost of the best path known, infinite without one.
-        levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper``.
+        levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
         field_error_j: What was subtracted from the energy before bounding [J].
     """
 
@@ -111,6 +112,7 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = _ENOUGH
     """
     grid, cell = _first_grid(problem)
     lower, upper, levels = 0.0, np.inf, []
+    began = perf_counter()
     for level in range(_LEVELS):
         progress(level / _LEVELS, "bounding the best path", lower=lower, upper=upper)
         found = _bound(problem, grid, cell)
@@ -119,7 +121,7 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = _ENOUGH
         upper = min(upper, improve(found.rough_path))
         lower = max(lower, min(found.lower, upper))
         levels.append({"spacing_m": grid.spacing, "open_cells": int(found.open_cells.sum()),
-                       "lower": lower, "upper": upper})
+                       "lower": lower, "upper": upper, "seconds": perf_counter() - began})
         if upper <= (1.0 + enough) * lower:
             break
         keep = found.keep(upper)
