@@ -11,6 +11,7 @@ import json
 import time
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -135,8 +136,8 @@ def _trials(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
         if trial.source == source and wanted.pop((trial.branch, trial.seed), None):
             found[trial.branch].append(trial)
     with Pool() as pool:
-        futures = [pool.submit(run_trial, one.subject.model, one.known, one.goal, number, own,
-                               branch=name, source=source)
+        futures = [pool.submit(partial(run_trial, branch=name, source=source), one.subject.model,
+                               one.known, one.goal, number, own)
                    for (name, own), (one, number) in wanted.items()]
         for done, future in enumerate(as_completed(futures)):
             trial = future.result()
@@ -158,8 +159,9 @@ def _detours(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
         if detour.source == source and wanted.pop((detour.branch, detour.seed), None):
             found.append(detour)
     with Pool() as pool:
-        futures = [pool.submit(run_detour, one.known, one.goal, number, own, branch=name,
-                               source=source) for (name, own), (one, number) in wanted.items()]
+        futures = [pool.submit(partial(run_detour, branch=name, source=source), one.known,
+                               one.goal, number, own)
+                   for (name, own), (one, number) in wanted.items()]
         for done, future in enumerate(as_completed(futures)):
             found.append(future.result())
             keep(found[-1], kept)

@@ -116,6 +116,11 @@ class Limits:
                    settings.max_strain or np.inf, (settings.max_stress or np.inf) / stiffer,
                    settings.max_axial_force or np.inf, settings.max_torque or np.inf, low, high)
 
+    def tightened(self, factors: dict[str, float]) -> "Limits":
+        """Return the limits divided by ``factors``, by the names of ``UNITS``."""
+        return replace(self, **{name: getattr(self, name) / factor
+                                for name, factor in factors.items()})
+
     def asked(self) -> dict[str, float]:
         """Return the limits that were asked for, by the names of ``UNITS``."""
         return {name: getattr(self, name) for name in UNITS if getattr(self, name) < np.inf}
@@ -154,7 +159,7 @@ class Limits:
         places = states.poses[:, :3]
         outside = np.maximum(self.low - places, places - self.high).max(axis=1)
         asked = [(f"{name.replace('_', ' ')} [{UNITS[name]}]".replace(" []", ""), size,
-                  getattr(self, name)) for name, size in _sizes(states).items()]
+                  getattr(self, name)) for name, size in sizes(states).items()]
         asked.append(("distance outside the workspace [m]", outside, 1e-6))
         return [Broken(name, float(values.max()), limit, places[values.argmax()])
                 for name, values, limit in asked if values.max() > limit]
@@ -162,13 +167,13 @@ class Limits:
     def kept(self, states: SolvedPoses) -> np.ndarray:
         """Return which states keep all limits, bool [n]."""
         places = states.poses[:, :3]
-        within = [size <= getattr(self, name) for name, size in _sizes(states).items()]
+        within = [size <= getattr(self, name) for name, size in sizes(states).items()]
         return (np.logical_and.reduce(within)
                 & (places >= self.low - 1e-6).all(axis=1)
                 & (places <= self.high + 1e-6).all(axis=1))
 
 
-def _sizes(states: SolvedPoses) -> dict[str, np.ndarray]:
+def sizes(states: SolvedPoses) -> dict[str, np.ndarray]:
     """Return what limits are on, by the names of ``UNITS``, shape [n] each."""
     return {"energy": states.energies, "force": states.force_sizes,
             **{name: np.abs(values) for name, values in states.loads.items()}}

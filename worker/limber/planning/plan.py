@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError, NoPathError
+from limber.planning.chance import YoungDoubt
 from limber.planning.compare import (
     PathPair,
     PlanSettings,
@@ -30,6 +31,7 @@ from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread
 
+_RESERVE = 1.01  # on factors of limits: they change a little with the path
 _OWN = 0.003  # [m] of the surface about a target that does not hide it
 _WIDE_GAP = 5.0  # percent, above which the user is told in a warning
 
@@ -53,12 +55,14 @@ class PlannedMotion:
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
-                limits: Limits | None = None, view: View | None = None, workers: int | None = None,
+                limits: Limits | None = None, view: View | None = None,
+                doubt: YoungDoubt | None = None, workers: int | None = None,
                 progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
     ``limits`` are the settings' where not given; those of a robot's cell come in this way, and
-    what its camera sees as ``view``.
+    what its camera sees as ``view``. With ``doubt`` the limits are kept with the settings'
+    confidence: planned is with tighter ones.
 
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and it is planned anew, at most
@@ -76,12 +80,13 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     limits = limits or Limits.of(settings)
     rounds: list[dict[str, Any]] = []
     pair = baseline = None
+    planned_limits, risks = limits, []
     for number in range(settings.replans + 1):
         ahead = progress.part(number / (settings.replans + 1), (number + 1) / (
             settings.replans + 1))
         began = perf_counter()
-        before, pair = pair, plan_within(field, start, goal, settings, limits, before=pair,
-                                         progress=ahead.part(0.0, 0.3))
+        before, pair = pair, plan_within(field, start, goal, settings, planned_limits,
+                                         before=pair, progress=ahead.part(0.0, 0.3))
         planned = perf_counter()
         ahead(0.3, "both paths on the full model")
         # The shortest path rarely changes with what was learnt: it is solved once.
@@ -95,6 +100,11 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             raise NoPathError(f"On the planned way {met}.",
                               "Paths are checked against obstacles, and not yet led around them.",
                               "Choose another goal, or a workspace that keeps clear of it.")
+        if doubt is not None and not broken:
+            risks.append(doubt.risk(grasp_model, plan, limits, settings.confidence))
+            broken = risks[-1].told()
+            planned_limits = limits.tightened(
+                {name: _RESERVE * factor for name, factor in risks[-1].factors.items()})
         off = field_error(field, plan.solved)
         rounds.append({"broken": broken, "sample_count": len(field.samples.poses),
                        "margins": pair.margins, "field_energy_error": off,
@@ -108,6 +118,10 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     _require_sight(goal, grasp_model, plan)
     summary = _summary(field, goal, start, pair, baseline.require(), plan, settings)
     summary["rounds"] = rounds
+    if risks:
+        summary["confidence"] = {"asked": settings.confidence, "kept_at_least": risks[-1].kept,
+                                 "factors": risks[-1].factors,
+                                 "of_a_plan_for_the_estimate": risks[0].kept}
     for message in _doubts(summary, baseline, plan):
         progress.warn(message)
     return PlannedMotion(summary, baseline, plan, field, {

@@ -30,7 +30,7 @@ class PlanSettings(Settings):
                            "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
-                               "max_stress", "workspace_low", "workspace_high"),
+                               "max_stress", "workspace_low", "workspace_high", "confidence"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
     experts = ("start_seed", "iterations", "engine", "replans", "field_error")
@@ -78,6 +78,9 @@ class PlanSettings(Settings):
         "Lower corner of the box that the grasp stays in, in the branch's frame [m]."))
     workspace_high: tuple[float, float, float] | None = Field(None, description=(
         "Upper corner of that box [m]."))
+    confidence: float | None = Field(None, ge=0.5, lt=1, description=(
+        "Probability with which the limits are kept, Young's modulus being as uncertain as the "
+        "estimate says; without it they are kept for the estimate."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
         "eikonal: the cheapest way on a grid, refined, mostly within 1 % of the best possible "
         "path; d-rrt-star: the paper's D-RRT*. Either comes with a proven bound."))

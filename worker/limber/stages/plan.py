@@ -75,6 +75,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.plan_file import whole_motion
     from limber.stages.loading import load_grasp_model
     from limber.stages.plan_cell import reached_by
+    from limber.stages.plan_doubt import young_doubt
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
             ("-baseline", "-motion", "-trees")):
@@ -96,6 +97,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     stiffer = _stiffer(branch) if settings.max_stress else 1.0
     digests = digests | {"stiffer": f"{stiffer:.6f}"}
     asked = Limits.of(settings, stiffer)
+    doubt = None if settings.confidence is None else young_doubt(branch, grasp_model, asked)
     in_cell = None if cell_file is None else _InCell.of(branch, cell_file, asked, progress)
     if in_cell is not None:
         digests = digests | {"cell": file_digest(cell_file)}
@@ -109,7 +111,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
         found = plan_motion(field, grasp_model, settings, limits=limits,
-                            view=in_cell and in_cell.view, workers=workers,
+                            view=in_cell and in_cell.view, doubt=doubt, workers=workers,
                             progress=progress)
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets))
         if in_cell is not None:

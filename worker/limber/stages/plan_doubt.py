@@ -1,0 +1,46 @@
+"""What a plan is told of how uncertain Young's modulus is."""
+
+import json
+
+import numpy as np
+
+from limber.errors import InputError
+from limber.mechanics.young_field import young_weights
+from limber.planning.chance import YoungDoubt
+from limber.planning.field.grasp_model import GraspModel
+from limber.planning.limits import Limits
+from limber.store import Branch
+
+_INTERVAL = 2 * 1.96  # standard deviations in an interval of 95 %
+
+
+def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungDoubt:
+    """Return the moduli's distribution by the branch's estimate.
+
+    Deviations are those of the stated intervals, all that is not known included; correlations those
+    of the fit. Control points of one group have one modulus.
+
+    Raises:
+        InputError: there is no limit, no estimate, or one without intervals.
+    """
+    if not limits.asked():
+        raise InputError("--confidence is given without a limit.",
+                         "It is the probability with which limits are kept.",
+                         "Give --max-force, --max-strain or another limit as well.")
+    if "estimate" not in branch.manifest.stages:
+        raise InputError("--confidence is given, and nothing is estimated.",
+                         "How uncertain Young's modulus is comes from `limber estimate`.",
+                         "Import a pull and estimate, or leave --confidence away.")
+    found = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
+    interval = np.array(found["young_interval_pa"], float)
+    if not (np.isfinite(interval).all() and (interval > 0.0).all()):
+        raise InputError("The estimate has no interval for some control points.",
+                         "How uncertain Young's modulus is there is not known.",
+                         "Record another pull, or leave --confidence away.")
+    points = np.array(found["control_points_m"], float)
+    groups = np.array(found.get("groups") or range(len(points)), int)
+    correlation = np.array(found["correlation"], float)[np.ix_(groups, groups)]
+    weights = young_weights(grasp_model.mesh, points) * np.array(
+        found.get("young_mesh_pa") or found["young_pa"], float)
+    return YoungDoubt(weights / weights.sum(axis=1, keepdims=True),
+                      np.log(interval[:, 1] / interval[:, 0]) / _INTERVAL, correlation)
