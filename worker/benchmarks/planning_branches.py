@@ -24,15 +24,16 @@ _DENSITY = 900.0
 
 @dataclass(frozen=True)
 class Subject:
-    """A branch to plan on."""
+    """A branch to plan on; ``shares`` [tets, K] of each control point in a tetrahedron's E."""
 
     name: str
     model: GraspModel
+    shares: np.ndarray
 
 
 def arcs() -> list[Subject]:
     """Return the paper's branches: its moduli, too soft to stand under their own weight."""
-    return [Subject(branch.name, _arc(branch)) for branch in BRANCHES]
+    return [_arc(branch) for branch in BRANCHES]
 
 
 def forked(seed: int, count: int, progress: Progress = SILENT) -> list[Subject]:
@@ -47,24 +48,24 @@ def forked(seed: int, count: int, progress: Progress = SILENT) -> list[Subject]:
             radius_tip=rng.uniform(0.45, 0.7) * root, fork_count=int(rng.integers(1, 4)),
             young_mean=10 ** rng.uniform(8.5, 9.5))
         mesh = mesh_branch(drawn.skeleton).mesh
-        found.append(Subject(f"forked {number + 1}", _grasp_model(
-            mesh, drawn.skeleton, drawn.young, 0.35, _GRAVITY, progress)))
+        found.append(_subject(f"forked {number + 1}", mesh, drawn.skeleton, drawn.young, 0.35,
+                              _GRAVITY, progress))
     return found
 
 
-def _arc(branch: PaperBranch) -> GraspModel:
+def _arc(branch: PaperBranch) -> Subject:
     skeleton = branch.skeleton
-    return _grasp_model(branch.mesh(slice_length=2.0, sides=6), skeleton,
-                        np.array(branch.young), branch.poisson, None)
+    return _subject(branch.name, branch.mesh(slice_length=2.0, sides=6), skeleton,
+                    np.array(branch.young), branch.poisson, None)
 
 
-def _grasp_model(mesh: TetMesh, skeleton: Skeleton, young: np.ndarray, poisson: float,
-                 gravity: tuple[float, float, float] | None, progress: Progress = SILENT,
-                 ) -> GraspModel:
+def _subject(name: str, mesh: TetMesh, skeleton: Skeleton, young: np.ndarray, poisson: float,
+             gravity: tuple[float, float, float] | None, progress: Progress = SILENT) -> Subject:
     mesh = mark(mesh, skeleton, young=1.0, poisson=poisson, density=_DENSITY)
-    values = young_weights(mesh, control_points(skeleton, FRACTIONS)) @ young
+    parts = young_weights(mesh, control_points(skeleton, FRACTIONS)) * young
+    values = parts.sum(axis=1)
     mesh = mesh.with_data(cell_data={"young": values})
     model = BranchModel(mesh, young=values, poisson=poisson, density=_DENSITY, gravity=gravity)
     loaded = replace(hang(model, progress=progress),
                      grasp_point=tuple(map(float, skeleton.point_at(GRASP_FRACTION))))
-    return grasp_model_of(loaded, skeleton)
+    return Subject(name, grasp_model_of(loaded, skeleton), parts / values[:, None])

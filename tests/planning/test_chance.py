@@ -1,0 +1,67 @@
+"""Limits under an uncertain Young's modulus, against scalings that are exact."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from limber.errors import InputError
+from limber.planning.chance import YoungDoubt
+from limber.planning.limits import Limits
+from limber.planning.resolve import resolve_path
+from limber.planning.settings import PlanSettings
+from limber.stages.plan import plan as plan_paths
+
+
+@pytest.fixture(scope="module")
+def bent(small_model):
+    """The weightless small branch, bent in three steps to the side."""
+    side = np.linspace(0.0, 1.0, 4)[1:, None] * np.array([0.0, 0.04, -0.002])
+    return resolve_path(small_model, small_model.rest_position + side,
+                        small_model.rest_position[None])
+
+
+def doubt_of(small_model, deviations, correlation=0.0):
+    """Control points at a third and two thirds of the height, or one alone."""
+    height = small_model.mesh.centroids[:, 2] / 0.5
+    shares = np.column_stack([1.0 - height, height])[:, :len(deviations)]
+    count = len(deviations)
+    return YoungDoubt(shares / shares.sum(axis=1, keepdims=True), np.array(deviations),
+                      np.eye(count) + correlation * (1 - np.eye(count)))
+
+
+def test_a_branch_that_is_stiffer_everywhere(small_model, bent):
+    """Force goes with E, strain does not: both chances are known in closed form."""
+    peak = bent.solved.force_sizes.max()
+    limits = Limits(force=1.1 * peak, strain=1.01 * bent.solved.strains.max())
+    found = doubt_of(small_model, [0.08]).risk(small_model, bent, limits, 0.95)
+    z = norm.ppf(0.975)
+    assert found.factors["force"] == pytest.approx(np.exp(0.08 * z), rel=1e-3)
+    assert found.factors["strain"] == pytest.approx(1.0, abs=1e-3)
+    assert found.kept == pytest.approx(norm.cdf(np.log(1.1) / 0.08), abs=2e-3)
+    assert not found.is_kept and "force" in found.told()[0]
+    tighter = limits.tightened(found.factors)
+    assert tighter.force < peak
+    wide = replace(limits, force=1.2 * peak)
+    assert doubt_of(small_model, [0.08]).risk(small_model, bent, wide, 0.95).is_kept
+
+
+def test_the_log_of_a_force_is_linear_in_the_logs_of_the_moduli(small_model, bent):
+    """What the slopes say of moduli that change against each other, against the full model."""
+    doubt = doubt_of(small_model, [0.1, 0.15], -0.5)
+    logs = np.array([0.1, -0.15])
+    slopes = doubt._slopes(small_model, bent.solved, {"force": 1.0}, lambda *_: None)["force"]
+    solved = doubt.solved(small_model, logs, bent.solved)
+    change = np.log(solved.force_sizes / bent.solved.force_sizes)
+    assert np.allclose(slopes @ [1.0, -1.0], change, atol=0.015)
+    assert np.abs(change).max() > 0.02
+
+
+@pytest.mark.parametrize(("settings", "words"), [
+    ({"confidence": 0.95}, "without a limit"),
+    ({"confidence": 0.95, "max_force": 5.0}, "nothing is estimated"),
+])
+def test_a_confidence_needs_a_limit_and_an_estimate(planned_branch, settings, words):
+    with pytest.raises(InputError, match=words):
+        plan_paths(planned_branch, PlanSettings(**settings), name="sure")

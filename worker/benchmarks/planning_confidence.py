@@ -1,0 +1,89 @@
+"""Plans that shall keep a limit with a probability, against draws of Young's modulus."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.planning_branches import Subject
+from benchmarks.table import Row
+from limber.errors import LimberError
+from limber.planning.chance import YoungDoubt
+from limber.planning.cost import resample
+from limber.planning.field.energy_field import EnergyField
+from limber.planning.goals import GraspGoal
+from limber.planning.plan import plan_motion
+from limber.planning.settings import PlanSettings
+
+CONFIDENCE = 0.95
+_DEVIATION = 0.12  # of log E at each control point: an interval of about -21 to +27 %
+_NEIGHBOUR = -0.4  # correlation of neighbours, as fits have it
+_EVERY = 4  # pose of the motion is asked under each draw, and the one with most force
+
+
+@dataclass
+class Sure:
+    """One plan with a force limit kept at a confidence, and its draws.
+
+    Attributes:
+        kept: Share of draws, each solved on the full model, that keep the limit.
+        before: The same by the risk that the plan for the estimate alone would have run.
+    """
+
+    branch: str
+    seed: int = 0
+    source: str = ""
+    kept: float | None = None
+    before: float | None = None
+    trouble: str = ""
+
+
+def run_sure(subject: Subject, known: EnergyField, goal: GraspGoal, draws: int, seed: int,
+             source: str = "") -> Sure:
+    """Plan from rest under a force that binds, with confidence; draw moduli, solve the motion."""
+    sure = Sure(subject.name, seed, source)
+    model, doubt = subject.model, doubt_of(subject)
+    settings = PlanSettings(seed=seed, iterations=500, goal=goal.position,
+                            goal_tolerance=goal.tolerance)
+    try:
+        free = plan_motion(known, model, settings, workers=1)
+        path = free.plan.solved.poses[:, :3]
+        force = np.linalg.norm(free.field.force(resample(path, 0.002)), axis=1)
+        cap = float(max(1.1 * force.max(), 1.3 * force[-1]))
+        motion = plan_motion(free.field, model, settings.model_copy(update={
+            "max_force": cap, "confidence": CONFIDENCE, "goal": tuple(map(float, path[-1]))}),
+            doubt=doubt, workers=1)
+        sure.before = motion.summary["confidence"]["of_a_plan_for_the_estimate"]
+        states = motion.plan.approach.joined(motion.plan.solved)
+        chosen = np.unique([*range(0, len(states.poses), _EVERY), len(states.poses) - 1,
+                            int(states.force_sizes.argmax())])
+        generator = np.random.default_rng([seed, 5])
+        kept = [doubt.solved(model, doubt.draw(generator), states.take(chosen)).force_sizes.max()
+                <= cap for _ in range(draws)]
+        sure.kept = float(np.mean(kept))
+    except LimberError as error:
+        sure.trouble = f"{type(error).__name__}: {error}"
+    return sure
+
+
+def doubt_of(subject: Subject) -> YoungDoubt:
+    """Return a posterior as an estimate's: the same deviation at each control point."""
+    count = subject.shares.shape[1]
+    near = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) == 1
+    return YoungDoubt(subject.shares, np.full(count, _DEVIATION),
+                      np.eye(count) + _NEIGHBOUR * near)
+
+
+def sure_rows(found: list[Sure], draws: int) -> list[Row]:
+    """Return the row of limits kept with confidence."""
+    good = [one for one in found if one.kept is not None]
+    troubles = "; ".join(f"{one.branch}: {one.trouble}" for one in found if one.trouble)
+    if not good:
+        return [Row(f"limits kept at --confidence {CONFIDENCE}", "90 to 100 %", troubles, False)]
+    kept = 100.0 * np.array([one.kept for one in good])
+    before = 100.0 * np.array([one.before for one in good])
+    return [Row(
+        f"force limit kept at --confidence {CONFIDENCE}, {draws} draws each on the full model, "
+        f"{len(good)} of {len(found)} branches", "90 to 100 %",
+        f"{kept.min():.0f} to {kept.max():.0f} %, mean {kept.mean():.1f}; planned for the estimate "
+        f"alone {before.min():.0f} to {before.max():.0f}" + (f"; {troubles}" if troubles else ""),
+        bool(kept.min() >= 90.0 and len(good) == len(found)))]
