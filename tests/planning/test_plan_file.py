@@ -10,7 +10,6 @@ import pytest
 from limber.errors import InputError
 from limber.planning.limits import Limits
 from limber.planning.plan_file import (
-    SPEED,
     limits_of_motion,
     plan_text,
     read_plan,
@@ -18,6 +17,7 @@ from limber.planning.plan_file import (
     whole_motion,
 )
 from limber.planning.resolve import ResolvedPath, SolvedPoses
+from limber.planning.timing import Pace
 
 OLD = Path(__file__).parent / "plan_format_1.json"  # written by the last version before format 2
 
@@ -45,12 +45,13 @@ def path():
 
 
 def test_motion_goes_there_and_back(path):
-    """Approach from rest, path, and back by the same states; times ascend at one speed."""
+    """Approach from rest, path, and back by the same states, which takes as long."""
     motion = whole_motion(path, ("flower", "leaf"))
     wanted = [0, 0.05, 0.1, 0.15, 0.2, 0.15, 0.1, 0.05, 0]
     np.testing.assert_allclose(motion.poses[:, 0], wanted)
     assert motion.phases == ("approach",) * 2 + ("path",) * 3 + ("return",) * 4
-    np.testing.assert_allclose(motion.times[-1], 0.4 / SPEED)
+    assert motion.times[-1] > 0.4 / Pace().speed
+    np.testing.assert_allclose(motion.times[4], motion.times[-1] / 2)
     assert (np.diff(motion.times) > 0).all()
     np.testing.assert_allclose(motion.targets["leaf"][:, 0], 3 * np.array(wanted))
     np.testing.assert_allclose(motion.torques, 0.1 * motion.forces)
@@ -87,7 +88,7 @@ def test_what_is_written_is_read(path, tmp_path):
     """All columns, vectors as vectors; summary, limits and timing with them."""
     plan = read_plan(written(path, tmp_path))
     assert plan.version == 2 and plan.summary["seed"] == 3
-    assert plan.summary["timing"]["kind"] == "constant speed"
+    assert plan.summary["timing"]["acceleration_m_s2"] == 0.1
     assert plan.summary["limits"]["energy_j"]["limit"] == 0.1 and plan.summary["robot"] is None
     motion = whole_motion(path, ("flower", "leaf"))
     for name in ("poses", "energies", "forces", "torques", "strains", "tips", "times"):

@@ -11,9 +11,9 @@ branch, outward), ``strains`` and ``stresses_pa`` (largest in the branch), ``tip
 ``targets_m`` {name: [n][3]}, ``field_energies_j`` (what the field had promised), ``joints_rad``
 [n][6] where a robot is given; ``motion`` also ``phases``.
 
-``timing`` says where times come from: today one speed of the gripper throughout, no acceleration
-limited. ``limits`` has for each limit asked for its value, the peak of the motion and the margin.
-``robot`` is null for plans that were not made in a robot's cell.
+``timing`` has the limits of speed and acceleration that the times keep; a motion stands still at
+rest, at the path's end, and at rest again. ``limits`` has for each limit asked for its value, the
+peak of the motion and the margin. ``robot`` is null for plans that were not made in a robot's cell.
 
 Format 1 had no version, no motion, and the sizes of forces alone. It is read as well.
 """
@@ -28,15 +28,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
 from limber.plain import plain
-from limber.planning.cost import arc_lengths
 from limber.planning.limits import UNITS, Limits
 from limber.planning.resolve import ResolvedPath, SolvedPoses
+from limber.planning.timing import DEFAULT_PACE, Pace, times_along
 from limber.reading import checked_as, read_json
 
 FORMAT = 2
-SPEED = 0.02
-"""Of the gripper along a motion [m/s], until motions are timed: slow enough that nothing swings."""
-
 _WAYS = ("baseline", "plan")
 _COLUMNS = {"poses": "poses", "energies": "energies_j", "strains": "strains", "tips": "tips_m",
             "torques": "torques_nm", "times": "times_s", "field_energies": "field_energies_j",
@@ -148,8 +145,9 @@ class PlanFile:
 
 
 def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
+           pace: Pace = DEFAULT_PACE, stops: tuple[int, ...] = (),
            field_energies: np.ndarray | None = None, phases: tuple[str, ...] | None = None) -> Way:
-    """Return the way of solved poses, at one speed.
+    """Return the way of solved poses, as fast as ``pace`` allows, standing still at ``stops``.
 
     Args:
         targets: Names, in the order of the solution's.
@@ -157,13 +155,14 @@ def way_of(solved: SolvedPoses, targets: tuple[str, ...] = (), *,
     return Way(
         poses=solved.poses, energies=solved.energies, force_sizes=solved.force_sizes,
         strains=solved.strains, forces=solved.forces, torques=solved.torques,
-        times=arc_lengths(solved.poses[:, :3]) / SPEED, tips=solved.tips,
+        times=times_along(solved.poses[:, :3], pace, stops), tips=solved.tips,
         targets={name: solved.targets[:, k] for k, name in enumerate(targets)},
         field_energies=field_energies, phases=phases, stresses=solved.stresses,
         axial_forces=solved.axial_forces)
 
 
-def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = ()) -> Way:
+def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
+                 pace: Pace = DEFAULT_PACE) -> Way:
     """Return approach from rest, path, and the way back, which is the same in reverse.
 
     Equilibria have no memory: on the way back the branch takes the states that it came by.
@@ -174,7 +173,8 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = ()) -> Way:
     count, ahead = len(approach.poses), approach.joined(there)
     back = np.arange(len(ahead.poses) - 1)[::-1]
     phases = ("approach",) * count + ("path",) * len(there.poses) + ("return",) * len(back)
-    return way_of(ahead.joined(ahead.take(back)), targets, phases=phases)
+    return way_of(ahead.joined(ahead.take(back)), targets, pace=pace,
+                  stops=(len(ahead.poses) - 1,), phases=phases)
 
 
 def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]:
@@ -192,7 +192,7 @@ def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]
 
 
 def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,
-              limits: dict[str, dict[str, float]]) -> str:
+              limits: dict[str, dict[str, float]], pace: Pace = DEFAULT_PACE) -> str:
     """Return the content of a file of format 2.
 
     Args:
@@ -200,7 +200,8 @@ def plan_text(summary: dict[str, Any], baseline: Way, plan: Way, motion: Way,
     """
     content = {
         "format_version": FORMAT, **summary, "targets": sorted(plan.targets),
-        "timing": {"kind": "constant speed", "speed_m_s": SPEED}, "limits": limits,
+        "timing": {"kind": "limited acceleration", "speed_m_s": pace.speed,
+                   "acceleration_m_s2": pace.acceleration}, "limits": limits,
         "robot": summary.get("robot"),
         "baseline": summary["baseline"] | _columns(baseline),
         "plan": summary["plan"] | _columns(plan), "motion": _columns(motion)}

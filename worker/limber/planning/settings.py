@@ -31,6 +31,7 @@ class PlanSettings(Settings):
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "max_stress", "workspace_low", "workspace_high", "confidence"),
+        "timing": ("speed", "acceleration"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
     experts = ("start_seed", "iterations", "engine", "replans", "field_error")
@@ -81,6 +82,9 @@ class PlanSettings(Settings):
     confidence: float | None = Field(None, ge=0.5, lt=1, description=(
         "Probability with which the limits are kept, Young's modulus being as uncertain as the "
         "estimate says; without it they are kept for the estimate."))
+    speed: float = Field(0.02, gt=0, le=0.25, description="Of the gripper, at most [m/s].")
+    acceleration: float = Field(0.1, gt=0, le=2.0, description=(
+        "Of the gripper, at most [m/s^2]; the motion stands still at both ends of the path."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
         "eikonal: the cheapest way on a grid, refined, mostly within 1 % of the best possible "
         "path; d-rrt-star: the paper's D-RRT*. Either comes with a proven bound."))

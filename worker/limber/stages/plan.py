@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from limber.planning.plan import PlannedMotion
     from limber.planning.plan_file import Way
     from limber.planning.regions import View
+    from limber.planning.timing import Pace
     from limber.robot.cell import Cell
 
 
@@ -73,6 +74,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.limits import Limits
     from limber.planning.plan import plan_motion
     from limber.planning.plan_file import whole_motion
+    from limber.planning.timing import Pace
     from limber.stages.loading import load_grasp_model
     from limber.stages.plan_cell import reached_by
     from limber.stages.plan_doubt import young_doubt
@@ -113,13 +115,16 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         found = plan_motion(field, grasp_model, settings, limits=limits,
                             view=in_cell and in_cell.view, doubt=doubt, workers=workers,
                             progress=progress)
-        motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets))
+        pace = Pace(settings.speed, settings.acceleration)
+        if in_cell is not None:
+            pace = in_cell.slowed(pace)
+        motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
             found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
-                                                limits.obstacles)
+                                                limits.obstacles, pace.speed)
         progress(0.95, "writing")
-        _write(stage, name, limits, motion, grasp_model, found)
+        _write(stage, name, limits, pace, motion, grasp_model, found)
         stage.result.update(found.summary)
     progress(1.0, "planned")
     return branch.manifest.stages[key].result
@@ -141,6 +146,12 @@ class _InCell:
         return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)),
                    view_of(cell))
 
+
+    def slowed(self, pace: Pace) -> Pace:
+        """Return the pace, no faster than the cell allows."""
+        most = self.cell.limits
+        return replace(pace, speed=min(pace.speed, most.speed_m_s),
+                       acceleration=min(pace.acceleration, most.acceleration_m_s2))
 
     def check_goal(self, settings: PlanSettings) -> None:
         """Raise NoPathError where the goal that is given lies inside an obstacle."""
@@ -172,18 +183,19 @@ def _stiffer(branch: Branch) -> float:
     return float(np.max(share, initial=1.0))
 
 
-def _write(stage: Stage, name: str, limits: Limits, motion: Way, grasp_model: GraspModel,
-           found: PlannedMotion) -> None:
+def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
+           grasp_model: GraspModel, found: PlannedMotion) -> None:
     from limber.mechanics.frames import surface_fields, write_pc2
     from limber.mechanics.strain import strain_state
     from limber.planning.plan_file import limits_of_motion, plan_text, way_of
 
     names = tuple(target.name for target in grasp_model.branch.targets)
-    baseline, plan = (way_of(path.solved, names,
+    baseline, plan = (way_of(path.solved, names, pace=pace,
                              field_energies=found.field.energy(path.solved.poses[:, :3]))
                       for path in (found.baseline, found.plan))
     stage.path(f"plans/{name}.json").write_text(plan_text(
-        found.summary, baseline, plan, motion, limits_of_motion(motion, limits)), encoding="utf-8")
+        found.summary, baseline, plan, motion, limits_of_motion(motion, limits), pace),
+        encoding="utf-8")
     stage.path(f"plans/{name}.csv").write_text(_table(plan), encoding="utf-8")
     stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
     stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")

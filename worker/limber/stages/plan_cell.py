@@ -10,7 +10,7 @@ from limber.geometry.surface.input import usable_surface
 from limber.geometry.surface.surface import Surface
 from limber.planning.limits import Limits
 from limber.planning.obstacles import Box, Obstacle, Solid, closest
-from limber.planning.plan_file import SPEED, Way
+from limber.planning.plan_file import Way
 from limber.planning.regions import View
 from limber.progress import Progress
 from limber.robot.belonging import check_branch
@@ -84,8 +84,8 @@ def limits_in(cell: Cell, limits: Limits, obstacles: tuple[Obstacle, ...]) -> Li
 
 
 def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obstacle, ...],
-               ) -> dict[str, Any]:
-    """Return how the cell's robot takes the gripper along approach and path.
+               speed: float) -> dict[str, Any]:
+    """Return how the cell's robot takes the gripper along approach and path, at a speed [m/s].
 
     Raises:
         NoPathError: no continuous branch of the inverse kinematics carries it, or the gripper
@@ -93,7 +93,7 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
     """
     there = np.array(motion.phases) != "return"
     found = robot_motion(cell, motion.poses[there], motion.forces[there], axis,
-                         speed=min(SPEED, cell.limits.speed_m_s))
+                         speed=speed)
     base = matrices(np.array(cell.base.pose))
     tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
     flange = base @ matrices(np.vstack([found.approach.poses, found.path.poses])) @ tool
