@@ -1,10 +1,9 @@
 """What a plan is told of how uncertain Young's modulus is."""
 
-import json
-
 import numpy as np
 
 from limber.errors import InputError
+from limber.estimation.estimate_file import read_estimate
 from limber.mechanics.young_field import young_weights
 from limber.planning.chance import YoungDoubt
 from limber.planning.field.grasp_model import GraspModel
@@ -31,15 +30,16 @@ def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> Youn
         raise InputError("--confidence is given, and nothing is estimated.",
                          "How uncertain Young's modulus is comes from `limber estimate`.",
                          "Import a pull and estimate, or leave --confidence away.")
-    found = json.loads(branch.require("estimate.json", "estimate").read_text(encoding="utf-8"))
+    found = read_estimate(branch.require("estimate.json", "estimate"))
     interval = np.array(found["young_interval_pa"], float)
     if not (np.isfinite(interval).all() and (interval > 0.0).all()):
         raise InputError("The estimate has no interval for some control points.",
                          "How uncertain Young's modulus is there is not known.",
                          "Record another pull, or leave --confidence away.")
     points = np.array(found["control_points_m"], float)
-    groups = np.array(found.get("groups") or range(len(points)), int)
-    correlation = np.array(found["correlation"], float)[np.ix_(groups, groups)]
+    covariance = np.array(found["covariance"], float)[np.ix_(found["groups"], found["groups"])]
+    size = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    correlation = np.clip(covariance / np.outer(size, size), -1.0, 1.0)
     weights = young_weights(grasp_model.mesh, points) * np.array(
         found.get("young_mesh_pa") or found["young_pa"], float)
     return YoungDoubt(weights / weights.sum(axis=1, keepdims=True),
