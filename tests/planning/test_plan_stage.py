@@ -14,6 +14,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.compare import PlanSettings
 from limber.planning.field.energy_field import EnergyField, fit_field
 from limber.planning.goals import default_goal
+from limber.planning.plan import _doubts
 from limber.planning.resolve import resolve_path
 from limber.progress import Progress
 from limber.report.plan_figures import report_figures
@@ -188,6 +189,15 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
             name="refused", workers=1)
     assert refused.value.exit_code == 3
     assert not (copied / "plans/refused.json").exists()
+
+
+def test_a_field_too_coarse_for_the_asked_bound_is_told():
+    """With both numbers and what to change; one that is fine enough is not."""
+    summary = {"baseline": {"field_energy_error": 0.1}, "plan": {"field_energy_error": 0.05},
+               "certificate": {"gap_percent": 1.0}}
+    told = _doubts(summary, 3.0)
+    assert len(told) == 1 and "5 %" in told[0] and "over the 3 %" in told[0]
+    assert _doubts(summary, 6.0) == []
 
 
 def test_tip_goal_puts_the_real_tip_there(copied):

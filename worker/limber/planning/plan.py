@@ -122,7 +122,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         summary["confidence"] = {"asked": settings.confidence, "kept_at_least": risks[-1].kept,
                                  "factors": risks[-1].factors,
                                  "of_a_plan_for_the_estimate": risks[0].kept}
-    for message in _doubts(summary, baseline, plan):
+    for message in _doubts(summary, settings.field_error, baseline, plan):
         progress.warn(message)
     return PlannedMotion(summary, baseline, plan, field, {
         name: path.tree for name, path in pair.trees.items()})
@@ -252,13 +252,14 @@ def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
     return measure_path(fine, field.energy(fine), np.linalg.norm(field.force(fine), axis=1))
 
 
-def _doubts(summary: dict[str, Any], *paths: ResolvedPath) -> list[str]:
+def _doubts(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
     doubts = []
-    for key, label in (("baseline", "shortest"), ("plan", "gentle")):
-        error = summary[key]["field_energy_error"]
-        if error > 0.15:
-            doubts.append(f"Along the {label} path the energy field was off by {100 * error:.0f} % "
-                          "of the full model's energy; more samples would help.")
+    for key, label, most in (("baseline", "shortest", 15.0), ("plan", "gentle", field_error)):
+        error = 100.0 * summary[key]["field_energy_error"]
+        if error > most:
+            doubts.append(f"Along the {label} path the energy field was off by {error:.2g} % of "
+                          f"the full model's energy, over the {most:g} % that may be: sample more "
+                          "poses with `limber energy --samples`.")
     gap = summary["certificate"]["gap_percent"]
     if gap is not None and gap > _WIDE_GAP:
         doubts.append(f"The path may be up to {gap:.1f} % dearer than the best possible one; "
