@@ -74,7 +74,7 @@ LAYERS = (
      "optional", "owner", "files", "reading", "plain", "progress", "settings", "terminal"),
     ("jobs",),
     ("store", "geometry"),
-    ("mechanics",),
+    ("mechanics",), ("exports",),
     ("recordings",),
     ("perception",),
     ("estimation", "planning", "robot"),

@@ -1,20 +1,34 @@
 """Skeletons of other programs: SWC trees and cylinder models (QSM) as CSV."""
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from limber.constants import UNIT_METRES
 from limber.errors import InputError
+from limber.geometry.skeleton.cylinder_models import read_treeqsm
 from limber.geometry.skeleton.skeleton import STATES, Skeleton
+
+_ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
+    f"{end}{axis}": f"{end[0]}{axis}" for end in ("start", "end") for axis in "xyz"}}
+"""Names of columns in rTwig and SimpleForest, in small letters and without underscores."""
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read a skeleton: ``.swc``, or a cylinder model ``.csv``; see the two readers."""
+    """Read a skeleton: ``.swc``, or a cylinder model: ``.csv``, or TreeQSM's ``.mat``.
+
+    See :func:`read_swc`, :func:`read_cylinders` and :func:`~.cylinder_models.read_treeqsm`.
+    """
     path = Path(path)
     if path.suffix.lower() == ".csv":
         return read_cylinders(path, scale=1.0 if scale is None else scale)
+    if path.suffix.lower() == ".mat":
+        read = read_treeqsm(path)
+        table = np.column_stack([read["id"], read["parent"], read["start"], read["end"],
+                                 read["radius"]])
+        return _tree_of(path, table, 1.0 if scale is None else scale)
     return read_swc(path, scale=scale)
 
 
@@ -57,7 +71,7 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
 
     A cylinder's end becomes a node that hangs on the end of its parent; the root's start becomes
     the root node. What :func:`write_cylinders` adds (deviations, states, probabilities) is read
-    where it is there.
+    where it is there. The names of rTwig and SimpleForest are known, too.
 
     Args:
         path: The CSV file.
@@ -66,7 +80,9 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
     Raises:
         InputError: columns are missing, a value is no number, or it is not one tree.
     """
-    rows = list(csv.DictReader(_lines(path)))
+    rows = [{_ALIASES.get(name.strip().lower().replace("_", ""), name.strip()): value
+             for name, value in row.items() if name is not None}
+            for row in csv.DictReader(_lines(path))]
     names = ("id", "parent", "sx", "sy", "sz", "ex", "ey", "ez", "radius")
     missing = [name for name in names if not rows or name not in rows[0]]
     if missing:
@@ -78,18 +94,27 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
                          "All nine columns are numbers.", "Correct the file.") from error
+    return _tree_of(path, table, scale, rows)
+
+
+def _tree_of(path: Path, table: np.ndarray, scale: float,
+             rows: Sequence[dict[str, str]] = ()) -> Skeleton:
+    """The skeleton of cylinders: id, parent, start, end and radius, shape [n, 9]."""
     _require_whole(path, table[:, :2])
-    parent = _parents(path, table[:, 0].astype(np.int64), table[:, 1].astype(np.int64))
+    ids, up = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
+    # Some programs count from 1 and give the root the parent 0.
+    parent = _parents(path, ids, np.where((up == 0) & ~(ids == 0).any(), -1, up))
     roots = np.flatnonzero(parent < 0)
     if len(roots) != 1:
         raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
                          "A branch has exactly one root.", "Keep one tree in the file.")
     root = roots[0]
     nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
-    first = _number(path, rows[root].get("start_radius") or rows[root]["radius"])
+    first = _number(path, rows[root].get("start_radius") or rows[root]["radius"]
+                    ) if rows else table[root, 8]
     radius = np.concatenate([[first], table[:, 8]]) * scale
     hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
-    fitted = _fitted_columns(path, rows, scale)
+    fitted = _fitted_columns(path, rows, scale) if rows else {}
     hang, keep = _without_repeats(nodes, hang)
     return Skeleton.from_edges(nodes[keep], hang, radius[keep], **{
         name: np.concatenate([values[root:root + 1], values])[keep]

@@ -1,0 +1,139 @@
+"""Exported branches in the programs they are for, bent and swung against our own elements."""
+
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import eigh
+
+from benchmarks.table import Row
+from limber.exports.abaqus import inp_text
+from limber.exports.mjcf import mjcf_text
+from limber.geometry.generated import generate_branch
+from limber.geometry.reconstruct import mesh_skeleton
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
+from limber.mechanics.rods import rod_tree
+from limber.mechanics.statics.solve import solve_static
+from limber.mechanics.vibration import lowest_modes
+from limber.progress import Progress
+
+_LINKS = 30
+_SHARE = 0.01
+"""Of the main path's length that the tip is bent by, about."""
+
+
+@dataclass(frozen=True)
+class Bent:
+    """What one program says: tip's displacement [m], shape [3], and first frequency [Hz]."""
+
+    tip: np.ndarray
+    frequency: float
+
+
+def rows(seeds: list[int], progress: Progress) -> list[Row]:
+    """Generated branches, weightless and hanging, in MuJoCo; weightless in CalculiX."""
+    found: dict[str, list[tuple[float, float]]] = {}
+    for number, seed in enumerate(seeds):
+        progress(number / len(seeds), f"exports, seed {seed}")
+        branch = generate_branch(seed)
+        mesh = mesh_skeleton(branch.skeleton, ReconstructSettings(), progress).mesh
+        for label, gravity in (("MuJoCo, weightless", None), ("MuJoCo, hanging", (0, 0, -9.81))):
+            model = BranchModel(mesh, young=1e9, poisson=0.35, density=800.0, gravity=gravity)
+            model = model.as_scanned() if gravity else model
+            node, load = _load(model, branch.skeleton)
+            ours = bent_here(model, node, load)
+            theirs = bent_in_mujoco(model, branch.skeleton, mesh.nodes[node], load)
+            if theirs is not None:
+                found.setdefault(label, []).append(_apart(ours, theirs))
+            if gravity is None and (theirs := bent_in_calculix(model, node, load)) is not None:
+                found.setdefault("CalculiX, weightless", []).append(_apart(ours, theirs))
+    return [_row(label, errors) for label, errors in found.items()] or [
+        Row("exports in other programs", "2 %, 2 %", "none is installed", None)]
+
+
+def _row(label: str, errors: list[tuple[float, float]]) -> Row:
+    tip, frequency = np.max(errors, axis=0)
+    return Row(f"export in {label}, worst of {len(errors)}: static tip; first frequency",
+               "2 %; 2 %", f"{100 * tip:.2f} %; {100 * frequency:.2f} %",
+               bool(tip <= 0.02 and frequency <= 0.02))
+
+
+def _apart(ours: Bent, theirs: Bent) -> tuple[float, float]:
+    return (float(np.linalg.norm(theirs.tip - ours.tip) / np.linalg.norm(ours.tip)),
+            abs(theirs.frequency / ours.frequency - 1))
+
+
+def _load(model: BranchModel, skeleton: Skeleton) -> tuple[int, np.ndarray]:
+    """The tip's node and a force across the branch that bends it a little."""
+    path = skeleton.main_path()
+    node = int(np.linalg.norm(model.mesh.nodes - skeleton.nodes[path[-1]], axis=1).argmin())
+    load = np.array([1e-3, 5e-4, 0.0])
+    tip = bent_here(model, node, load).tip
+    length = float(skeleton.arc_length[path[-1]])
+    return node, load * _SHARE * length / float(np.linalg.norm(tip))
+
+
+def bent_here(model: BranchModel, node: int, load: np.ndarray) -> Bent:
+    """Our own quadratic tetrahedra."""
+    forces = np.zeros_like(model.mesh.nodes)
+    forces[node] = load
+    moved = solve_static(model, nodal_forces=forces).require().displacement[node]
+    return Bent(moved, float(lowest_modes(model, 1).frequencies[0]))
+
+
+def bent_in_mujoco(model: BranchModel, skeleton: Skeleton, tip: np.ndarray, load: np.ndarray,
+                   links: int = _LINKS) -> Bent | None:
+    """Links on springs; None where MuJoCo is not installed."""
+    try:
+        import mujoco
+    except ImportError:
+        return None
+    length = float(skeleton.arc_length[skeleton.main_path()[-1]])
+    tree = rod_tree(model, skeleton, length / links)
+    held = mujoco.MjModel.from_xml_string(
+        mjcf_text(tree, DEFAULT_DAMPING, "branch", {"tip": tuple(tip)}))
+    data, site, count = mujoco.MjData(held), held.site("tip").id, held.nv
+    jacobian = np.zeros((3, count))
+
+    def pull(angles: np.ndarray, force: np.ndarray) -> np.ndarray:
+        data.qpos[:], data.qvel[:] = angles, 0.0
+        mujoco.mj_forward(held, data)
+        mujoco.mj_jacSite(held, data, jacobian, None, site)
+        return data.qfrc_passive - data.qfrc_bias + jacobian.T @ force
+
+    nothing, step = np.zeros(3), 1e-6
+    pull(np.zeros(count), nothing)
+    start, mass = data.site_xpos[site].copy(), np.zeros((count, count))
+    mujoco.mj_fullM(held, data, mass)
+    stiffness = np.stack([(pull(-step * one, nothing) - pull(step * one, nothing)) / (2 * step)
+                          for one in np.eye(count)], axis=1)
+    stiffness = (stiffness + stiffness.T) / 2
+    angles = np.zeros(count)
+    for _ in range(50):
+        left = pull(angles, load)
+        if np.abs(left).max() < 1e-12:
+            break
+        angles = angles + np.linalg.solve(stiffness, left)
+    square = float(eigh(stiffness, mass, eigvals_only=True, subset_by_index=[0, 0])[0])
+    return Bent(data.site_xpos[site] - start, np.sqrt(square) / (2 * np.pi))
+
+
+def bent_in_calculix(model: BranchModel, node: int, load: np.ndarray) -> Bent | None:
+    """The same tetrahedra in CalculiX; None where ``ccx`` is not on the PATH."""
+    program = shutil.which("ccx")
+    if program is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "branch.inp").write_text(inp_text(model, "branch", node, load, 1))
+        subprocess.run([program, "branch"], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        lines = Path(folder, "branch.dat").read_text().splitlines()
+    at = next(k for k, line in enumerate(lines) if "displacements" in line)
+    tip = np.array([float(word) for word in lines[at + 2].split()[1:4]])
+    at = next(k for k, line in enumerate(lines) if "E I G E N V A L U E   O U T P U T" in line)
+    row = next(line.split() for line in lines[at + 1:] if line.split()[:1] == ["1"])
+    return Bent(tip, float(row[3]))
