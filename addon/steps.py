@@ -89,6 +89,7 @@ RUN = tuple(dict.fromkeys(view.stage for step in STEPS for view in (step.view, *
 """The stages that the add-on can run."""
 NOT_RUN_HERE = {
     "record": "it moves a robot", "generate": "it makes scans, no branch",
+    "load": "its answer is a table: at a terminal",
     "export": "it writes files for other programs: at a terminal",
     "scene": "`limber.open_result` draws what it says"}
 """The others, and why."""

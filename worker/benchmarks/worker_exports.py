@@ -17,7 +17,7 @@ from limber.geometry.reconstruct import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
-from limber.mechanics.rods import rod_tree
+from limber.mechanics.rods import matched, rod_tree
 from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.vibration import lowest_modes
 from limber.progress import Progress
@@ -94,7 +94,9 @@ def bent_in_mujoco(model: BranchModel, skeleton: Skeleton, tip: np.ndarray, load
     except ImportError:
         return None
     length = float(skeleton.arc_length[skeleton.main_path()[-1]])
-    tree = rod_tree(model, skeleton, length / links)
+    node = int(np.linalg.norm(model.mesh.nodes - tip, axis=1).argmin())
+    tree, factor = matched(rod_tree(model, skeleton, length / links), model, node)
+    print(f"springs scaled by {factor:.3f}")
     held = mujoco.MjModel.from_xml_string(
         mjcf_text(tree, DEFAULT_DAMPING, "branch", {"tip": tuple(tip)}))
     data, site, count = mujoco.MjData(held), held.site("tip").id, held.nv

@@ -63,7 +63,8 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
     """Write a branch in another program's format; the folder stays as it is.
 
     Returns:
-        ``output``, ``format``, and what it holds: ``link_count`` and ``mass_kg``; or
+        ``output``, ``format``, and what it holds: ``link_count``, ``mass_kg`` and
+        ``stiffness_factor``, by which the links' springs were scaled to bend as the mesh does; or
         ``tet_count``, ``node_count`` and ``tip_node``; or ``cylinder_count``.
 
     Raises:
@@ -89,14 +90,16 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
           ) -> tuple[str, dict[str, Any]]:
     from limber.exports.mjcf import mjcf_text
     from limber.exports.urdf import urdf_text
-    from limber.mechanics.rods import rod_tree
+    from limber.mechanics.rods import matched, rod_tree
     from limber.stages.loading import load_branch, load_skeleton, load_targets
 
     skeleton = load_skeleton(branch)
     loaded = load_branch(branch, gravity=settings.gravity, progress=progress)
     path = skeleton.main_path()
     spacing = float(skeleton.arc_length[path[-1]]) / settings.links
-    tree = rod_tree(loaded.model, skeleton, spacing)
+    tip = skeleton.nodes[path[-1]]
+    node = int(np.linalg.norm(loaded.mesh.nodes - tip, axis=1).argmin())
+    tree, factor = matched(rod_tree(loaded.model, skeleton, spacing), loaded.model, node)
     damping = _damping(branch, progress)
     if suffix == ".urdf":
         text = urdf_text(tree, damping, branch.name)
@@ -105,8 +108,9 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
         if loaded.grasp_point is not None:
             sites = {"grasp": loaded.grasp_point, **sites}
         text = mjcf_text(tree, damping, branch.name,
-                         {"tip": tuple(skeleton.nodes[path[-1]]), **sites})
+                         {"tip": tuple(tip), **sites})
     return text, {"link_count": tree.count, "mass_kg": float(tree.mass.sum()),
+                  "stiffness_factor": factor,
                   "damping_stiffness_s": damping.stiffness}
 
 

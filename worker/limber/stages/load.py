@@ -1,0 +1,197 @@
+"""What wind, snow, fruit or a pruning cut does to the branch: sag, strain, frequencies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from limber.errors import InputError, WorkError
+from limber.progress import SILENT, Progress
+from limber.settings import Groups, Settings
+from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.registry import StageDescription
+from limber.store import Branch
+
+if TYPE_CHECKING:
+    from limber.mechanics.outdoors import Bent, LoadedOutdoors
+
+_Place = tuple[float, float, float]
+_Fruit = tuple[float, float, float, float]
+
+
+class LoadSettings(Settings):
+    """What acts beside the weight that the branch had when it was scanned."""
+
+    groups: ClassVar[Groups] = {
+        "loads": ("wind", "drag", "snow", "fruit", "cut"),
+        "limits": ("strain_limit", "limit_load", "most")}
+
+    wind: tuple[float, float, float] | None = Field(
+        None, description="Velocity of the wind, branch frame [m/s].",
+        json_schema_extra={"metavar": "X Y Z"})
+    drag: float = Field(1.1, gt=0, le=5, description="Drag coefficient of a round branch across "
+                        "the wind; leaves are not in it.")
+    snow: float = Field(0.0, ge=0, le=1000, description="Snow on the branch's shadow as seen "
+                        "from above [kg/m^2].")
+    fruit: tuple[_Fruit, ...] = Field(
+        (), description="A fruit: place on the branch [m] and mass [kg]; may be given again.",
+        json_schema_extra={"metavar": "X Y Z KG"})
+    cut: tuple[_Place, ...] = Field(
+        (), description="Cut the branch off here [m]; may be given again.",
+        json_schema_extra={"metavar": "X Y Z"})
+    strain_limit: float = Field(
+        0.01, gt=0, lt=1, description="Strain at which the wood is taken to fail.")
+    limit_load: bool = Field(
+        False, description="Also find how many times these loads the branch bears.")
+    most: float = Field(50.0, gt=1, le=1e4, description="Largest number of times that is tried.")
+
+
+def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -> dict[str, Any]:
+    """Bring the branch to rest under loads; writes nothing.
+
+    Returns:
+        ``tip_displacement_m`` [3] and ``sag_m`` (its way along gravity) with ``sag_interval_m``;
+        ``greatest_strain``, ``strain_over_limit``, ``along``: the greatest strain in ten parts of
+        the main path; ``frequencies_hz`` and ``first_frequency_interval_hz``,
+        ``frequencies_before_hz``; ``wind_force_n``, ``added_mass_kg``, ``cut_mass_kg``; with
+        ``limit_load`` ``bears_times`` and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``).
+        Intervals are None where nothing has told how sure the moduli are.
+
+    Raises:
+        InputError: no load, or one off the branch. WorkError: it finds no rest under it.
+    """
+    from limber.mechanics.added import PointMass
+    from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
+    from limber.mechanics.vibration import lowest_modes
+    from limber.stages.loading import load_branch, load_skeleton
+
+    if not (settings.wind or settings.snow or settings.fruit or settings.cut):
+        raise InputError("No load is given.", "Its own weight has bent the scanned branch already.",
+                         "Give --wind, --snow, --fruit or --cut.")
+    if any(not one[3] > 0 for one in settings.fruit):
+        raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
+    branch = Branch.open(folder)
+    skeleton = load_skeleton(branch)
+    hanging = load_branch(branch, progress=progress).model
+    _require_near(hanging.mesh.nodes, [one[:3] for one in settings.fruit])
+    loads = Outdoors(settings.wind or (0.0, 0.0, 0.0), settings.drag, settings.snow, tuple(
+        PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
+    outdoors = LoadedOutdoors(hanging, skeleton, loads)
+    progress(0.2, "rest under the loads")
+    bent = _at_rest(outdoors)
+    tip = _tip(outdoors, hanging.mesh.nodes)
+    down = hanging.gravity / max(float(np.linalg.norm(hanging.gravity)), 1e-300)
+    moved = bent.displacement[tip]
+    progress(0.5, "interval")
+    spread = _deviation(branch)
+    intervals = _intervals(outdoors, spread, tip, down)
+    result = {
+        "tip_displacement_m": moved, "sag_m": float(moved @ down),
+        "greatest_strain": float(bent.strains.max()),
+        "strain_over_limit": float(bent.strains.max() / settings.strain_limit),
+        "along": outdoors.along(bent.strains), "frequencies_hz": bent.frequencies,
+        "frequencies_before_hz": lowest_modes(hanging, len(bent.frequencies)).frequencies,
+        "wind_force_n": outdoors.wind_force, "cut_mass_kg": outdoors.cut_mass,
+        "added_mass_kg": outdoors.added_mass, "young_deviation": spread, **intervals}
+    if settings.limit_load:
+        progress(0.7, "limit load")
+        result |= _limit(outdoors, settings, progress.part(0.7, 1.0))
+    return result
+
+
+def _at_rest(outdoors: LoadedOutdoors) -> Bent:
+    found = outdoors.rest()
+    if not found.converged:
+        raise WorkError(f"The branch finds no rest under these loads ({found.message}).",
+                        f"It followed {100 * found.reached:.0f} % of them.",
+                        "They may be more than it can carry: see --limit-load with smaller ones.")
+    return outdoors.bent(found)
+
+
+def _tip(outdoors: LoadedOutdoors, nodes: np.ndarray) -> int:
+    """The node at the outermost place of the main path that is left."""
+    path = [node for node in outdoors.skeleton.main_path() if not outdoors.gone[node]]
+    return int(np.linalg.norm(nodes - outdoors.skeleton.nodes[path[-1]], axis=1).argmin())
+
+
+def _require_near(nodes: np.ndarray, places: list[_Place]) -> None:
+    for place in places:
+        distance = float(np.linalg.norm(nodes - np.array(place), axis=1).min())
+        if not distance < 0.1:
+            raise InputError(f"A fruit at {place} m is {distance:.3g} m off the branch.",
+                             "It hangs on the branch.", "Check frame and unit.")
+
+
+def _deviation(branch: Branch) -> float | None:
+    """Standard deviation of log E that the last estimate or swing left, taken as one for all."""
+    if not branch.has("estimate.json"):
+        return None
+    from limber.estimation.estimate_file import read_estimate
+
+    known = read_estimate(branch.path("estimate.json"))
+    total = [value for value in (known.get("young_deviation") or {}).get("total") or []
+             if value is not None]
+    return float(np.mean(total)) if total else None
+
+
+def _intervals(outdoors: LoadedOutdoors, deviation: float | None, tip: int, down: np.ndarray,
+               ) -> dict[str, Any]:
+    """95 % intervals: the branch softer and stiffer throughout, which is the widest."""
+    none: dict[str, Any] = {"sag_interval_m": None, "first_frequency_interval_hz": None}
+    if deviation is None:
+        return none
+    sags, firsts = [], []
+    for sign in (-1.96, 1.96):
+        other = outdoors.with_young(float(np.exp(sign * deviation)))
+        found = other.rest()
+        if not found.converged:
+            return none
+        bent = other.bent(found)
+        sags.append(float(bent.displacement[tip] @ down))
+        firsts.append(float(bent.frequencies[0]))
+    return {"sag_interval_m": sorted(sags), "first_frequency_interval_hz": sorted(firsts)}
+
+
+def _limit(outdoors: LoadedOutdoors, settings: LoadSettings, progress: Progress,
+           ) -> dict[str, Any]:
+    """Bisect the share of the loads at which the wood fails or no rest is found."""
+    def trouble(share: float) -> str:
+        found = outdoors.rest(share)
+        if not found.converged:
+            return "equilibrium"
+        return "strain" if outdoors.greatest_strain(found) > settings.strain_limit else ""
+    low, high, why = 0.0, 1.0, ""
+    while not (why := trouble(high)) and high < settings.most:
+        low, high = high, min(2 * high, settings.most)
+    if not why:
+        return {"bears_times": settings.most, "held_by": "nothing"}
+    for number in range(8):
+        progress(number / 8, "limit load")
+        middle = (low + high) / 2
+        if found := trouble(middle):
+            high, why = middle, found
+        else:
+            low = middle
+    return {"bears_times": low, "held_by": why}
+
+
+def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    limit = result["strain_over_limit"] / max(result["greatest_strain"], 1e-300)
+    return [("Greatest strain along the main path", [
+        ["from [m]", "to [m]", "strain", "of the limit"],
+        *([f"{row['from_m']:.3f}", f"{row['to_m']:.3f}", f"{row['strain']:.5f}",
+           f"{100 * limit * row['strain']:.0f} %"] for row in result["along"])])]
+
+
+def run(inputs: BranchInputs, settings: LoadSettings, _options: NoOptions,
+        progress: Progress) -> dict[str, Any]:
+    """Run the stage."""
+    return load(inputs.branch_folder, settings, progress=progress)
+
+
+STAGE = StageDescription(
+    "load", 45, run, BranchInputs, LoadSettings, NoOptions, reads=("mesh.vtu", "skeleton.swc"),
+    tables=_tables)
