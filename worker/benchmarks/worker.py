@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 
 from benchmarks.table import Row
+from benchmarks.worker_batches import killed, memory, speed_up
+from benchmarks.worker_exports import rows as exported
 from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_readers import READERS
 from limber.progress import Progress
@@ -18,12 +20,16 @@ TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 
 def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    """Measure; ``quick`` gives each reader 20 mutated files instead of 200."""
+    """Measure; ``quick`` takes a tenth of the files, branches and jobs."""
     table = _start_up()
-    progress(0.05, "mutated files")
+    table += exported([seed + k for k in range(2 if quick else 5)], progress.part(0.02, 0.1))
+    progress(0.1, "mutated files")
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         keep = (out or Path(place)) / "harmful"
-        table += _fuzzed(20 if quick else 200, seed, keep, progress.part(0.05, 1.0))
+        table += _fuzzed(20 if quick else 200, seed, keep, progress.part(0.1, 0.5))
+    table.append(memory(30 if quick else 100, TEMPLATE, progress.part(0.5, 0.6)))
+    table.append(killed(3 if quick else 30, 2 if quick else 4, seed, progress.part(0.6, 0.8)))
+    table.append(speed_up(4 if quick else 40, seed, progress.part(0.8, 1.0)))
     return table
 
 

@@ -1,0 +1,148 @@
+"""Batches: two cores against one, kills at random moments, memory over many jobs."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.table import Row
+from limber.batch.job_file import StageTask
+from limber.batch.task import run_task
+from limber.jobs import Pool
+from limber.progress import SILENT, Progress
+from limber.stages.generate import GenerateInputs, GenerateSettings
+from limber.stages.registry import stage_description
+
+_STAGES = '[[job.stage]]\nrun = "reconstruct"\n'
+_ESTIMATE = ('[[job.stage]]\nrun = "virtual-pull"\nname = "pull-1"\n'
+             '[[job.stage]]\nrun = "estimate"\n')
+
+
+def speed_up(count: int, seed: int, progress: Progress) -> Row:
+    """``count`` branches, reconstruct and estimate, with one and with two workers."""
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        folder = Path(place)
+        _scans(folder, count, seed)
+        seconds = []
+        for workers in (1, 2):
+            progress(0.5 * (workers - 1), f"{workers} worker(s)")
+            jobs = _jobs(folder, f"by-{workers}", _STAGES + _ESTIMATE)
+            started = time.perf_counter()
+            _batch(jobs, workers).wait()
+            seconds.append(time.perf_counter() - started)
+    times = seconds[0] / seconds[1]
+    return Row(f"{count} generated branches, reconstruct and estimate: two workers against one",
+               "1.8 times", f"{times:.2f} times ({seconds[0]:.0f} s, {seconds[1]:.0f} s)",
+               times >= 1.8)
+
+
+def killed(kills: int, branches: int, seed: int, progress: Progress) -> Row:
+    """Kill -9 of the batch and all its workers at random moments, then let it end."""
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        folder = Path(place)
+        _scans(folder, branches, seed)
+        undisturbed = _jobs(folder, "undisturbed", _STAGES)
+        started = time.perf_counter()
+        code = _batch(undisturbed, 1).wait()
+        whole = time.perf_counter() - started
+        jobs = _jobs(folder, "killed", _STAGES)
+        redone, kept = 0, {}
+        for number in range(kills):
+            progress(number / kills, f"kill {number + 1} of {kills}")
+            process = _batch(jobs, 1)
+            time.sleep(float(rng.uniform(0.5, 0.8 * whole)))
+            _kill(process)
+            now = _finished(folder / "killed")
+            redone += sum(now.get(key) != value for key, value in kept.items())
+            kept = now
+        code = code or _batch(jobs, 1).wait()
+        now = _finished(folder / "killed")
+        redone += sum(now.get(key) != value for key, value in kept.items())
+        same = _digests(folder / "undisturbed") == _digests(folder / "killed")
+    told = (f"{'identical' if same else 'DIFFERENT'} files, {redone} stages redone, exit {code}; "
+            f"{kills} kills, {branches} branches")
+    return Row("kill -9 of batch and workers at random moments (30 asked)",
+               "identical, nothing stored redone", told, same and redone == 0 and code == 0)
+
+
+def memory(jobs: int, template: Path, progress: Progress) -> Row:
+    """Memory of one worker over many jobs, after the tenth."""
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place, \
+            Pool(1, name="a job of the bench") as pool:
+        folder = Path(shutil.copytree(template, Path(place, "a.branch")))
+        stage = stage_description("load")
+        used = []
+        for number in range(jobs):
+            progress(number / jobs, f"job {number + 1}")
+            task = StageTask("load", stage.inputs(branch_folder=folder), stage.settings(
+                wind=(3.0 + 0.01 * number, 0.0, 0.0)), stage.options())
+            outcome = pool.submit(run_task, task, folder).result()
+            if outcome["error"]:
+                return Row("memory over jobs in one worker", "under 5 %", outcome["error"], None)
+            used.append(outcome["memory_mb"])
+    grown = float(np.median(used[-5:]) / np.median(used[9:14]) - 1)
+    return Row(f"memory over {jobs} jobs in one worker, after the tenth", "under 5 %",
+               f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05)
+
+
+def _scans(folder: Path, count: int, seed: int) -> None:
+    for number in range(count):
+        made = folder / f"made-{number}"
+        settings = GenerateSettings(seed=seed % 10_000 + number)
+        stage_description("generate").run(GenerateInputs(folder=made), settings, None, SILENT)
+        (made / "cloud.ply").rename(folder / f"scan-{number}.ply")
+
+
+def _jobs(folder: Path, name: str, stages: str) -> Path:
+    path = folder / f"{name}.toml"
+    path.write_text(f'out = "{name}"\n[[job]]\nscans = ["scan-*.ply"]\n{stages}')
+    return path
+
+
+def _batch(jobs: Path, workers: int) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "limber", "batch", str(jobs), "--workers", str(workers)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        env=os.environ | {"LIMBER_CORES": str(workers)})
+
+
+def _kill(process: subprocess.Popen) -> None:
+    import psutil
+
+    try:
+        family = psutil.Process(process.pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        family = []
+    for one in (process.pid, *(child.pid for child in family)):
+        try:
+            os.kill(one, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+    process.wait()
+
+
+def _manifests(out: Path) -> dict[str, dict]:
+    found = {}
+    for path in sorted(out.glob("*.branch/branch.json")):
+        found[path.parent.name] = json.loads(path.read_text())
+    return found
+
+
+def _finished(out: Path) -> dict[tuple[str, str], str]:
+    """When each stored stage was made."""
+    return {(branch, key): f"{entry['finished']} {entry['seconds']}"
+            for branch, manifest in _manifests(out).items()
+            for key, entry in manifest["stages"].items()}
+
+
+def _digests(out: Path) -> dict[tuple[str, str], str]:
+    return {(branch, name): entry["sha256"] for branch, manifest in _manifests(out).items()
+            for name, entry in manifest["files"].items()}
