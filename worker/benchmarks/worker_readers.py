@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.errors import InputError
 from limber.files import file_digest
 from limber.store import Branch
 
@@ -459,6 +460,51 @@ _TARGETS = {"format_version": 1, "targets": [
     {"name": "fruit", "position_m": [0.0, 0.0, 0.3], "mass_kg": 0.1}]}
 
 
+def _cylinder_models(suffix: str, template: Path, folder: Path) -> list[Path]:
+    from limber.stages.export import ExportSettings, export
+
+    files = [folder / f"tree{suffix}"]
+    export(template, files[0], ExportSettings())
+    return files
+
+
+def _skeleton(_template: Path, path: Path) -> Any:
+    from limber.geometry.skeleton.files import read_skeleton
+
+    return read_skeleton(path)
+
+
+@cache
+def _addon(name: str) -> Any:
+    """A module of the add-on that needs no Blender."""
+    import importlib.util
+    import sys
+
+    place = Path(__file__).parents[2] / "addon" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"addon_{name}", place)
+    sys.modules[spec.name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def _addon_read(module: str, function: str, _template: Path, path: Path) -> Any:
+    """What the add-on reads; its own word for a refusal is ValueError."""
+    try:
+        return getattr(_addon(module), function)(path)
+    except ValueError as error:
+        if type(error) is not ValueError and not type(error).__name__.endswith("DataError"):
+            raise
+        raise InputError(str(error)) from error
+
+
+def _scene_file(template: Path, folder: Path) -> list[Path]:
+    from limber.scene.data import scene_data
+
+    path = folder / "scene.npz"
+    scene_data(Branch.open(template)).write(path)
+    return [path]
+
+
 def _branch_file(name: str, kind: str, act: Callable[[Branch], Any], make: Any = None,
                  may_lack: bool = False) -> Reader:
     return Reader(kind, make or partial(_template_file, name), partial(_in_folder, name, act),
@@ -484,6 +530,13 @@ READERS: dict[str, Reader] = {
     "tables CSV": Reader("text", _tables, _table, True),
     "nominal CSV": Reader("text", _nominal, _read_nominal),
     "calipers CSV": Reader("text", _calipers, _read_calipers),
+    "MAT": Reader("binary", partial(_cylinder_models, ".mat"), _skeleton),
+    "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), _skeleton),
+    "add-on clouds": Reader("binary", lambda template, folder: [
+        *_ply(template, folder), *_texts(template, folder)],
+        partial(_addon_read, "clouds", "read_points")),
+    "add-on scene data": Reader("npz", _scene_file, partial(
+        _addon_read, "scene_data", "read_scene_data"), True),
     "edits JSON": Reader("json", _edits, _read_edits),
     "job TOML": Reader("text", _jobs, _read_jobs),
     "cell TOML": Reader("text", _cell, _read_cell),
