@@ -191,6 +191,27 @@ def test_no_file_imports_itself_in_a_circle():
     graphlib.TopologicalSorter(core_imports()).prepare()
 
 
+# Lines between processes of ours, and lines that a killed program may have left half written.
+OWN_LINES = {"robot", "session", "jobs", "batch.records", "store.lock", "estimation.evaluations",
+             "geometry.tets.tetwild_process"}
+
+
+def test_files_come_in_through_one_door():
+    """JSON, TOML and arrays are read by limber.reading, which checks them, and nowhere else."""
+    doors = ("json.loads", "json.load", "tomllib.loads", "tomllib.load", "np.load",
+             "np.genfromtxt", "np.fromfile", "pickle.load")
+    wrong = []
+    for path in CORE.rglob("*.py"):
+        module = ".".join(path.relative_to(CORE).with_suffix("").parts)
+        if module == "reading" or any(
+                module == name or module.startswith(name + ".") for name in OWN_LINES):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in doors:
+                wrong.append(f"limber.{module}, line {node.lineno}: {ast.unparse(node.func)}")
+    assert not wrong
+
+
 def test_numerical_packages_know_no_branch_folder():
     """They take and return values: only stages, and what stands above, open a branch folder."""
     wrong = {module for module, imported in core_imports().items()

@@ -59,24 +59,26 @@ class EvaluationLog:
             self._path.unlink(missing_ok=True)
 
     def _resume(self) -> None:
-        lines = (self._path.read_text(encoding="utf-8").splitlines()
+        lines = (self._path.read_text(encoding="utf-8", errors="replace").splitlines()
                  if self._path.exists() else [])
         header = _parsed(lines[0]) if lines else None
         if header is None or header.get("problem") != self._problem:
             self._path.write_text(json.dumps({"problem": self._problem}) + "\n", encoding="utf-8")
             return
         for line in lines[1:]:
-            record = _parsed(line)
-            if record is not None:
+            record = _parsed(line) or {}
+            try:
                 entry = EvaluationEntry(**(record | {"parameters": tuple(record["parameters"])}))
                 self._known[_key(np.array(entry.parameters))] = entry
+            except (KeyError, TypeError, ValueError):
+                continue  # a damaged line: that evaluation is done again
         self.resumed_count = len(self._known)
 
 
 def _parsed(line: str) -> dict | None:
     try:
         record = json.loads(line)
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):
         # The line that was being written when the process was killed.
         return None
     return record if isinstance(record, dict) else None

@@ -259,8 +259,6 @@ def _nearest(listed: list[tuple[float, Path]], wanted: float, stamps: list[float
 
 
 def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
-    from PIL import Image
-
     from limber.recordings.masks import YoloSegmenter
 
     images = _listed(source, "rgb", settings)
@@ -275,8 +273,8 @@ def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
         if file is None:
             masks.append(None)
             continue
-        with Image.open(file) as image:
-            masks.append(segment(np.asarray(image.convert("RGB"))))
+        pixels = read_pixels(file, "a colour image")
+        masks.append(segment(pixels[..., :3] if pixels.ndim == 3 else np.stack([pixels] * 3, -1)))
     return masks
 
 
