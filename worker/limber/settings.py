@@ -38,12 +38,15 @@ class Settings(BaseModel):
         groups: Title to the names of the fields that stand under it; a model that inherits adds
             to those of its bases.
         experts: Fields that only ``--help-all`` shows.
+        results_version: Raised where the same settings on the same input give other results than
+            before: branches then count as out of date, and a batch runs the stage again.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     groups: ClassVar[Groups] = {}
     experts: ClassVar[tuple[str, ...]] = ()
+    results_version: ClassVar[int] = 1
 
     @classmethod
     def group_of(cls, name: str) -> str:

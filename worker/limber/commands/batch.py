@@ -12,9 +12,11 @@ from limber.cli import Run, stage_command
 @click.argument("job_file", type=click.Path(path_type=Path), metavar="JOBS.toml")
 @click.option("--dry-run", is_flag=True, help="Only check the file and say what would run.")
 @click.option("--retry-failed", is_flag=True, help="Run again also what has failed before.")
+@click.option("--emit", type=click.Choice(["slurm", "snakemake"]), help=(
+    "Run nothing; write a Slurm array job, a task a branch, or a Snakefile, for a cluster."))
 @click.option("--workers", type=click.IntRange(min=1), help=(
     "At most so many branches side by side; by default as the file says, or one a core."))
-def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool,
+def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: str | None,
             workers: int | None) -> dict[str, Any]:
     """Run stages on many branches, side by side.
 
@@ -47,6 +49,10 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool,
     from limber.errors import WorkError
 
     jobs = read_jobs(job_file)
+    if emit is not None:
+        from limber.batch.emit import write_script
+
+        return {"branch_count": len(jobs.branches), "script": write_script(jobs, emit)}
     records = Records(jobs)
     if dry_run:
         planned = plan_of(jobs, records, retry_failed=retry_failed)

@@ -38,17 +38,7 @@ PARTS = [
 @click.option("--warm", is_flag=True, help="Compile the solver's kernels now, not at first use.")
 def command(run: Run, warm: bool) -> dict[str, Any]:
     """What is installed, what is missing and what then does not work."""
-    parts = {}
-    missing = []
-    for module, distribution, cost in PARTS:
-        present = importlib.util.find_spec(module) is not None
-        parts[module] = _version(distribution) if present else f"missing: {cost}"
-        if not present:
-            missing.append(module)
-    result: dict[str, Any] = {
-        "python": platform.python_version(), "system": platform.platform(),
-        "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
-    }
+    result = report()
     if warm:
         from limber.geometry.warm_up import warm_up as warm_geometry
         from limber.mechanics.warm_up import warm_up as warm_mechanics
@@ -58,6 +48,21 @@ def command(run: Run, warm: bool) -> dict[str, Any]:
         warm_mechanics(run.progress.part(0.1, 0.5))
         warm_planning(run.progress.part(0.5, 1.0))
     return result
+
+
+def report() -> dict[str, Any]:
+    """Return what is installed and what is missing."""
+    parts = {}
+    missing = []
+    for module, distribution, cost in PARTS:
+        present = importlib.util.find_spec(module) is not None
+        parts[module] = _version(distribution) if present else f"missing: {cost}"
+        if not present:
+            missing.append(module)
+    return {
+        "python": platform.python_version(), "system": platform.platform(),
+        "cores": os.cpu_count(), "blender": _blender(), "packages": parts, "missing": missing,
+    }
 
 
 def _version(distribution: str) -> str:

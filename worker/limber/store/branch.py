@@ -25,7 +25,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from limber.constants import GRAVITY
-from limber.errors import BranchFolderError
+from limber.errors import BranchFolderError, WorkError
 from limber.files import file_digest, flush_folder, write_atomically
 from limber.owner import is_owned_name, owned_name, sweep, sweep_beside
 from limber.plain import plain
@@ -44,6 +44,10 @@ from limber.store.streams import Stream
 from limber.store.verify import Checker, Damage, damage_error
 
 _STREAMS = ".streams"
+RESULTS = "results"
+"""Among a stage's programs: the version of its settings' results; see limber.settings."""
+LEAST_FREE_BYTES = 200e6
+"""A stage does not begin with less room on the disk: it would lose its work at the end."""
 
 
 class Stage:
@@ -212,10 +216,12 @@ class Branch:
 
         Raises:
             BranchFolderError: another program holds it; says who and since when.
+            WorkError: the disk is nearly full.
         """
         with run_lock(self.folder, purpose) as is_first:
             if is_first:
                 sweep(self.folder)
+                _require_room(self.folder, purpose)
             yield
 
     def stream(self, name: str) -> Stream:
@@ -245,7 +251,8 @@ class Branch:
         intact = all(name in self.manifest.files
                      and not self._checker.trouble(name, self.manifest.files[name])
                      for name in entry.writes if self._owner(name) == key)
-        return intact and entry.reads == wanted and entry.settings == plain(settings or {})
+        return (intact and entry.reads == wanted and entry.settings == plain(settings or {})
+                and entry.programs.get(RESULTS, "1") == _results_version(settings))
 
     @contextmanager
     def stage(self, key: str, settings: BaseModel | Mapping[str, Any] | None = None, *,
@@ -269,7 +276,8 @@ class Branch:
                 yield stage
                 entry = StageEntry(
                     settings=plain(settings or {}), reads=read, writes=stage.written(),
-                    result=plain(stage.result), programs=program_versions(),
+                    result=plain(stage.result),
+                    programs=program_versions() | _told_version(settings),
                     seconds=round(time.perf_counter() - started, 3),
                     finished=datetime.now(UTC).isoformat(timespec="seconds"))
                 self._commit(key, entry, stage, work)
@@ -344,6 +352,24 @@ def _finish_pending(folder: Path) -> None:
     if journal.is_pending(folder):
         with commit_lock(folder):
             journal.roll_forward(folder)
+
+
+def _results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
+    return str(getattr(type(settings), "results_version", 1))
+
+
+def _told_version(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
+    version = _results_version(settings)
+    return {} if version == "1" else {RESULTS: version}
+
+
+def _require_room(folder: Path, purpose: str) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < LEAST_FREE_BYTES:
+        raise WorkError(f"The disk of {folder} has {free / 1e6:.0f} MB left.",
+                        f"For {purpose} {LEAST_FREE_BYTES / 1e6:.0f} MB are wanted: it would end "
+                        "without its results.",
+                        "Make room (`limber cache --clear` frees some), or move the folder.")
 
 
 def _is_litter(name: str) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from limber.caches import TETRAHEDRA_BYTES, cache_folder, trim
 from limber.errors import InputError, MeshingError, MissingDependencyError
 from limber.geometry.settings import MeshSettings
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -178,13 +179,11 @@ def _largest_piece(mesh: TetMesh) -> TetMesh:
 
 
 def _cache_place(surface: Surface, *numbers: float) -> Path:
-    import platformdirs
-
     digest = hashlib.sha256()
     for array in (surface.vertices, surface.faces.astype(np.int64),
                   np.array([_CACHE_VERSION, *map(float, numbers)])):
         digest.update(np.ascontiguousarray(array).tobytes())
-    return Path(platformdirs.user_cache_dir("limber"), "tetrahedra", f"{digest.hexdigest()}.npz")
+    return cache_folder() / "tetrahedra" / f"{digest.hexdigest()}.npz"
 
 
 def _from_cache(place: Path) -> tuple[np.ndarray, np.ndarray] | None:
@@ -202,5 +201,6 @@ def _to_cache(place: Path, nodes: np.ndarray, tets: np.ndarray) -> None:
         part = place.with_name(f".{os.getpid()}-{place.name}")
         np.savez(part, nodes=nodes, tets=tets)
         os.replace(part, place)
+        trim(place.parent, TETRAHEDRA_BYTES)
     except OSError:
         return  # a cache that cannot be written costs time, not results

@@ -1,0 +1,69 @@
+"""What Limber keeps beside branch folders to be quicker the next time; any of it may go."""
+
+import contextlib
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import platformdirs
+
+TETRAHEDRA_BYTES = 1 << 30
+"""How much fTetWild's meshes may take."""
+
+
+@dataclass(frozen=True)
+class Cache:
+    """One folder of the cache: what it holds, how many files, how many bytes."""
+
+    name: str
+    folder: Path
+    file_count: int
+    byte_count: int
+
+
+def cache_folder() -> Path:
+    """Return the folder of all caches of this user."""
+    return Path(platformdirs.user_cache_dir("limber"))
+
+
+def known_caches() -> list[Cache]:
+    """Return the caches there are, by name."""
+    folder = cache_folder()
+    if not folder.is_dir():
+        return []
+    found = []
+    for place in sorted(path for path in folder.iterdir() if path.is_dir()):
+        sizes = [size for _, size, _ in _files(place)]
+        found.append(Cache(place.name, place, len(sizes), sum(sizes)))
+    return found
+
+
+def trim(folder: Path, most_bytes: float) -> int:
+    """Remove the files used longest ago until those of ``folder`` take ``most_bytes`` at most.
+
+    Returns:
+        Bytes that were set free. What another program holds open or removes meanwhile is passed
+        over.
+    """
+    files = _files(folder)
+    total, freed = sum(size for _, size, _ in files), 0
+    for _, size, path in sorted(files):
+        if total - freed <= most_bytes:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+            freed += size
+    return freed
+
+
+def _files(folder: Path) -> list[tuple[float, int, Path]]:
+    """Time of last use, size and path of each file; locks, which are empty, are left alone."""
+    found = []
+    for place, _folders, names in os.walk(folder):
+        for name in names:
+            path = Path(place, name)
+            with contextlib.suppress(OSError):
+                about = path.stat()
+                if path.suffix != ".lock":
+                    found.append((max(about.st_mtime, about.st_atime), about.st_size, path))
+    return found
