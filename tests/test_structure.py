@@ -83,7 +83,8 @@ LAYERS = (
     ("session",),
     ("report", "scene"),
     ("stages",),
-    ("options", "batch"),
+    ("options",),
+    ("batch",),
     ("cli",),
     ("commands", "__main__"),
 )
