@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import EDGES, FACES, TetMesh
+from limber.geometry.tets.tree_sweep import sweep_tree
 
 
 @pytest.fixture
@@ -89,3 +91,16 @@ def test_unreadable_file(tmp_path, content: bytes):
     (tmp_path / "bad.vtu").write_bytes(content)
     with pytest.raises(InputError, match=r"bad\.vtu"):
         TetMesh.read(tmp_path / "bad.vtu")
+
+
+def test_a_twig_that_starts_in_a_hook_is_joined() -> None:
+    """Its first node lies on the other side of the carrier: led straight, it is in the mesh."""
+    carrier = np.stack([0 * np.arange(40.0), 0 * np.arange(40.0), 5 * np.arange(40)], axis=1)
+    way = np.array([-np.sin(np.pi / 3), 0, np.cos(np.pi / 3)])
+    twig = np.vstack([[8, 0, 0], [8, 0, 0] + np.outer(5 * np.arange(1, 15), way)])
+    nodes = 1e-3 * np.vstack([carrier, carrier[20] + twig])
+    parent = np.concatenate([np.arange(40) - 1, [20], 40 + np.arange(len(twig) - 1)])
+    swept = sweep_tree(Skeleton.from_edges(nodes, parent, np.full(len(nodes), 5e-3)))
+    assert swept.left_out == []
+    assert swept.mesh.volumes.min() > 0
+    assert swept.mesh.nodes[:, 0].min() < -0.03

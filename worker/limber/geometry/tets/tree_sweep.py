@@ -25,6 +25,7 @@ _CLAMP_SLICES = (1.0, 3.0)  # where the first slices end, in radii of the root
 _TAPERED, _THINNEST = 2.5, 0.06  # radius ratio from which rings are graded; down to which
 _STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # where a twig's first ring is tried, and how far it leans
 _NEAR = 2.5  # radii beyond the first place that will do, within which the best one is taken
+_STRAIGHTENED = (0.0, 3.0, 6.0, 12.0)  # radii of a twig's start that may be led straight
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
 
@@ -77,6 +78,14 @@ class _Axis:
     @property
     def length(self) -> float:
         return float(self.along[-1])
+
+    def straight_until(self, reach: float) -> "_Axis":
+        """The axis without its bends up to ``reach`` [m] from its start."""
+        kept = self.along >= min(reach, 0.5 * self.length)
+        kept[0] = True
+        points = self.points[kept]
+        step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        return _Axis(points, self.radius[kept], np.concatenate([[0], np.cumsum(step)]))
 
     def at(self, where: np.ndarray | float) -> np.ndarray:
         return np.stack([np.interp(where, self.along, self.points[:, k]) for k in range(3)],
@@ -136,10 +145,15 @@ class _TreeSweep:
         if carrier is None or run not in carrier.windows:
             self._left_out.append(run)
             return
-        for patch in self._patches(carrier, run):
-            if self._grow(carrier, run, patch):
-                carrier.taken |= {(patch.slice, side) for side in patch.faces}
-                return
+        axis = self._axes[run]
+        for reach in _STRAIGHTENED:
+            # A twig that starts along its carrier's side, or in a hook, is led out of it straight.
+            self._axes[run] = axis.straight_until(reach * float(axis.radius[0]))
+            for patch in self._patches(carrier, run):
+                if self._grow(carrier, run, patch):
+                    carrier.taken |= {(patch.slice, side) for side in patch.faces}
+                    return
+        self._axes[run] = axis
         self._left_out.append(run)
 
     def _sweep(self, run: int, start: float, sides: int, first_normal: np.ndarray | None,
