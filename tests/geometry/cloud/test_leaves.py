@@ -7,7 +7,7 @@ import pytest
 
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.files import read_cloud
-from limber.geometry.cloud.leaves import find_leaves
+from limber.geometry.cloud.leaves import _with_rims, find_leaves
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import ReconstructSettings
 from limber.stages.loading import load_point_masses
@@ -55,6 +55,20 @@ def test_leaves_are_told_from_stems(seedling) -> None:
     assert found[on_leaf].mean() > 0.97 and found[~on_leaf].mean() < 0.2
     assert len(branch.skeleton.tips()) <= len(leaves) <= len(branch.skeleton.tips()) + 2
     assert sum(leaf.area for leaf in leaves) == pytest.approx(area, rel=0.3)
+
+
+def test_rims_of_leaves_go_with_them_and_stems_stay() -> None:
+    """A strip along a sheet's side is its rim; a stem that touches it with its end is none."""
+    rng = np.random.default_rng(5)
+    sheet = np.column_stack([rng.uniform(0, 0.04, 3000), rng.uniform(0, 0.03, 3000), 0 * rng.random(
+        3000)])
+    rim = np.column_stack([rng.uniform(0, 0.04, 80), 0.031 + 0 * rng.random(80),
+                           rng.uniform(0, 1e-3, 80)])
+    stem = np.column_stack([rng.uniform(-0.1, 0, 900), np.full(900, 0.015),
+                            rng.normal(0, 1e-3, 900)])
+    on_leaf = np.arange(3980) < 3000
+    found = _with_rims(np.vstack([sheet, rim, stem]), on_leaf, 0.003)
+    assert found[:3080].all() and not found[3080:].any()
 
 
 def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> None:

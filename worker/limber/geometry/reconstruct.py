@@ -155,7 +155,8 @@ def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: Reconstru
     taken is asked too. A depth camera's scatter alone does that without a leaf; 3 mm of noise on
     branches of 3 mm radius leaves 15 % off the axes.
     """
-    if prepared.view is None and unexplained_share(found) > settings.unexplained:
+    if found.leafy or (prepared.view is None
+                       and unexplained_share(found) > settings.unexplained):
         return True
     try:
         check_explained(found, settings.unexplained)

@@ -26,6 +26,7 @@ _AFTER = 3  # scales that are looked at after it
 _LEAST = 8  # points of a neighbourhood that tell anything
 _SMALLEST = 40  # points of a leaf
 _PATCH = 0.1  # of the largest leaf's area, up to which a piece is a patch of a stem
+_NEAR = 3.0  # spacings, up to which points hang together
 _AGREE = 0.5  # of the neighbours, that make a point one of a leaf
 
 
@@ -55,7 +56,31 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
     near = tree.query(points, k=min(16, len(points)))[1]
     for _ in range(2):
         on_leaf = on_leaf[near].mean(axis=1) > _AGREE
-    return _pieces(points, on_leaf, 3 * spacing)
+    return _pieces(points, _with_rims(points, on_leaf, _NEAR * spacing), _NEAR * spacing)
+
+
+def _with_rims(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> np.ndarray:
+    """Add the pieces of the rest that lie along leaves: rims and folds, where a leaf is no sheet.
+
+    A stem touches its leaf with its end alone.
+    """
+    rest = np.flatnonzero(~on_leaf)
+    if len(rest) == 0 or len(rest) == len(points):
+        return on_leaf
+    label, count = _labels(points[rest], reach)
+    beside = cKDTree(points[on_leaf]).query(points[rest], distance_upper_bound=reach)[0] < np.inf
+    rim = np.bincount(label, beside) > _AGREE * count
+    found = on_leaf.copy()
+    found[rest[rim[label]]] = True
+    return found
+
+
+def _labels(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which connected piece each point belongs to, shape [n], and the pieces' sizes."""
+    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (len(points), len(points)))
+    label = connected_components(graph, directed=False)[1]
+    return label, np.bincount(label)
 
 
 def _on_sheets(points: np.ndarray, spacing: float) -> np.ndarray:
@@ -100,14 +125,12 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
     if len(own) < _SMALLEST:
         return []
     tree = cKDTree(points[own])
-    pairs = tree.query_pairs(reach, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), (len(own), len(own)))
-    label = connected_components(graph, directed=False)[1]
+    label, count = _labels(points[own], reach)
     k = min(9, len(own))
     around = tree.query(points[own], k=k)[0][:, -1]
     area = np.pi * around**2 / (k - 1)
     leaves = []
-    for piece in np.flatnonzero(np.bincount(label) >= _SMALLEST):
+    for piece in np.flatnonzero(count >= _SMALLEST):
         members = np.flatnonzero(label == piece)
         # The median: at a leaf's edge neighbours are missing on one side.
         leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
