@@ -14,7 +14,7 @@ def cube() -> TetMesh:
     """A unit cube of five tetrahedra, two of them turned inside out, with data."""
     nodes = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
     tets = np.array([[0, 1, 2, 4], [3, 2, 1, 7], [5, 1, 4, 7], [4, 6, 2, 7], [2, 1, 4, 7]])
-    return TetMesh(nodes, tets, {"young": np.arange(5.0)},
+    return TetMesh(nodes, tets, {"young": np.arange(1.0, 6.0)},
                    {"fixed": (nodes[:, 2] == 0).astype(np.int64),
                     "control_point": np.where(np.arange(8) == 3, 1, -1)})
 
