@@ -97,7 +97,8 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     Raises:
         InputError: the scan or the skeleton cannot be used. WorkError: the work failed.
     """
-    prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=eye)
+    prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=eye,
+                       up=np.array(settings.up, float))
     for text in prepared.warnings:
         progress.warn(text)
     found = _skeleton(prepared, settings, own, progress.part(0.02, 0.55))

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.ground import find_ground
 from limber.geometry.cloud.scan_lines import scan_line_view
 from limber.geometry.cloud.sheets import find_sheet
 from limber.geometry.cloud.sight import Sight, View, find_sight, flying_pixels
@@ -40,7 +41,7 @@ class Prepared:
 
 
 def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = None, *,
-            eye: np.ndarray | None = None) -> Prepared:
+            eye: np.ndarray | None = None, up: np.ndarray | None = None) -> Prepared:
     """Crop, convert to metres, recentre, and drop flying pixels, duplicates and outliers.
 
     Args:
@@ -48,6 +49,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         scale: Metres per unit of the file.
         settings: How.
         eye: Where the camera stood, if it is known, in the file's coordinates, shape [3].
+        up: Which way is up, shape [3], to look for rough ground; None: for walls and floors only.
 
     Raises:
         InputError: too few points, or all of them at one place.
@@ -79,6 +81,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
     cloud = cloud.subset(keep)
     if not settings.keep_sheets:
         cloud = _without_sheets(cloud, counts)
+        cloud = cloud if up is None else _without_ground(cloud, up, counts)
     if settings.voxel > 0:
         chosen = voxel_thinned(cloud.points, settings.voxel)
         counts["thinned"] = len(cloud) - len(chosen)
@@ -127,6 +130,14 @@ def _without_sheets(cloud: Cloud, counts: dict[str, int]) -> Cloud:
         return cloud
     counts["sheets"] = count - len(rest)
     return rest
+
+
+def _without_ground(cloud: Cloud, up: np.ndarray, counts: dict[str, int]) -> Cloud:
+    ground = find_ground(cloud.points, up, _SHEET_LEAST * len(cloud))
+    if ground is None or (~ground).sum() < max(0.1 * len(cloud), POINT_MINIMUM):
+        return cloud
+    counts["ground"] = int(ground.sum())
+    return cloud.subset(~ground)
 
 
 def _enough_digits(points: np.ndarray) -> None:
@@ -227,6 +238,9 @@ def _plausible(points: np.ndarray, counts: dict[str, int]) -> list[str]:
     if counts.get("sheets"):
         texts.append(f"{counts['sheets']} of {counts['read']} points lie on a wide flat sheet (a "
                      "wall, the ground?) and were cut out (--keep-sheets).")
+    if counts.get("ground"):
+        texts.append(f"{counts['ground']} of {counts['read']} points lie on rough ground and were "
+                     "cut out (--keep-sheets).")
     step = _rounding(points)
     if step > 0:
         texts.append(f"Coordinates are rounded to {1000 * step:.4g} mm: radii can be no better "
