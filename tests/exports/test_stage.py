@@ -26,6 +26,24 @@ def test_cylinder_models_come_back(tmp_path, name, columns):
     np.testing.assert_array_equal(after.parent, before.parent)
 
 
+def test_simulators_files_are_written(tmp_path):
+    """MJCF with the tip as a site, URDF, Abaqus input; springs are scaled by a few percent."""
+    from xml.etree import ElementTree
+
+    links = {}
+    for name in ("a.xml", "a.urdf"):
+        told = export(EXAMPLE, tmp_path / name, ExportSettings(links=8))
+        assert 0.7 < told["stiffness_factor"] < 1.3 and told["mass_kg"] > 0
+        links[name] = told["link_count"]
+    bodies = ElementTree.parse(tmp_path / "a.xml").getroot().findall(".//body")
+    assert len(bodies) == links["a.xml"] == links["a.urdf"]
+    assert ElementTree.parse(tmp_path / "a.xml").find(".//site[@name='tip']") is not None
+    told = export(EXAMPLE, tmp_path / "a.inp", ExportSettings(load=(0.1, 0.0, 0.0)))
+    text = (tmp_path / "a.inp").read_text()
+    assert "*CLOAD" in text and text.count("*ELEMENT") == 1
+    assert f"*NSET, NSET=TIP\n{told['tip_node']}\n" in text
+
+
 def test_an_mtg_has_a_line_for_each_node(tmp_path):
     """Axes follow with <, side axes with +; places and radii stand in their columns."""
     export(EXAMPLE, tmp_path / "a.mtg", ExportSettings())

@@ -116,7 +116,8 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
 
 def _damping(branch: Branch, progress: Progress) -> RayleighDamping:
     """What the last swing told, else what simulations take."""
-    from limber.mechanics.materials import DEFAULT_DAMPING, RayleighDamping
+    from limber.mechanics.materials import RayleighDamping
+    from limber.mechanics.model import DEFAULT_DAMPING
 
     swing = branch.manifest.stages.get("swing")
     known = swing.result if swing else {}
