@@ -21,8 +21,8 @@ class LimberPreferences(bpy.types.AddonPreferences):
     python_path: bpy.props.StringProperty(
         name="Python with Limber", subtype="FILE_PATH", options=compat.PATH_OPTIONS,
         description="The Python in which Limber's worker is installed, for example "
-                    ".venv/bin/python of a checkout. Empty: LIMBER_PYTHON, then `limber` "
-                    "on the PATH")
+                    ".venv/bin/python of a checkout. Empty: LIMBER_PYTHON, then what the "
+                    "extension brought along, then `limber` on the PATH")
     worker_status: bpy.props.StringProperty(options={"SKIP_SAVE"})
 
     def draw(self, context):
@@ -33,7 +33,8 @@ class LimberPreferences(bpy.types.AddonPreferences):
             layout.label(text=line)
         column = layout.column(align=True)
         column.label(text="The worker computes everything.", icon="INFO")
-        column.label(text="This version of the extension does not bring it along.", icon="BLANK1")
+        brought = "brought it along" if worker.bundled_command() else "came without it"
+        column.label(text=f"This extension {brought}.", icon="BLANK1")
 
 
 def get(context: bpy.types.Context | None = None) -> LimberPreferences | None:
@@ -45,8 +46,10 @@ def get(context: bpy.types.Context | None = None) -> LimberPreferences | None:
 def worker_command() -> list[str]:
     """Return how to start the worker; WorkerNotFound says what to do when there is none."""
     chosen = get()
-    fallback = sys.executable if compat.IS_MODULE else ""
-    return worker.worker_command(chosen.python_path if chosen else "", fallback)
+    path = chosen.python_path if chosen else ""
+    if compat.IS_MODULE:
+        return worker.worker_command(path, sys.executable)
+    return worker.worker_command(path, bundled=worker.bundled_command())
 
 
 def has_worker() -> bool:

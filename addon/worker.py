@@ -1,7 +1,9 @@
 """Finds the worker: the Python that has `limber`. Nothing here needs Blender."""
 
+import importlib.util
 import os
 import shutil
+import sys
 from pathlib import Path
 
 
@@ -10,17 +12,30 @@ class WorkerNotFound(Exception):
 
     def __init__(self, seen: str):
         super().__init__(
-            f"{seen} Everything is computed by Limber's worker, which this extension does not "
-            "bring along yet. Install it (a Python 3.11 or newer: `pip install PROJECT_FOLDER`, or "
-            "scripts/setup in a checkout), then name that Python in the add-on's preferences or "
-            "in LIMBER_PYTHON, or put the program `limber` on the PATH.")
+            f"{seen} Everything is computed by Limber's worker. The extension's zip for your "
+            f"system and Python {sys.version_info.major}.{sys.version_info.minor} brings it along; "
+            "this one does not. Install that zip, or the worker (a Python 3.11 or newer: `pip "
+            "install PROJECT_FOLDER`, or scripts/setup in a checkout), then name that Python in "
+            "the add-on's preferences or in LIMBER_PYTHON, or put the program `limber` on the "
+            "PATH.")
 
 
-def worker_command(python_path: str = "", fallback: str = "") -> list[str]:
+def bundled_command() -> list[str]:
+    """Return how to start the worker of the extension's own wheels; nothing if it has none."""
+    found = importlib.util.find_spec("limber")
+    if found is None or found.origin is None:
+        return []
+    folder = Path(found.origin).parents[1]
+    return [sys.executable, str(Path(__file__).with_name("bundled.py")), str(folder)]
+
+
+def worker_command(python_path: str = "", fallback: str = "",
+                   bundled: list[str] | None = None) -> list[str]:
     """Return how to start `limber`, to be followed by its arguments.
 
     Args:
         python_path: A Python that the user chose, or nothing.
+        bundled: How to start the worker that came with the extension, or nothing.
         fallback: A Python to try last: that of the bpy package.
 
     Raises:
@@ -34,6 +49,8 @@ def worker_command(python_path: str = "", fallback: str = "") -> list[str]:
         if not path.is_file():
             raise WorkerNotFound(f"The Python named in {source}, {path}, does not exist.")
         return [str(path), "-m", "limber"]
+    if bundled:
+        return bundled
     program = shutil.which("limber")
     if program:
         return [program]

@@ -1,7 +1,10 @@
 """The worker as a process: progress, results, failures, and a cancel that leaves nothing alive."""
 
 import importlib
+import importlib.machinery
+import importlib.util
 import os
+import subprocess
 import sys
 import textwrap
 import time
@@ -150,3 +153,22 @@ def test_worker_environment_is_not_blenders(addon, monkeypatch):
     environment = worker.worker_environment()
     assert not {"PYTHONHOME", "PYTHONPATH"} & set(environment)
     assert environment["PYTHONUNBUFFERED"] == "1"
+
+
+def test_the_worker_of_the_extensions_own_wheels(addon, tmp_path, monkeypatch):
+    """It runs in this Python, and so does all that it starts; a Python that was chosen wins."""
+    worker = importlib.import_module("limber_addon.worker")
+    monkeypatch.delenv("LIMBER_PYTHON", raising=False)
+    package = tmp_path / "limber"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "cli.py").write_text(
+        "import os, sys\n\n\ndef run():\n    print(sys.argv[1:], os.environ['PYTHONPATH'])\n")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: importlib.machinery.ModuleSpec(
+        name, None, origin=str(package / "__init__.py")))
+    command = worker.worker_command(bundled=worker.bundled_command())
+    done = subprocess.run([*command, "doctor", "--json"], check=True, capture_output=True,
+                          text=True)
+    assert done.stdout == f"['doctor', '--json'] {tmp_path}\n"
+    monkeypatch.setenv("LIMBER_PYTHON", sys.executable)
+    assert worker.worker_command(bundled=command) == [sys.executable, "-m", "limber"]

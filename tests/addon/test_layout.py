@@ -27,9 +27,12 @@ def test_no_mathematics():
 
 
 def test_imports_of_its_own_are_relative():
-    """Blender names the package bl_ext.REPOSITORY.limber, so no file may know its name."""
+    """Blender names the package bl_ext.REPOSITORY.limber, so no file may know its name.
+
+    What bundled.py imports is the worker: it is started as a program of its own.
+    """
     wrong = []
-    for path in FILES:
+    for path in [path for path in FILES if path.name != "bundled.py"]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and node.level == 0:
                 first = (node.module or "").split(".")[0]

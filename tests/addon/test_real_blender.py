@@ -75,6 +75,33 @@ def test_without_a_worker(run):
     assert "LIMBER_PYTHON" in done.stderr
 
 
+def test_the_worker_comes_along(blender, tmp_path):
+    """The zip with wheels is the whole installation: a scan is reconstructed with no other
+    Python. It fetches 150 MB, so only where LIMBER_TEST_WHEELS is set."""
+    if not os.environ.get("LIMBER_TEST_WHEELS"):
+        pytest.skip("a large download: set LIMBER_TEST_WHEELS=1")
+    environment = {name: value for name, value in os.environ.items() if name != "LIMBER_PYTHON"}
+    environment |= {"BLENDER_USER_RESOURCES": str(tmp_path / "resources"),
+                    "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
+
+    def run(*arguments):
+        done = subprocess.run([blender, "-b", *map(str, arguments)], check=False, text=True,
+                              capture_output=True, env=environment, timeout=400)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+    version = run("--python-expr", "import sys; print('Python', *sys.version_info[:2])")
+    version = next(line for line in version.splitlines() if line.startswith("Python"))
+    subprocess.run([sys.executable, FOLDER.parents[1] / "scripts" / "build_extension",
+                    "--wheels", "linux-x64", "--python", ".".join(version.split()[1:]),
+                    "--output-dir", tmp_path], check=True)
+    run("--command", "extension", "install-file", "-r", "user_default", "--enable",
+        next(tmp_path.glob("*.zip")))
+    generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
+        tmp_path / "scan.ply")
+    run("--command", "limber", "reconstruct", tmp_path / "scan.ply")
+    assert (tmp_path / "scan.branch" / "mesh.vtu").is_file()
+
+
 def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
     """`limber scene` by this Blender; the file opens in it and its frames are right."""
     from limber.cli import call
