@@ -7,7 +7,7 @@ import pytest
 from tests.subjects.paper_branches import FRACTIONS, measured
 
 from limber.estimation.doubt import shape_error as module
-from limber.estimation.doubt.shape_error import shape_error
+from limber.estimation.doubt.shape_error import hung_error, shape_error
 from limber.estimation.field_form import open_field
 from limber.estimation.fit import _tell_largest_part
 from limber.estimation.forward.watched import WatchedForward
@@ -15,6 +15,8 @@ from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject, forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
+from limber.mechanics.added import PointMass
+from limber.mechanics.model import BranchModel
 from limber.progress import Progress
 from limber.recordings.calibration import CalibrationEntry
 
@@ -112,3 +114,28 @@ def test_a_watched_path_and_an_open_field_are_no_exception(monkeypatch, small, s
     monkeypatch.setattr(module, "likely_skeletons", lambda *_: shapes)
     found = shape_error(evaluation, objective, subject, np.empty((0, 3)), len(shapes))
     assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
+
+
+def test_the_mass_of_twigs_enters_the_interval(small, small_bench, small_pull):
+    """A hanging branch with 30 g at its tip: as by pulls of one that carries a tenth more."""
+    bench, skeleton = small_bench, small.skeleton
+    model = BranchModel(bench.mesh, young=1e7, poisson=0.36, density=900.0, gravity=(0, 0, 9.81),
+                        point_masses=[PointMass(tuple(skeleton.nodes[-1]), 0.03)]).as_scanned()
+    pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"weightless": False}))
+    values = Values(np.array(small.young), 0.36, 900.0)
+
+    def evaluated(hung):
+        subject = Subject(bench.mesh, skeleton, bench.points, bench.weights, hung, values)
+        forwards = forwards_of([pull], subject, SETTINGS)
+        objective = Objective(forwards, parameter_space(subject, forwards, SETTINGS),
+                              force_sigma=[0.1])
+        return objective, objective.evaluate(objective.space.pack(values), jacobian=True)
+
+    objective, evaluation = evaluated(model)
+    residual = evaluated(model.with_hung_mass(1.1))[1].residual
+    step = np.linalg.lstsq(evaluation.jacobian, evaluation.residual - residual, rcond=None)[0]
+    found = hung_error(evaluation, objective, 0.1)
+    assert 1e-3 < found.max() < 0.5
+    assert found == pytest.approx(np.abs(step[:4]), rel=0.1, abs=3e-3)
+    bare, alone = evaluated(model.without_point_masses())
+    assert hung_error(alone, bare, 0.1) is None

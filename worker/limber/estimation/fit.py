@@ -26,7 +26,7 @@ from limber.estimation.doubt.model_error import (
     steady_loads,
 )
 from limber.estimation.doubt.path_error import led_by_path, path_error
-from limber.estimation.doubt.shape_error import shape_error
+from limber.estimation.doubt.shape_error import hung_error, shape_error
 from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward, under_its_weight
@@ -102,7 +102,7 @@ class Estimate:
         sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
         error = self.model_error
         return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-                "path": error.path, "axis_is_exact": error.axis_is_exact,
+                "path": error.path, "hung": error.hung, "axis_is_exact": error.axis_is_exact,
                 "total": error.total(sensor)}
 
     @property
@@ -127,6 +127,8 @@ class Estimate:
             parts["shape of the scan"] = self.model_error.geometry**2
         if self.model_error.mesh is not None:
             parts["mesh"] = self.model_error.mesh**2
+        if self.model_error.hung is not None:
+            parts["mass of twigs and leaves"] = self.model_error.hung**2
         if self.model_error.path is not None:
             parts["gripper frame"] = parts.get("gripper frame", 0.0) + self.model_error.path**2
         return parts
@@ -461,7 +463,9 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
                            steady_loads(forwards))
         if stiff is not None:
             error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
-    found.model_error = replace(error, path=_path_error(found, progress))
+    found.model_error = replace(
+        error, path=_path_error(found, progress),
+        hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma))
     _tell_largest_part(found.causes, progress)
 
 

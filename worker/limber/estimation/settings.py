@@ -18,8 +18,8 @@ class EstimateSettings(Settings):
         "material": ("young", "poisson", "density", "gravity", "fit_poisson", "fit_density",
                      "fit_damping"),
         "solver": ("method", "forward", "key_frames", "evaluations", "delta_m2", "robust"),
-        "uncertainty": ("field", "poisson_sigma", "density_sigma", "hold_out", "mesh_check",
-                        "shapes"),
+        "uncertainty": ("field", "poisson_sigma", "density_sigma", "hung_sigma", "hold_out",
+                        "mesh_check", "shapes"),
     }
     experts = ("key_frames", "evaluations", "delta_m2", "robust", "mesh_check", "shapes")
 
@@ -65,6 +65,9 @@ class EstimateSettings(Settings):
     mesh_check: bool = Field(
         True, description="At the end, see on a finer mesh how much this one is too stiff; it "
         "enters the interval.")
+    hung_sigma: float = Field(
+        0.4, ge=0, description="Relative standard deviation of the mass of twigs and leaves that "
+        "hang on the branch beside its mesh: as far as two programs' volumes of one crown differ.")
     shapes: int = Field(
         16, ge=0, description="At the end, pull so many branches that the scan allows as well; "
         "how they differ enters the interval. 0: the radii's deviation alone, the axis as exact.")

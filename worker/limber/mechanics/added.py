@@ -32,6 +32,10 @@ class PointMass:
     position: Place
     mass: float
 
+    def heavier(self, factor: float) -> "PointMass":
+        """Return it ``factor`` times as heavy."""
+        return replace(self, mass=factor * self.mass)
+
 
 @dataclass(frozen=True)
 class HungTwig(PointMass):
@@ -45,6 +49,11 @@ class HungTwig(PointMass):
 
     attached: Place
     inertia: tuple[Place, Place, Place]
+
+    def heavier(self, factor: float) -> "HungTwig":
+        """Return it ``factor`` times as dense."""
+        rows = tuple(tuple(factor * value for value in row) for row in self.inertia)
+        return replace(self, mass=factor * self.mass, inertia=rows)
 
 
 @dataclass(frozen=True)

@@ -233,6 +233,18 @@ class BranchModel:
         other.point_masses, other._mass = (*self.point_masses, *masses), {}
         return other
 
+    def with_hung_mass(self, factor: float) -> "BranchModel":
+        """Return the model with all that hangs on it ``factor`` times as heavy.
+
+        A branch that hung as it was scanned carried that too.
+        """
+        other = copy.copy(self)
+        other.point_masses = tuple(one.heavier(factor) for one in self.point_masses)
+        other._mass = {}
+        if other.hanging is not None and other.hanging.added is not None:
+            other.hanging = replace(other.hanging, added=other.hanging.added.scaled(factor))
+        return other
+
     def without_point_masses(self) -> "BranchModel":
         """Return the model with nothing hanging on it."""
         if not self.point_masses:

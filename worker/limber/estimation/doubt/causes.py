@@ -29,6 +29,8 @@ ADVICE = {
     "density": "weigh a piece of the branch (--density, --density-sigma)",
     "moduli that the pulls leave open": "pull at a point farther out",
     "shape of the scan": "a scan from more sides, or with less noise",
+    "mass of twigs and leaves": "weigh what hangs on the branch, and state it "
+                                "(--hung-sigma); or mesh more twigs (--twig-radius of reconstruct)",
     "mesh": "a finer mesh (--mesh-spacing of reconstruct)",
     "clamp": "scan farther down, so that the clamped place is known",
 }

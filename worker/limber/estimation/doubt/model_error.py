@@ -48,6 +48,8 @@ class ModelError:
             too stiff by as much; shape [K]. ``mesh`` is what that leaves open.
         path: From the gripper's frame where its path leads the fit, shape [K]; None where none
             does (:func:`limber.estimation.doubt.path_error.path_error`).
+        hung: From the mass of twigs and leaves beside the mesh, shape [K]; None where there are
+            none (:func:`limber.estimation.doubt.shape_error.hung_error`).
     """
 
     geometry: np.ndarray | None = None
@@ -55,10 +57,12 @@ class ModelError:
     axis_is_exact: bool = True
     mesh_factor: np.ndarray | float = 1.0
     path: np.ndarray | None = None
+    hung: np.ndarray | None = None
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
-        parts = [part for part in (sensor, self.geometry, self.mesh, self.path) if part is not None]
+        parts = [part for part in (sensor, self.geometry, self.mesh, self.path, self.hung)
+                 if part is not None]
         return np.sqrt(np.sum(np.square(parts), axis=0))
 
 

@@ -1,4 +1,4 @@
-"""What a scan leaves open of axis and radii, carried to Young's modulus through the pulls.
+"""What a scan leaves open of shape and hung mass, carried to Young's modulus through the pulls.
 
 Branches as likely as the fitted one (:mod:`limber.geometry.likely_shapes`) are pulled as the branch
 was, with the moduli found. By how much their points and forces differ, to first order, the fit
@@ -9,7 +9,8 @@ of axis and radius, and of several moduli go together as they do in the scan.
 import numpy as np
 from scipy import stats
 
-from limber.estimation.doubt.shape_slopes import shape_slopes
+from limber.estimation.doubt.path_error import WIDEST
+from limber.estimation.doubt.shape_slopes import hung_slopes, shape_slopes, taken_up
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.preparation import Subject
 from limber.geometry.likely_shapes import likely_skeletons, reshaped
@@ -24,8 +25,8 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
                 progress: Progress = SILENT) -> np.ndarray | None:
     """Relative standard deviation of E at the control points from axis and radii, shape [K].
 
-    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr. Root mean square over
-    the shapes, times Student's quantile over the normal one since they are few.
+    Root mean square over the shapes of what the fit would have taken up, times Student's quantile
+    over the normal one since they are few.
 
     Args:
         evaluation: At the fit's end.
@@ -37,25 +38,33 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
         progress: Called as it goes.
 
     Returns:
-        None where a pull is dynamic, since that would take too long, where shapes are too few, or
-        where a pull finds no equilibrium.
+        None where shapes are too few, or as :func:`taken_up`.
     """
-    if count < FEWEST or any(f.entry.motion == "dynamic" for f in objective.forwards):
+    if count < FEWEST:
         return None
-    # Differences vary slowly along a pull: few key frames show them.
-    forwards = [forward.led_elsewhere(forward.frames.poses) for forward in objective.forwards]
-    alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
-    expected = alone.evaluate(evaluation.free, jacobian=True)
-    if expected is None:
-        return None
-    values = objective.space.unpack(evaluation.free)
+    progress(0.0, "other shapes that the scan allows")
     meshes = [reshaped(subject.mesh, subject.skeleton, shape) for shape in likely_skeletons(
         subject.skeleton, points, count, np.random.default_rng(seed))]
-    changes = []
-    for number, forward in enumerate(forwards):
-        progress(number / len(forwards), "other shapes that the scan allows")
-        changes.append(shape_slopes(forward, values, meshes))
-    steps = np.linalg.lstsq(expected.jacobian, alone.residual_slopes(expected, changes),
-                            rcond=1e-9)[0]
-    spread = np.sqrt(np.mean(steps[list(objective.space.groups)]**2, axis=1))
-    return np.minimum(spread * stats.t.ppf(0.975, count) / stats.norm.ppf(0.975), 35.0)
+    steps = taken_up(evaluation, objective,
+                     lambda forward, values: shape_slopes(forward, values, meshes))
+    if steps is None:
+        return None
+    spread = np.sqrt(np.mean(steps**2, axis=1))
+    return np.minimum(spread * stats.t.ppf(0.975, count) / stats.norm.ppf(0.975), WIDEST)
+
+
+def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:
+    """Relative standard deviation of E from the mass of twigs and leaves beside the mesh, [K].
+
+    Args:
+        evaluation, objective: As of :func:`shape_error`.
+        sigma: Relative standard deviation of that mass, all alike.
+
+    Returns:
+        None where nothing hangs on the branch or nothing weighs, or as :func:`taken_up`.
+    """
+    models = [forward.full.model for forward in objective.forwards if not forward.is_dynamic]
+    if not sigma or not any(model.point_masses and model.gravity.any() for model in models):
+        return None
+    steps = taken_up(evaluation, objective, hung_slopes)
+    return None if steps is None else np.minimum(sigma * np.abs(steps[:, 0]), WIDEST)

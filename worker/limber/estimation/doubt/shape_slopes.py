@@ -1,21 +1,25 @@
-"""How a slow pull changes with the shape of the branch, to first order.
+"""How a slow pull changes with what the fit took as known, to first order, and the moduli with it.
 
-All nodes X of the mesh go a way w aside, to another shape of the same tree. At a state u in balance
-the internal force f, the loads p and what holds the branch change with X, and the state follows:
+All nodes X of the mesh go a way w aside, to another shape of the same tree; or what hangs on the
+branch is heavier. At a state u in balance the internal force f, the loads p and what holds the
+branch change, and the state follows:
 
     K du = dp - df,      df = (f(X + s w, u) - f(X, u)) / s  for a small s,
 
 with the tangent stiffness K that belongs to the state. So one factor a key frame serves all shapes,
 at an assembled force and a solve each, where a mesh of its own would have to find its own states.
+What the fit would have taken up in the moduli follows from the change of its residuals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.nuisances import ErrorSlopes
+from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.linear.equations import Tangent
@@ -24,8 +28,36 @@ from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import reactions
 
 STEP = 1e-4
-"""Part of the way to another shape over which the force's derivative is taken: a branch turned by
-a radian answers far from linearly to the whole of a radius' change."""
+"""Part of the way to another shape, or of a mass, over which the force's derivative is taken: a
+branch turned by a radian answers far from linearly to the whole of a radius' change."""
+
+
+def taken_up(evaluation: Evaluation, objective: Objective,
+             slopes: Callable[[QuasiStaticForward, Values], ErrorSlopes]) -> np.ndarray | None:
+    """Change of log E at the control points by which a fit takes up S changes of its pulls, [K, S].
+
+    Linear in the change of the residuals r: d log E = -(J^T J)^-1 J^T dr, at few key frames:
+    differences vary slowly along a pull.
+
+    Args:
+        evaluation: At the fit's end.
+        objective: What was minimised.
+        slopes: Change of a pull, simulated for these values, by each of the S.
+
+    Returns:
+        None where a pull is dynamic, since that would take too long, or finds no equilibrium.
+    """
+    if any(forward.entry.motion == "dynamic" for forward in objective.forwards):
+        return None
+    forwards = [forward.led_elsewhere(forward.frames.poses) for forward in objective.forwards]
+    alone = Objective(forwards, objective.space, force_sigma=objective.force_sigma)
+    expected = alone.evaluate(evaluation.free, jacobian=True)
+    if expected is None:
+        return None
+    values = objective.space.unpack(evaluation.free)
+    changes = alone.residual_slopes(expected, [slopes(forward, values) for forward in forwards])
+    steps = np.linalg.lstsq(expected.jacobian, -changes, rcond=1e-9)[0]
+    return steps[list(objective.space.groups)]
 
 
 def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[TetMesh],
@@ -37,11 +69,29 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
         values: The physical parameters.
         meshes: The same tetrahedra with their nodes elsewhere.
     """
+    nodes = forward.mesh.nodes
+    operator = point_operator(forward.mesh, forward.rest_points)
+    return _slopes(forward, values,
+                   [forward.aside(nodes + STEP * (mesh.nodes - nodes)) for mesh in meshes],
+                   [point_operator(mesh, forward.rest_points) - operator for mesh in meshes])
+
+
+def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
+    """Return the change of a pull's observations by the mass of what hangs on the branch, relative.
+
+    Arguments as of :func:`shape_slopes`.
+    """
+    size = 3 * len(forward.rest_points), forward.mesh.nodes.size
+    return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
+
+
+def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiStaticForward],
+            elsewhere: Sequence[sparse.csr_matrix]) -> ErrorSlopes:
+    """Changes to pulls that are a step aside, where points may sit in the mesh elsewhere."""
     here = _Pulled(forward, forward.model_with(values))
     equations = here.model.equations((forward.grasp,) if here.is_held else ())
     operator = point_operator(here.model.mesh, forward.rest_points)
-    others = [_aside(forward, values, mesh) for mesh in meshes]
-    elsewhere = [point_operator(mesh, forward.rest_points) - operator for mesh in meshes]
+    others = [_Pulled(aside, aside.model_with(values)) for aside in asides]
     changes = []
     for key, state in enumerate(forward.displacements()):
         before = here.out_of_balance(key, state)
@@ -55,7 +105,7 @@ def shape_slopes(forward: QuasiStaticForward, values: Values, meshes: Sequence[T
                 (now - then) / STEP for now, then in zip(after, seen, strict=True))])
     return ErrorSlopes(*(
         np.einsum("fk,ks...->f...s", forward.spread, np.array(each).reshape(
-            -1, len(meshes), *each[0].shape)) for each in zip(*changes, strict=True)))
+            -1, len(others), *each[0].shape)) for each in zip(*changes, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -101,13 +151,6 @@ class _Pulled:
         about = self.forward.frames.poses[self.forward.keys[key], :3]
         arms = (self.model.mesh.nodes + state)[grasp.nodes] - about
         return (reactions([grasp], out)[0], np.cross(arms, out[grasp.nodes]).sum(axis=0), place)
-
-
-def _aside(forward: QuasiStaticForward, values: Values, mesh: TetMesh) -> _Pulled:
-    """A step of the way to another shape."""
-    nodes = forward.mesh.nodes
-    aside = forward.aside(nodes + STEP * (mesh.nodes - nodes))
-    return _Pulled(aside, aside.model_with(values))
 
 
 def _followed(here: _Pulled, others: Sequence[_Pulled], key: int, state: np.ndarray,

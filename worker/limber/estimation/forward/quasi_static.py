@@ -255,6 +255,12 @@ class QuasiStaticForward(Forward):
             other._loads = [other._loads_at(key) for key in self.keys]
         return other
 
+    def with_hung_mass(self, factor: float) -> "QuasiStaticForward":
+        """Return the same pull with all that hangs on the branch ``factor`` times as heavy."""
+        other = copy.copy(self)
+        other._model = self._model.with_hung_mass(factor)
+        return other
+
     def place(self, displacement: np.ndarray) -> np.ndarray:
         """Where the recorded grasp point is [m], shape [3]."""
         arm = np.array(self.entry.grasp.point_m) - self.grasp.centre
