@@ -90,3 +90,17 @@ def test_what_is_no_swing_is_refused():
     creep[:, 0, 0] -= 0.01 * (1 - np.exp(-5 * times))
     with pytest.raises(InputError, match="to and fro"):
         first_guess(SwingSeen(times, creep, MARKERS, "held", np.zeros(3), 0.0, 1e-5))
+
+
+def test_markers_that_are_jostled_before_are_no_release():
+    """Held until 0.4 s, a marker at the base trembles before; and where it rests it creeps."""
+    times = np.arange(300) / 100.0
+    since = np.clip(times - 0.4, 0, None)
+    swings = np.where(times > 0.4, 1 - np.exp(-3 * since) * np.cos(2 * np.pi * 4 * since), 0.0)
+    moved = 1e-6 * np.random.default_rng(1).standard_normal((300, 3, 3))
+    moved[:, 0, 0] -= 0.01 * swings * (1 + 0.05 * since)
+    moved[8:, 2, 1] += 4e-4
+    released, period = first_guess(SwingSeen(times, moved, MARKERS, "held", np.zeros(3), 0.0,
+                                             1e-5))
+    assert released == pytest.approx(0.4, abs=0.02)
+    assert period == pytest.approx(0.25, rel=0.03)

@@ -10,6 +10,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.skeleton.files import write_cylinders
 from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
 from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.report.page import draw_page
 from limber.report.tables import (
     cause_rows,
     comparison_rows,
@@ -17,6 +18,7 @@ from limber.report.tables import (
     held_out_rows,
     held_sentence,
     modulus_rows,
+    swing_rows,
 )
 from limber.stages.report import write_report
 from limber.store import Branch
@@ -167,3 +169,21 @@ def test_cylinder_model_stands_beside_calipers(tmp_path):
         path.write_text(content)
         with pytest.raises(InputError, match=told):
             write_report(branch.folder, caliper_path=path)
+
+
+def test_a_swing_has_a_section(meshed):
+    """What it told, with intervals, and the track it was laid over."""
+    times = np.linspace(0.0, 1.0, 30)
+    track = 0.02 * np.cos(20 * times)[:, None, None] * [[[0, 0, 0.1], [0, 0.5, 1.0]]]
+    swing = {"pull": "let-go", "young_pa": 2.5e6, "young_interval_pa": [2.4e6, 2.7e6],
+             "damping_ratio": 0.05, "damping_ratio_interval": [0.04, 0.06], "release_s": 0.4,
+             "release_deviation_s": 0.01, "frequency_hz": 3.2, "relative_residual": 0.012,
+             "warnings": ["a word"], "times_s": times.tolist(), "seen_m": (track + 1e-4).tolist(),
+             "simulated_m": track.tolist()}
+    assert swing_rows(swing)[1] == ["Young's modulus, mean [MPa]", "2.5", "2.4 to 2.7"]
+    assert swing_rows(swing)[3][2] == "0.3804 to 0.4196"
+    with meshed.stage("swing") as stage:
+        stage.path("swing.json").write_text(json.dumps(swing), encoding="utf-8")
+    page, sections = draw_page(meshed)
+    found = next(section for section in sections if section.title == "Swing let-go")
+    assert len(found.pictures) == 1 and found.text == ["a word"] and "2.4 to 2.7" in page

@@ -38,6 +38,7 @@ class _Deviation(_Told):
     geometry: list[_Maybe] | None = None
     mesh: list[_Maybe] | None = None
     path: list[_Maybe] | None = None
+    hung: list[_Maybe] | None = None
     total: list[_Maybe] | None = None
 
 
@@ -115,7 +116,8 @@ class _Estimate(_Told):
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
             **{f"young_deviation.{name}": getattr(told, name)
-               for name in ("sensor", "geometry", "mesh", "path", "total")}}
+               for name in ("sensor", "geometry", "mesh", "path", "hung",
+                            "total")}}
         for name, values in lists.items():
             if values and len(values) != count:
                 raise ValueError(f"{name} has {len(values)} entries for {count} moduli")

@@ -34,6 +34,8 @@ _FIRST_PERIODS = 1.5
 """The fit begins with so many, so that simulated and seen phases cannot be a turn apart."""
 _DAMPING_BOUNDS = (1e-4, 1e3)
 """Of Rayleigh's alpha over the first angular frequency, and beta times it: both without unit."""
+_GONE = 0.3
+"""Part of its way at which a branch has surely been let go."""
 _MARGIN = 0.1
 """Deviation of how much a marker moves, where the registration is not known."""
 STARTS = ("held", "loaded")
@@ -139,12 +141,16 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
         InputError: nothing moves, or it does not swing.
     """
     way = np.linalg.norm(seen.moved - np.nanmedian(seen.moved[:3], axis=0), axis=2)
-    far = np.nanmax(np.where(np.isfinite(way), way, 0.0), axis=1)
+    # Of the marker that goes farthest: others are jostled while the branch is still held.
+    far = way[:, np.argmax(np.nan_to_num(way).max(axis=0))]
+    far = np.where(np.isfinite(far), far, 0.0)
     if far.max() < 10 * seen.noise:
         raise InputError("Nothing swings in the recording.",
                          f"No marker moves by more than {1e3 * far.max():.2g} mm.",
                          "Start the recording before the branch is let go.")
-    start = int(np.argmax(far > max(6 * seen.noise, 0.02 * far.max())))
+    gone = int(np.argmax(far > _GONE * far.max()))
+    at_rest = np.flatnonzero(far[:gone] < max(6 * seen.noise, 0.02 * far.max()))
+    start = int(at_rest[-1]) + 1 if len(at_rest) else 0
     marker, axis = np.unravel_index(np.nanargmax(np.nanvar(seen.moved[start:], axis=0)),
                                     seen.moved.shape[1:])
     track = seen.moved[start:, marker, axis]
@@ -161,7 +167,8 @@ def first_guess(seen: SwingSeen) -> tuple[float, float]:
                          "Let it go at once, or fit the place of rest: --motion quasi_static.")
     cross = times[turns] - away[turns] * (times[turns + 1] - times[turns]) / (
         away[turns + 1] - away[turns])
-    period = 2 * float(np.median(np.diff(cross)))
+    # Over whole turns: where it rests may be a little beside, as of a branch that creeps.
+    period = float(np.median(cross[2:] - cross[:-2]))
     rate = float(np.median(np.diff(seen.times)))
     if period < 6 * rate:
         raise InputError(f"The branch swings {1 / period:.3g} times a second.",

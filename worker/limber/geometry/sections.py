@@ -22,6 +22,7 @@ from limber.geometry.surface.surface import Surface
 from limber.geometry.tets.cylinder_mesh import swept
 from limber.geometry.tets.marks import mark
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.reading import read_text
 
 COLUMNS = ("x", "y", "z", "width", "height")
 MASS = "mass_kg"
@@ -61,8 +62,8 @@ def read_sections(path: Path, unit: str) -> Sections:
     Raises:
         InputError: a column is missing, a value no number, or a thickness not positive.
     """
-    with open(path, newline="", encoding="utf-8-sig") as stream:
-        rows = list(csv.DictReader(line for line in stream if not line.startswith("#")))
+    text = read_text(path, "a table of sections")
+    rows = list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
     titles = [title.strip() for title in rows[0] if title] if rows else []
     found = {}
     for title in titles:

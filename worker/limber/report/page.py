@@ -20,7 +20,7 @@ from limber.mechanics.frames import read_frames_file
 from limber.optional import require_extra
 from limber.planning.field.energy_field import EnergyField
 from limber.progress import SILENT, Progress
-from limber.reading import read_arrays
+from limber.reading import read_arrays, read_json
 from limber.report import figures
 from limber.report.tables import (
     caliper_rows,
@@ -33,6 +33,7 @@ from limber.report.tables import (
     modulus_rows,
     order_rows,
     share_rows,
+    swing_rows,
 )
 from limber.stages.loading import load_skeleton, load_targets
 from limber.store import Branch
@@ -84,7 +85,8 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
     page = [*_held_back(branch), _summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
         _scan, partial(_cylinders, calipers=calipers), _mesh, *_pulls(branch), _estimate,
-        *_simulations(branch), _energy, *_plans(branch), _provenance]
+        *([_swing] if branch.has("swing.json") else []), *_simulations(branch), _energy,
+        *_plans(branch), _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
@@ -255,6 +257,17 @@ def _estimate(branch: Branch) -> Section:
     for figure, caption in estimate_figures.report_figures(estimate):
         section.draw(figure, caption)
     section.text += estimate.get("warnings", [])
+    return section
+
+
+def _swing(branch: Branch) -> Section:
+    from limber.report import estimate_figures
+
+    swing = read_json(branch.path("swing.json"), "a swing")
+    section = Section(f"Swing {swing['pull']}", text=list(swing.get("warnings", [])),
+                      tables=[("", swing_rows(swing))])
+    section.draw(estimate_figures.swing_over_time(swing),
+                 "The marker that swings most, along its way: seen (dots) and simulated.")
     return section
 
 
