@@ -15,7 +15,7 @@ from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import Subject, forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
-from limber.mechanics.added import PointMass
+from limber.mechanics.added import HungTwig
 from limber.mechanics.model import BranchModel
 from limber.progress import Progress
 from limber.recordings.calibration import CalibrationEntry
@@ -120,7 +120,9 @@ def test_the_mass_of_twigs_enters_the_interval(small, small_bench, small_pull):
     """A hanging branch with 30 g at its tip: as by pulls of one that carries a tenth more."""
     bench, skeleton = small_bench, small.skeleton
     model = BranchModel(bench.mesh, young=1e7, poisson=0.36, density=900.0, gravity=(0, 0, 9.81),
-                        point_masses=[PointMass(tuple(skeleton.nodes[-1]), 0.03)]).as_scanned()
+                        point_masses=[HungTwig(tuple(skeleton.nodes[-1]), 0.03,
+                                               tuple(skeleton.nodes[-1]), 3 * ((0.0,) * 3,))],
+                        ).as_scanned()
     pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"weightless": False}))
     values = Values(np.array(small.young), 0.36, 900.0)
 

@@ -87,12 +87,18 @@ def load_masses(branch: Branch) -> list[dict[str, Any]]:
 def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
     """Return what hung on the branch when it was scanned, and its mesh leaves out.
 
-    Twigs and leaves, as stiff bodies that go with the section they grow from, and targets.
+    Twigs and leaves, as stiff bodies that go with the section they grow from; masses that somebody
+    has stated in a table; and targets.
     """
-    return (*(HungTwig(tuple(m.get("centre_m", m["attached_m"])), m["mass_kg"],
-                       tuple(m["attached_m"]),
-                       tuple(map(tuple, m.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))))
-              for m in load_masses(branch)), *target_masses(load_targets(branch)))
+    return (*(_hung(mass) for mass in load_masses(branch)), *target_masses(load_targets(branch)))
+
+
+def _hung(mass: dict[str, Any]) -> PointMass:
+    if mass.get("kind") == "table":
+        return PointMass(tuple(mass["attached_m"]), mass["mass_kg"])
+    return HungTwig(tuple(mass.get("centre_m", mass["attached_m"])), mass["mass_kg"],
+                    tuple(mass["attached_m"]),
+                    tuple(map(tuple, mass.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))))
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:

@@ -14,6 +14,7 @@ from limber.estimation.doubt.shape_slopes import hung_slopes, shape_slopes, take
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.preparation import Subject
 from limber.geometry.likely_shapes import likely_skeletons, reshaped
+from limber.mechanics.added import HungTwig
 from limber.progress import SILENT, Progress
 
 FEWEST = 8
@@ -64,7 +65,10 @@ def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np
         None where nothing hangs on the branch or nothing weighs, or as :func:`taken_up`.
     """
     models = [forward.full.model for forward in objective.forwards if not forward.is_dynamic]
-    if not sigma or not any(model.point_masses and model.gravity.any() for model in models):
+    # Masses that somebody stated are known; twigs' and leaves' are those of their volume.
+    if not sigma or not any(
+            model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)
+            for model in models):
         return None
     steps = taken_up(evaluation, objective, hung_slopes)
     return None if steps is None else np.minimum(sigma * np.abs(steps[:, 0]), WIDEST)

@@ -30,7 +30,10 @@ from limber.recordings.grasping import grasp_on, pose_on
 from limber.recordings.recording import PullEntry
 from limber.sparse import NotPositiveDefiniteError
 
-SETTINGS = StaticSettings(tolerance=1e-6)
+SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200)
+"""From the state before, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch of
+moduli far too soft, which a fit may try, folds up under its force: that is no step of the fit, and
+looking for where it comes to rest may take minutes."""
 FEW_KEYS = 4
 """Simulated frames where only the difference of two pulls is looked at, which varies slowly: with
 4, 6 and 12 what follows for the moduli came out within 1.5 % of each other."""

@@ -79,6 +79,9 @@ class Path:
         step = 1.0
         while self.reached < 1.0:
             progress(self.reached, "seeking equilibrium", iteration=self.iterations)
+            if self.iterations > self.settings.total_iterations:
+                self.trouble = f"no end after {self.iterations} iterations"
+                return self._result()
             part = min(1.0, self.reached + step)
             before = self.iterations
             taken = self._step(part)

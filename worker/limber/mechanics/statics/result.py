@@ -18,6 +18,7 @@ class StaticSettings:
         max_iterations: Newton iterations a step.
         max_step: Longest predicted motion a step, as part of the branch's extent.
         min_step: Smallest part of the whole way that is tried before giving up.
+        total_iterations: Newton iterations in all before giving up.
         stretch_limit: Principal stretch at which the branch is taken as torn.
         mixed: Mixed-integration-point Newton (St. Venant-Kirchhoff only); else Newton with
             line search.
@@ -29,6 +30,7 @@ class StaticSettings:
     max_iterations: int = 20
     max_step: float = 0.4
     min_step: float = 1 / 512
+    total_iterations: float = float("inf")
     stretch_limit: float = 2.0
     mixed: bool = True
     verify: bool = False

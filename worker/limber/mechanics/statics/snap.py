@@ -46,6 +46,8 @@ def settle(path: "Path", part: float) -> float | None:
     load, before = path.load_at(part), (path.status, path.trouble)
     trial, drag, pushes = path.displacement, _FIRST_DRAG, 0
     for _ in range(_CREEPS):
+        if path.iterations > path.settings.total_iterations:
+            break
         crept = _creep(path, trial, target, pins, load, drag)
         if crept is None:
             drag *= 8
