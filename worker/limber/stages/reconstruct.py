@@ -44,7 +44,8 @@ class ReconstructInputs(Settings):
         description="The branch folder to make; with a folder of scans, where to make them.",
         json_schema_extra={"short": "-o"})
     skeleton: Path | None = Field(
-        None, description="Your own skeleton (SWC or cylinder CSV) in the cloud's coordinates.")
+        None, description="Your own skeleton in the cloud's coordinates: SWC, cylinder CSV (ours, "
+        "rTwig's, SimpleForest's) or TreeQSM's .mat.")
     edits: Path | None = Field(
         None, description="Edits of the skeleton (JSON, see `limber skeleton`); they stay in the "
         "branch folder and are applied again by each reconstruct without --skeleton.")
