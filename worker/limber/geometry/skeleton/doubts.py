@@ -8,7 +8,7 @@ import numpy as np
 from limber.geometry.skeleton.skeleton import BRIDGED, UNRESOLVED, Skeleton
 
 _LIKELY = 0.8  # probability from which a branch is not listed
-_KINK = np.deg2rad(70.0)  # a turn within a branch that wood does not make
+KINK = np.deg2rad(70.0)  # a turn within a branch that wood does not make
 _BACKWARDS = np.deg2rad(110.0)  # of a twig against its carrier, likewise
 _CHORD = 2.0  # radii on each side of a node that tell its turn
 
@@ -58,8 +58,8 @@ def doubtful_parts(skeleton: Skeleton) -> list[Doubt]:
             found.append(_part(skeleton, DoubtKind.unresolved, run, part, float(share[part].max())))
         for part in _stretches(own, skeleton.radius_state[own] == BRIDGED):
             found.append(_part(skeleton, DoubtKind.bridged, run, part, float("nan")))
-        turn = _turns(skeleton, members)
-        for part in _stretches(np.arange(len(members)), turn > _KINK):
+        turn = turns(skeleton, members)
+        for part in _stretches(np.arange(len(members)), turn > KINK):
             worst = part[np.argmax(turn[part])]
             found.append(_part(skeleton, DoubtKind.kink, run, members[worst:worst + 1],
                                float(turn[worst])))
@@ -83,7 +83,7 @@ def _stretches(nodes: np.ndarray, chosen: np.ndarray) -> list[np.ndarray]:
     return [nodes[begin:end] for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
+def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
     """Angle [rad] between the axis before and after each node of a run, shape [k].
 
     Over two radii to each side, so that the roughness of single nodes is no kink; nodes nearer

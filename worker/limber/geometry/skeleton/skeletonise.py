@@ -23,6 +23,7 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import (
 )
 from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
 from limber.geometry.skeleton.contraction.pieces import second_base
+from limber.geometry.skeleton.kinks import without_kinks
 from limber.geometry.skeleton.plausibility import (
     check_no_sheet,
     check_one_plant,
@@ -322,8 +323,8 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late,
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
-    return replace(fit, skeleton=assessed(tapered(limited(fit.skeleton, low, high)), points,
-                                          fit.noise)), pruned
+    skeleton, _ = without_kinks(tapered(limited(fit.skeleton, low, high)))
+    return replace(fit, skeleton=assessed(skeleton, points, fit.noise)), pruned
 
 
 def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
