@@ -66,9 +66,11 @@ def test_rims_of_leaves_go_with_them_and_stems_stay() -> None:
                            rng.uniform(0, 1e-3, 80)])
     stem = np.column_stack([rng.uniform(-0.1, 0, 900), np.full(900, 0.015),
                             rng.normal(0, 1e-3, 900)])
-    on_leaf = np.arange(3980) < 3000
-    found = _with_rims(np.vstack([sheet, rim, stem]), on_leaf, 0.003)
-    assert found[:3080].all() and not found[3080:].any()
+    specks = np.array([[0.02, 0.04, 0.0], [0.05, 0.01, 0.002], [-0.05, 0.015, 0.008]])
+    on_leaf = np.arange(3983) < 3000
+    found = _with_rims(np.vstack([sheet, rim, stem, specks]), on_leaf, 0.003)
+    assert found[:3080].all() and found[3080:3980].mean() < 0.01
+    assert found[3980:].tolist() == [True, True, False]
 
 
 def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> None:

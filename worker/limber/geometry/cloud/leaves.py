@@ -62,7 +62,7 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
 def _with_rims(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> np.ndarray:
     """Add the pieces of the rest that lie along leaves: rims and folds, where a leaf is no sheet.
 
-    A stem touches its leaf with its end alone.
+    A stem touches its leaf with its end alone. Specks go with what they are nearest to.
     """
     rest = np.flatnonzero(~on_leaf)
     if len(rest) == 0 or len(rest) == len(points):
@@ -70,6 +70,14 @@ def _with_rims(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> np.ndar
     label, count = _labels(points[rest], reach)
     beside = cKDTree(points[on_leaf]).query(points[rest], distance_upper_bound=reach)[0] < np.inf
     rim = np.bincount(label, beside) > _AGREE * count
+    large = count[label] >= _SMALLEST
+    stem = rest[large & ~rim[label]]
+    if len(stem):
+        speck = np.flatnonzero(~large)
+        blade = np.concatenate([points[on_leaf], points[rest[rim[label]]]])
+        to_leaf, to_stem = (cKDTree(there).query(points[rest[speck]])[0]
+                            for there in (blade, points[stem]))
+        rim |= np.bincount(label[speck], to_leaf < to_stem, len(count)) > _AGREE * count
     found = on_leaf.copy()
     found[rest[rim[label]]] = True
     return found
@@ -129,7 +137,11 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
     k = min(9, len(own))
     around = tree.query(points[own], k=k)[0][:, -1]
     area = np.pi * around**2 / (k - 1)
-    leaves = []
+    leaves, large = [], count[label] >= _SMALLEST
+    if not large.any():
+        return []
+    # Specks go with the nearest leaf.
+    label = label[np.flatnonzero(large)[cKDTree(points[own[large]]).query(points[own])[1]]]
     for piece in np.flatnonzero(count >= _SMALLEST):
         members = np.flatnonzero(label == piece)
         # The median: at a leaf's edge neighbours are missing on one side.
