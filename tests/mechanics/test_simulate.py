@@ -137,8 +137,8 @@ SPOILT = {
     "flat": (_flat, "inverted|volume|flat|inside out"),
     "not fixed": (_loose_end, "fixed"),
     "poisson 0.5": (_cell("poisson", 0.5), "Poisson"),
-    "negative young": (_cell("young", -1e9), "Young"),
-    "no density": (_cell("density", 0.0), "Density"),
+    "negative young": (_cell("young", -1e9), "young"),
+    "no density": (_cell("density", 0.0), "density"),
 }
 
 
