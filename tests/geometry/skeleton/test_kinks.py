@@ -28,6 +28,14 @@ def test_an_end_that_folds_back_goes() -> None:
     assert not any(doubt.kind is DoubtKind.kink for doubt in doubtful_parts(mended))
 
 
+def test_an_end_that_folds_twice_goes_whole() -> None:
+    """A zigzag at the tip is cut back until nothing folds."""
+    run = _run((0, 0, 0), (0, 0, 0.3), (0.012, 0, 0.27), (0.02, 0, 0.3))
+    mended, count = without_kinks(run)
+    assert count >= 1 and mended.nodes[-1, 2] == pytest.approx(0.3, abs=0.006)
+    assert turns(mended, mended.runs()[0]).max() <= KINK
+
+
 def test_a_kink_inside_is_rounded() -> None:
     """A right angle far from the tip becomes a bend; its ends and what it carries stay."""
     run = _run((0, 0, 0), (0, 0, 0.2), (0.2, 0, 0.18))

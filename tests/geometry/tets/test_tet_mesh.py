@@ -104,3 +104,19 @@ def test_a_twig_that_starts_in_a_hook_is_joined() -> None:
     assert swept.left_out == []
     assert swept.mesh.volumes.min() > 0
     assert swept.mesh.nodes[:, 0].min() < -0.03
+
+
+def test_the_carriers_corners_turn_until_a_twig_is_joined() -> None:
+    """A thin twig at a small angle that meets an edge of the hexagon meets a face of another."""
+    carrier = np.stack([0 * np.arange(40.0), 0 * np.arange(40.0), 3 * np.arange(40)], axis=1)
+    away, around = np.deg2rad(20), np.deg2rad(40)
+    way = np.array([-np.sin(away), 0, np.cos(away)])
+    twig = np.vstack([[2, 0, 0], [2, 0, 0] + np.outer(1.5 * np.arange(1, 15), way)])
+    turn = np.array([[np.cos(around), -np.sin(around), 0], [np.sin(around), np.cos(around), 0],
+                     [0, 0, 1]])
+    nodes = 1e-3 * np.vstack([carrier, carrier[20] + twig @ turn.T])
+    parent = np.concatenate([np.arange(40) - 1, [20], 40 + np.arange(len(twig) - 1)])
+    radius = 1e-3 * np.repeat([3.0, 1.5], [40, len(twig)])
+    swept = sweep_tree(Skeleton.from_edges(nodes, parent, radius))
+    assert swept.left_out == []
+    assert swept.mesh.volumes.min() > 0

@@ -22,20 +22,14 @@ def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
     Returns:
         The skeleton, and how many kinks were mended.
     """
-    keep, count = np.ones(skeleton.node_count, bool), 0
-    children = skeleton.child_counts()
-    for members in skeleton.runs():
-        sharp = np.flatnonzero(turns(skeleton, members) > KINK)
-        for place in sharp:
-            beyond = members[place + 1:]
-            step = np.linalg.norm(np.diff(skeleton.nodes[members[place:]], axis=0), axis=1)
-            if place > 1 and step.sum() < _END * skeleton.radius[members[place]] and (
-                    children[members[place:]] < 2).all():
-                keep[beyond] = False
-                count += 1
-                break
-    if not keep.all():
-        skeleton = skeleton.subset(keep)
+    count = 0
+    while True:
+        beyond = _folded(skeleton)
+        if len(beyond) == 0:
+            break
+        keep = np.ones(skeleton.node_count, bool)
+        keep[beyond] = False
+        skeleton, count = skeleton.subset(keep), count + 1
     nodes = skeleton.nodes.copy()
     for members in skeleton.runs():
         sharp = np.flatnonzero(turns(skeleton, members) > KINK)
@@ -43,6 +37,19 @@ def without_kinks(skeleton: Skeleton) -> tuple[Skeleton, int]:
             count += int((np.diff(sharp) > 1).sum()) + 1
             _round_off(skeleton, nodes, members)
     return replace(skeleton, nodes=nodes), count
+
+
+def _folded(skeleton: Skeleton) -> np.ndarray:
+    """Nodes of one folded end beyond its kink; none if there is none."""
+    children = skeleton.child_counts()
+    for members in skeleton.runs():
+        for place in np.flatnonzero(turns(skeleton, members) > KINK):
+            rest = members[place:]
+            step = np.linalg.norm(np.diff(skeleton.nodes[rest], axis=0), axis=1)
+            if place > 1 and len(rest) > 1 and (children[rest] < 2).all() and (
+                    step.sum() < _END * skeleton.radius[rest[0]]):
+                return rest[1:]
+    return np.empty(0, np.int64)
 
 
 def _round_off(skeleton: Skeleton, nodes: np.ndarray, members: np.ndarray) -> None:

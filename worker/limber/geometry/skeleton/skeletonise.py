@@ -323,8 +323,8 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late,
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
-    skeleton, _ = without_kinks(tapered(limited(fit.skeleton, low, high)))
-    return replace(fit, skeleton=assessed(skeleton, points, fit.noise)), pruned
+    told = assessed(tapered(limited(fit.skeleton, low, high)), points, fit.noise)
+    return replace(fit, skeleton=without_kinks(told)[0]), pruned
 
 
 def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import bending_factor, frames, rings, tangents
+from limber.geometry.skeleton.sweep import any_normal, bending_factor, frames, rings, tangents
 from limber.geometry.tets.cylinder_mesh import split_wedges
 from limber.geometry.tets.tet_mesh import TetMesh
 
@@ -26,6 +26,9 @@ _TAPERED, _THINNEST = 2.5, 0.06  # radius ratio from which rings are graded; dow
 _STARTS, _LEANS = 60, (0.3, 0.8, 1.6)  # where a twig's first ring is tried, and how far it leans
 _NEAR = 2.5  # radii beyond the first place that will do, within which the best one is taken
 _STRAIGHTENED = (0.0, 3.0, 6.0, 12.0)  # radii of a twig's start that may be led straight
+# Where the main run's corners stand is tried in turn while a twig cannot be joined; in large trees,
+# where one or the other always cannot, once.
+_TURNS, _TURNED_MOST = tuple(np.deg2rad([0.0, 30.0, 15.0, 45.0])), 60
 _THICK_TWIG = 0.5  # of its carrier's radius: such a twig takes two side faces and has six sides
 
 
@@ -52,10 +55,18 @@ def sweep_tree(skeleton: Skeleton, *, spacing: float = 2.5) -> SweptTree:
     Raises:
         MeshingError: the main run cannot be swept, since it bends more sharply than it is thick.
     """
-    sweep = _TreeSweep(skeleton, spacing)
-    for run in range(skeleton.branch_count):
-        sweep.add_run(run)
-    return sweep.result()
+    best, least = None, np.inf
+    for turn in _TURNS if skeleton.branch_count <= _TURNED_MOST else _TURNS[:1]:
+        sweep = _TreeSweep(skeleton, spacing, turn)
+        for run in range(skeleton.branch_count):
+            sweep.add_run(run)
+        found = sweep.result()
+        lost = float(skeleton.radius[np.isin(skeleton.branch, found.left_out)].sum())
+        if lost < least:
+            best, least = found, lost
+        if not found.left_out:
+            break
+    return best
 
 
 @dataclass
@@ -123,9 +134,10 @@ class _Swept:
 
 
 class _TreeSweep:
-    def __init__(self, skeleton: Skeleton, spacing: float):
+    def __init__(self, skeleton: Skeleton, spacing: float, turn: float = 0.0):
         self._skeleton = skeleton
         self._spacing = spacing
+        self._turn = turn
         self._axes = [_Axis.of(skeleton, run) for run in range(skeleton.branch_count)]
         starts = [members[0] for members in skeleton.runs()]
         self._carrier = [-1] + [int(skeleton.branch[start]) for start in starts[1:]]
@@ -139,7 +151,7 @@ class _TreeSweep:
 
     def add_run(self, run: int) -> None:
         if run == 0:
-            self._sweep(run, 0.0, 6, None)
+            self._sweep(run, 0.0, 6, self._first_normal())
             return
         carrier = self._swept.get(self._carrier[run])
         if carrier is None or run not in carrier.windows:
@@ -155,6 +167,15 @@ class _TreeSweep:
                     return
         self._axes[run] = axis
         self._left_out.append(run)
+
+    def _first_normal(self) -> np.ndarray | None:
+        """Where the main run's first corner stands; None: anywhere."""
+        if self._turn == 0:
+            return None
+        way = self._axes[0].points[1] - self._axes[0].points[0]
+        normal = any_normal(way)
+        other = np.cross(way / np.linalg.norm(way), normal)
+        return np.cos(self._turn) * normal + np.sin(self._turn) * other
 
     def _sweep(self, run: int, start: float, sides: int, first_normal: np.ndarray | None,
                first_tangent: np.ndarray | None = None) -> bool:
