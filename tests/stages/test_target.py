@@ -9,6 +9,7 @@ from limber.cli import call
 from limber.errors import InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.progress import Progress
+from limber.settings import checked_settings
 from limber.stages.loading import load_branch, load_targets
 from limber.stages.target import TargetSettings, set_target
 from limber.store import Branch
@@ -57,7 +58,7 @@ def test_what_is_refused(folder, name, settings, words):
     """With its reason; targets from before stay."""
     set_target(folder, "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
     with pytest.raises(InputError) as caught:
-        set_target(folder, name, TargetSettings(**settings))
+        set_target(folder, name, checked_settings(TargetSettings, settings))
     assert words in str(caught.value)
     assert [t.name for t in load_targets(Branch.open(folder))] == ["leaf"]
 

@@ -181,7 +181,8 @@ def _fitted_columns(path: Path, rows: list[dict[str, str]], scale: float,
     except (TypeError, ValueError) as error:
         raise InputError(f"{path} has a field that is not a number ({error}).",
                          f"{', '.join(names)} are numbers.", "Correct the file.") from error
-    if not ((sigma >= 0).all() and np.isin(state, list(STATES.values())).all()
+    if not (((sigma >= 0) & np.isfinite(sigma)).all()
+            and np.isin(state, list(STATES.values())).all()
             and ((probability >= 0) & (probability <= 1)).all()):
         raise InputError(
             f"{path} has a deviation, state or probability out of its range.",
