@@ -8,7 +8,7 @@ are known wherever the cloud was moved or turned to since.
 
 import numpy as np
 
-_WINDOW, _STRIDE = 10, 5  # points in a row that show a plane
+_WINDOW, _STRIDE, _WINDOWS = 10, 5, 4000  # points in a row that show a plane; as many are looked at
 _PLANE = 1e-3  # across it over its narrower extent, up to which points lie in one
 _BENT = 0.02  # narrower extent over the longer one, from which that plane is known
 _LEAST, _SHARE = 20, 0.15  # number and share of windows that must show planes
@@ -29,8 +29,10 @@ def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     Returns:
         None where the order of the points is not that of an image.
     """
+    if len(points) < _WINDOW:
+        return None
     normals, offsets, weight = _planes(points)
-    if len(normals) < max(_LEAST, _SHARE * len(points) / _STRIDE):
+    if len(normals) < max(_LEAST, _SHARE * min(len(points) / _STRIDE, _WINDOWS)):
         return None
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     along, place = _common_line(normals, offsets, weight, extent)
@@ -56,6 +58,7 @@ def scan_line_view(points: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 def _planes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Planes of consecutive points: normals [w, 3], offsets [m], and how wide they are [m^2]."""
     start = np.arange(0, len(points) - _WINDOW + 1, _STRIDE)
+    start = start[np.linspace(0, len(start) - 1, min(len(start), _WINDOWS)).astype(int)]
     group = points[start[:, None] + np.arange(_WINDOW)]
     middle = group.mean(axis=1)
     offset = group - middle[:, None]
