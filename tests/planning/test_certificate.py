@@ -10,6 +10,7 @@ from limber.planning.bound import certificate
 from limber.planning.bound.certificate import certify
 from limber.planning.compare import plan_pair
 from limber.planning.cost import CostWeights, resample
+from limber.planning.field.energy_field import among_obstacles
 from limber.planning.field.trust import TrustRegion
 from limber.planning.goals import GraspGoal, TargetGoal
 from limber.planning.planners.detour import plan_detour
@@ -113,6 +114,23 @@ def test_a_limit_along_the_branch_binds_path_and_bound(ridge_field, across):
     kept = np.abs(ridge_field.load(resample(found.points, 0.001), "axial_force"))
     assert kept.max() <= cap * (1 + 1e-9)
     assert found.cost > free.cost and found.certificate.lower <= found.cost
+
+
+def test_a_path_is_led_around_an_obstacle(ridge_field, across):
+    """With a ball in the way of the free path: by the field it stays outside, for more cost."""
+    _, free = across
+    centre = free.points[len(free.points) // 2]
+
+    def closeness(points):
+        return np.exp((0.02 - np.linalg.norm(points - centre, axis=1)) / 0.1)
+
+    field = among_obstacles(ridge_field, closeness(ridge_field.samples.positions))
+    assert np.abs(field.load(free.points, "closeness") - closeness(free.points)).max() < 0.1
+    found = plan_gentle(problem_on(field, closeness=0.95))
+    fine = resample(found.points, 0.001)
+    assert field.load(fine, "closeness").max() <= 0.95 * (1 + 1e-9)
+    assert np.linalg.norm(fine - centre, axis=1).min() > 0.01
+    assert found.certificate.lower <= found.cost and found.cost > free.cost
 
 
 def test_without_deformation_the_bound_is_the_distance(well_field):

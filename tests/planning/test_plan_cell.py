@@ -66,6 +66,28 @@ def test_a_branch_that_meets_an_obstacle_refuses_the_plan(copied):
                    cell_file=blocked, workers=1)
 
 
+def test_a_branch_is_led_around_an_obstacle(copied):
+    """A post where the free way takes the tip: planned anew, the motion keeps clear of it; one that
+    the branch leans on where it hangs refuses every plan."""
+    there = read_plan(copied / "plans/there.json")
+    tip = there.motion.tips[len(there.motion.tips) // 4]
+    ends = {"start": tuple(map(float, there.plan.poses[0, :3])),
+            "goal": tuple(map(float, there.plan.poses[-1, :3]))}
+
+    def post(place):
+        return cell_file(copied, obstacles=({
+            "kind": "box", "name": "the post", "size_m": (0.01, 0.01, 0.01),
+            "pose": (*map(float, place), 0, 0, 0)},))
+
+    plan_paths(copied, PlanSettings(iterations=300, **ends), name="around", cell_file=post(tip),
+               workers=1)
+    assert np.linalg.norm(read_plan(copied / "plans/around.json").motion.tips - tip,
+                          axis=1).min() > 0.01
+    with pytest.raises(NoPathError, match="where it hangs"):
+        plan_paths(copied, SETTINGS, name="leaning", workers=1, cell_file=post(
+            there.motion.tips[0]))
+
+
 def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):
     path = read_plan(copied / "plans/there.json").plan.poses[:, :3]
     goal = tuple(map(float, path[-1]))

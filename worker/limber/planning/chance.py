@@ -79,7 +79,8 @@ class YoungDoubt:
         Raises:
             ConvergenceError: the branch with other moduli cannot be solved at a pose.
         """
-        asked = limits.asked()
+        # How close the branch comes to obstacles hardly depends on its modulus.
+        asked = {name: limit for name, limit in limits.asked().items() if name != "closeness"}
         whole = path.approach.joined(path.solved)
         chosen = whole.take(_chosen(whole, asked))
         known = sizes(chosen)

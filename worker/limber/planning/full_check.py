@@ -1,5 +1,7 @@
 """Whether a planned motion holds on the full model, and what is learnt where it does not."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from limber.planning.field.energy_field import EnergyField, GraspSamples
@@ -46,7 +48,10 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
     and where the field is off most; and poses that have no solution as rejected ones."""
     whole = path.approach.joined(path.solved)
     off = np.abs(field.energy(whole.poses[:, :3]) - whole.energies)
-    broken = np.flatnonzero(~limits.kept(whole))
+    close = None
+    if limits.obstacles:
+        close = limits.closeness_of(grasp_model.mesh.nodes, whole.displacements)
+    broken = np.flatnonzero(~limits.kept(whole) | (False if close is None else close > 1.0))
     order = np.concatenate([[len(off) - 1], broken[:: max(1, 2 * len(broken) // _MOST_LEARNT)],
                             np.argsort(-off)])
     chosen: list[int] = []
@@ -57,7 +62,9 @@ def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limi
         if len(chosen) < _MOST_LEARNT and (
                 np.linalg.norm(others - place, axis=1).min() > 0.5 * _APART):
             chosen.append(int(index))
-    return _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved, field.samples)
+    found = _as_samples(grasp_model, whole.take(np.array(chosen, int)), path.unsolved,
+                        field.samples)
+    return found if close is None else replace(found, closeness=close[chosen])
 
 
 def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarray,

@@ -139,7 +139,7 @@ def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> 
     found = [("energy", field.energy(points), limits.max_energy, " J"),
              ("force", np.linalg.norm(field.force(points), axis=1), limits.max_force, " N")]
     found += [(name.replace("_", " "), np.abs(field.load(points, name)), limit, unit)
-              for name, limit, unit in zip(LOADS, limits.max_loads, ("", " Pa", " N", " Nm"),
+              for name, limit, unit in zip(LOADS, limits.max_loads, ("", " Pa", " N", " Nm", ""),
                                            strict=True) if limit < np.inf]
     told = [f"the {name} is at least {values.min():.3g}{unit} where {limit:.3g}{unit} is allowed"
             for name, values, limit, unit in found if values.min() > limit]

@@ -11,12 +11,12 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
-from limber.planning.obstacles import Obstacle, closest
+from limber.planning.obstacles import Obstacle, closeness, closest
 from limber.planning.resolve import SolvedPoses
 from limber.planning.settings import PlanSettings
 
 UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
-         "torque": "Nm"}
+         "torque": "Nm", "closeness": ""}
 """Of the limits, by the names that they have in :class:`Limits`."""
 
 _COVERED = 0.95  # of the samples near a limit
@@ -55,6 +55,7 @@ class Limits:
         strain, stress: Largest principal anywhere in the branch, stress in Pa.
         axial_force: Of the gripper along the branch, pulling or pushing [N].
         torque: Of the gripper [Nm].
+        closeness: Of the branch to the obstacles (:func:`~.obstacles.closeness`).
         low, high: Box that the grasp stays in [m], shape [3].
         obstacles: Bodies that the branch must not meet.
     """
@@ -65,6 +66,7 @@ class Limits:
     stress: float = np.inf
     axial_force: float = np.inf
     torque: float = np.inf
+    closeness: float = np.inf
     low: np.ndarray = field(default_factory=lambda: np.full(3, -np.inf))
     high: np.ndarray = field(default_factory=lambda: np.full(3, np.inf))
     obstacles: tuple[Obstacle, ...] = ()
@@ -77,6 +79,7 @@ class Limits:
             InputError: the workspaces have nothing in common.
         """
         both = replace(self, force=min(self.force, force), obstacles=obstacles,
+                       closeness=1.0 if obstacles else np.inf,
                        low=self.low if low is None else np.maximum(self.low, low),
                        high=self.high if high is None else np.minimum(self.high, high))
         if not (both.low < both.high).all():
@@ -84,6 +87,10 @@ class Limits:
                              f"Together they go from {both.low} to {both.high} m.",
                              "Correct --workspace-low and --workspace-high, or the cell file.")
         return both
+
+    def closeness_of(self, nodes: np.ndarray, displacements: np.ndarray) -> np.ndarray:
+        """Return how close the branch is to obstacles in states [k, n, 3], shape [k]."""
+        return np.array([closeness(self.obstacles, nodes + moved) for moved in displacements])
 
     def met(self, states: SolvedPoses, nodes: np.ndarray) -> str | None:
         """Return in words where the branch, with ``nodes`` [n, 3] at rest, meets an obstacle."""
@@ -135,6 +142,7 @@ class Limits:
                   **samples.loads}
         inner = ~known.region.is_face()
         found = dict.fromkeys(UNITS, 0.0)
+        values["closeness"] = samples.closeness
         for name, limit in self.asked().items():
             if values[name] is None:
                 raise InputError(f"The energy field knows no {name.replace('_', ' ')}.",

@@ -8,6 +8,7 @@ import numpy as np
 from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.surface import Surface
 
+_SCALE = 0.1  # [m] by which closeness falls to a third
 _CHUNK = 2_000_000  # point and face pairs whose solid angles are summed at a time
 
 
@@ -50,6 +51,13 @@ class Solid:
         for part in np.array_split(near, 1 + len(near) * len(self.surface.faces) // _CHUNK):
             distance[part] *= np.where(np.abs(_winding(self.surface, points[part])) > 0.5, -1, 1)
         return distance
+
+
+def closeness(obstacles: tuple[Obstacle, ...], nodes: np.ndarray) -> float:
+    """Return how close a body with ``nodes`` [n, 3] is to any obstacle: ``exp(-d / 0.1 m)`` of its
+    clearance d, 1 where it touches one, more inside; smooth for a planner's field."""
+    clearance = min(float(obstacle.clearance(nodes).min()) for obstacle in obstacles)
+    return float(np.exp(-clearance / _SCALE))
 
 
 def closest(obstacles: tuple[Obstacle, ...], points: np.ndarray, radius: float = 0.0,

@@ -20,8 +20,9 @@ from limber.planning.compare import (
     random_start,
 )
 from limber.planning.cost import STEP, PathMeasures, measure_path, resample
-from limber.planning.field.energy_field import EnergyField, refit
+from limber.planning.field.energy_field import EnergyField, among_obstacles, refit
 from limber.planning.field.grasp_model import GraspModel
+from limber.planning.field.sampling import displacements_at
 from limber.planning.full_check import broken_on_full_model, field_error, learnt
 from limber.planning.goals import Goal, GraspGoal, TargetGoal, default_goal
 from limber.planning.limits import Limits
@@ -78,6 +79,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     goal = _goal(field, grasp_model, settings, view)
     start = _start(field, goal, settings)
     limits = limits or Limits.of(settings)
+    if limits.obstacles:
+        field = _among(field, grasp_model, limits, progress)
     rounds: list[dict[str, Any]] = []
     pair = baseline = None
     planned_limits, risks = limits, []
@@ -97,9 +100,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         baseline = other[0] if other else baseline
         broken = broken_on_full_model(plan, limits, goal)
         if met := limits.met(plan.approach.joined(plan.solved), grasp_model.mesh.nodes):
-            raise NoPathError(f"On the planned way {met}.",
-                              "Paths are checked against obstacles, and not yet led around them.",
-                              "Choose another goal, or a workspace that keeps clear of it.")
+            broken.append(met)
         if doubt is not None and not broken:
             risks.append(doubt.risk(grasp_model, plan, limits, settings.confidence))
             broken = risks[-1].told()
@@ -126,6 +127,23 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         progress.warn(message)
     return PlannedMotion(summary, baseline, plan, field, {
         name: path.tree for name, path in pair.trees.items()})
+
+
+def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, progress: Progress,
+           ) -> EnergyField:
+    """Return the field that knows how close the branch is to obstacles.
+
+    Raises:
+        NoPathError: it meets one where it hangs.
+    """
+    nodes = grasp_model.mesh.nodes
+    at_rest = limits.closeness_of(nodes, grasp_model.rest.displacement[None])[0]
+    if at_rest > 1.0:
+        raise NoPathError("The branch meets an obstacle where it hangs.",
+                          "No path begins there.", "Correct the obstacles in the cell file.")
+    displacements = displacements_at(grasp_model, field.samples.positions,
+                                     progress.part(0.0, 0.1))
+    return among_obstacles(field, limits.closeness_of(nodes, displacements))
 
 
 def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:

@@ -184,6 +184,8 @@ def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]
              "torque": np.linalg.norm(motion.torques, axis=1)}
     found = {}
     for name, limit in limits.asked().items():
+        if name not in peaks:
+            continue
         peak = float(np.abs(peaks[name]).max())
         unit = UNITS[name].lower()
         found[f"{name}_{unit}" if unit else name] = {"limit": limit, "peak": peak,

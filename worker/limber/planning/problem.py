@@ -44,7 +44,7 @@ class GentleProblem:
         kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
             ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
             *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
-                 ("", "Pa", "N", "Nm"), strict=True)) if value < np.inf]
+                 ("", "Pa", "N", "Nm", "(1: it touches)"), strict=True)) if value < np.inf]
         return (" at most " + " and ".join(kept)) if kept else ""
 
     def goal_excess(self, point: np.ndarray) -> float:

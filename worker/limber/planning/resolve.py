@@ -74,8 +74,8 @@ class SolvedPoses:
 
     @property
     def loads(self) -> dict[str, np.ndarray]:
-        """Loads by their names, shape [n] each."""
-        return dict(zip(LOADS, (self.strains, self.stresses, self.axial_forces,
+        """Loads by their names but closeness to obstacles, shape [n] each."""
+        return dict(zip(LOADS[:-1], (self.strains, self.stresses, self.axial_forces,
                                 np.linalg.norm(self.torques, axis=1)), strict=True))
 
     def take(self, index: np.ndarray) -> "SolvedPoses":

@@ -48,9 +48,10 @@ _CHOSEN_BY = ("energy_error", "force_error", "energy_error_median", "force_error
 _OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
              "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n"}
-LOADS = ("strain", "stress", "axial_force", "torque")
+LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
 """What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
-gripper's force along the branch [N], outward positive, and its torque [Nm]."""
+gripper's force along the branch [N], outward positive, and its torque [Nm]; how close the branch is
+to an obstacle, 1 where it touches one."""
 _WHAT = "an energy field (`limber energy --force` makes one)"
 _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_m": ("m", 3),
            "min_det_f": ("m",), "rejected_poses": ("q", 6)}
@@ -89,6 +90,7 @@ class GraspSamples:
         shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
             [m, 3, 6 + 3 targets].
         axial_forces: Part of the force along the branch at the grasp, outward [N], shape [m].
+        closeness: To the obstacles that a plan is made among, shape [m]; in no file.
     """
 
     poses: np.ndarray
@@ -104,6 +106,7 @@ class GraspSamples:
     stresses: np.ndarray | None = None
     shape_slopes: np.ndarray | None = None
     axial_forces: np.ndarray | None = None
+    closeness: np.ndarray | None = None
 
     @property
     def positions(self) -> np.ndarray:
@@ -121,8 +124,8 @@ class GraspSamples:
     def loads(self) -> dict[str, np.ndarray | None]:
         """By the names of ``LOADS``, shape [m] each; None where a file does not have them."""
         torque = None if self.torques is None else np.linalg.norm(self.torques, axis=1)
-        return dict(zip(LOADS, (self.strains, self.stresses, self.axial_forces, torque),
-                        strict=True))
+        return dict(zip(LOADS, (self.strains, self.stresses, self.axial_forces, torque,
+                                self.closeness), strict=True))
 
     @property
     def load_table(self) -> np.ndarray:
@@ -170,7 +173,7 @@ class EnergyField:
         load_fit: Channels: those of ``LOADS``.
         region: Where the field may be believed.
         errors: On samples left out; see :func:`error_measures`.
-        missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 8].
+        missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 9].
     """
 
     samples: GraspSamples
@@ -288,7 +291,7 @@ class EnergyField:
                 **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
             if "chart_layers" not in arrays:  # of an older program
                 return fit_field(samples, arrays["chart_base_m"])
-            if "load_fit_kernel" not in arrays:
+            if arrays.get("load_fit_value_weights", np.empty((0, 0))).shape[1] != len(LOADS):
                 return fit_field(samples, arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
             fits = [RadialInterpolant.from_arrays(arrays, f"{name}_")
                     for name in ("energy_fit", "shape_fit", "load_fit")]
@@ -371,7 +374,15 @@ def _slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
 
 def refit(field: EnergyField, added: GraspSamples) -> EnergyField:
     """Return the field fitted to ``added`` samples as well, in the same way."""
-    samples = field.samples.joined(added)
+    return _as_before(field, field.samples.joined(added))
+
+
+def among_obstacles(field: EnergyField, closeness: np.ndarray) -> EnergyField:
+    """Return the field that knows how close the branch is to obstacles at its samples, [m]."""
+    return _as_before(field, replace(field.samples, closeness=closeness))
+
+
+def _as_before(field: EnergyField, samples: GraspSamples) -> EnergyField:
     energy, shape = (FitChoice(fit.kernel, fit.shape, chart.stretch,
                                chart.depth / (chart.radius or 1.0))
                      for fit, chart in ((field.energy_fit, field.chart),

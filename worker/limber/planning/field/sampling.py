@@ -221,6 +221,30 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
     return solved
 
 
+def displacements_at(grasp_model: GraspModel, positions: np.ndarray,
+                     progress: Progress = SILENT) -> np.ndarray:
+    """Return the branch's states with its grasp at ``positions`` [m, 3] that could be solved once.
+
+    Shape [m, node_count, 3]; each from the nearest one before.
+
+    Raises:
+        ConvergenceError: one cannot be solved again.
+    """
+    known, states = [grasp_model.rest_position], [grasp_model.rest.displacement]
+    found = np.zeros((len(positions), *states[0].shape))
+    waiting = list(range(len(positions)))
+    while waiting:
+        gaps = np.linalg.norm(positions[waiting][:, None] - np.array(known)[None], axis=2)
+        place, source = np.unravel_index(np.argmin(gaps), gaps.shape)
+        target = waiting.pop(int(place))
+        result = grasp_model.follow(positions[target][None], states[int(source)])[0].require()
+        found[target] = result.displacement
+        known.append(positions[target])
+        states.append(result.displacement)
+        progress(1.0 - len(waiting) / len(positions), "the branch among obstacles")
+    return found
+
+
 def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
                  progress: Progress = SILENT) -> list[_Solved]:
     def report(done: int) -> None:
