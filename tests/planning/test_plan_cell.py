@@ -10,6 +10,7 @@ from limber.planning.compare import PlanSettings
 from limber.planning.plan_file import read_plan
 from limber.robot.cell import Cell, write_cell
 from limber.stages.plan import plan as plan_paths
+from limber.stages.plan_cell import region_of, require_taken
 from limber.store import Branch
 
 SETTINGS = PlanSettings(iterations=300)
@@ -86,6 +87,20 @@ def test_a_branch_is_led_around_an_obstacle(copied):
     with pytest.raises(NoPathError, match="where it hangs"):
         plan_paths(copied, SETTINGS, name="leaning", workers=1, cell_file=post(
             there.motion.tips[0]))
+
+
+def test_a_second_arm_reaches_as_far_as_it_can():
+    """Its region is the ball about its shoulder; within it inverse kinematics decides."""
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0, 0, 0, 0, 0, 0)}, second_arm={
+        "model": "ur3e", "base_pose": (1.0, 0, 0, 0, 0, 0)})
+    region = region_of(cell, PlanSettings(second_arm=True))
+    assert region.middle == pytest.approx([1.0, 0.0, 0.15185])
+    assert 0.5 < region.radius < 0.6
+    require_taken(cell, np.array([1.0, 0.3, 0.3]))
+    with pytest.raises(NoPathError, match="second arm"):
+        require_taken(cell, np.array([1.0, 0.9, 0.3]))
+    with pytest.raises(NoPathError, match="directions"):
+        require_taken(cell, np.array([1.0, 0.0, 0.15]))
 
 
 def test_a_workspace_is_kept_and_one_without_the_goal_refused(copied):

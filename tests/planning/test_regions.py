@@ -67,7 +67,8 @@ def test_a_named_target_is_brought_into_a_box(ridge):
     ({"target": "flower"}, "without a place"),
     ({"target": "flower", "tip_goal": (0, 0, 1)}, "no target flower"),
     ({"target_box": (0, 0, 1, 1, 1, 0)}, "empty"),
-    ({"in_view": True}, "no camera"),
+    ({"in_view": True}, r"no cell with a \[camera\]"),
+    ({"second_arm": True}, r"no cell with a \[second_arm\]"),
 ])
 def test_goals_that_make_no_sense_are_refused(small_model, ridge_field, settings, words):
     with pytest.raises(InputError, match=words):

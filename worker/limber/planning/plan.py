@@ -56,14 +56,14 @@ class PlannedMotion:
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
-                limits: Limits | None = None, view: View | None = None,
+                limits: Limits | None = None, region: Region | None = None,
                 doubt: YoungDoubt | None = None, workers: int | None = None,
                 progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
     ``limits`` are the settings' where not given; those of a robot's cell come in this way, and
-    what its camera sees as ``view``. With ``doubt`` the limits are kept with the settings'
-    confidence: planned is with tighter ones.
+    what its camera sees or its second arm reaches as ``region``. With ``doubt`` the limits are kept
+    with the settings' confidence: planned is with tighter ones.
 
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and it is planned anew, at most
@@ -76,7 +76,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         ConvergenceError: the branch cannot be solved along the shortest path.
     """
     one_thread()
-    goal = _goal(field, grasp_model, settings, view)
+    goal = _goal(field, grasp_model, settings, region)
     start = _start(field, goal, settings)
     limits = limits or Limits.of(settings)
     if limits.obstacles:
@@ -119,6 +119,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     _require_sight(goal, grasp_model, plan)
     summary = _summary(field, goal, start, pair, baseline.require(), plan, settings)
     summary["rounds"] = rounds
+    if isinstance(goal, TargetGoal):
+        summary["target_end_m"] = goal.place(plan.solved)
     if risks:
         summary["confidence"] = {"asked": settings.confidence, "kept_at_least": risks[-1].kept,
                                  "factors": risks[-1].factors,
@@ -156,9 +158,10 @@ def _refused(broken: list[str], settings: PlanSettings) -> NoPathError:
 
 
 def _goal(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings,
-          view: View | None) -> Goal:
+          cells: Region | None) -> Goal:
     given = {"--goal": settings.goal, "--tip-goal": settings.tip_goal,
-             "--target-box": settings.target_box, "--in-view": settings.in_view or None}
+             "--target-box": settings.target_box, "--in-view": settings.in_view or None,
+             "--second-arm": settings.second_arm or None}
     asked = [name for name, value in given.items() if value is not None]
     if len(asked) > 1:
         raise InputError(f"{' and '.join(asked)} are given.", "A path ends in one goal.",
@@ -166,7 +169,7 @@ def _goal(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings,
     if settings.target is not None and asked in ([], ["--goal"]):
         raise InputError(f"--target {settings.target} is given without a place for it.",
                          "A target alone says not where it shall be.",
-                         "Give --tip-goal, --target-box or --in-view as well.")
+                         "Give --tip-goal, --target-box, --in-view or --second-arm as well.")
     if settings.goal is not None:
         return GraspGoal(settings.goal, settings.goal_tolerance)
     if not asked:
@@ -180,11 +183,12 @@ def _goal(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings,
                              "Its lower corner must be below the upper one in x, y and z.",
                              "Correct --target-box.")
         region = BoxRegion(low, high)
-    elif view is None:
-        raise InputError("--in-view is given, but no camera.", "A cell file says where it stands.",
-                         "Give --cell with a [camera].")
+    elif cells is None:
+        what = "[camera] that stands still" if settings.in_view else "[second_arm]"
+        raise InputError(f"{asked[0]} is given, but no cell with a {what}.",
+                         "The cell file says where it stands.", "Give --cell with one.")
     else:
-        region = view
+        region = cells
     return TargetGoal(region, *_target(grasp_model, settings.target))
 
 
@@ -251,7 +255,8 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
 
 
 def _is_chosen(settings: PlanSettings) -> bool:
-    return not (settings.goal or settings.tip_goal or settings.target_box or settings.in_view)
+    return not (settings.goal or settings.tip_goal or settings.target_box or settings.in_view
+                or settings.second_arm)
 
 
 def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:

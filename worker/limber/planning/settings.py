@@ -26,8 +26,8 @@ class PlanSettings(Settings):
     """From where to where, what counts and what is not allowed."""
 
     groups: ClassVar[Groups] = {
-        "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "goal_tolerance",
-                           "start", "start_seed"),
+        "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "second_arm",
+                           "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "max_stress", "workspace_low", "workspace_high", "confidence"),
@@ -42,13 +42,15 @@ class PlanSettings(Settings):
     tip_goal: tuple[float, float, float] | None = Field(None, description=(
         "Where the branch's tip (its flower), or --target, shall be, in the branch's frame [m]."))
     target: str | None = Field(None, description=(
-        "Named target (`limber target`) that --tip-goal, --target-box and --in-view speak of; "
-        "without it the tip."))
+        "Named target (`limber target`) that --tip-goal, --target-box, --in-view and "
+        "--second-arm speak of; without it the tip."))
     target_box: tuple[float, float, float, float, float, float] | None = Field(None, description=(
         "Box that the target shall be in: lower corner, upper corner, in the branch's frame [m]."))
     in_view: bool = Field(False, description=(
         "The target shall be in the view of the cell's camera: in its picture, in its range, and "
         "not hidden by the branch."))
+    second_arm: bool = Field(False, description=(
+        "The target shall be where the cell's second arm can take it."))
     goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp starts [m]; default the rest pose."))

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from limber.planning.limits import Limits
     from limber.planning.plan import PlannedMotion
     from limber.planning.plan_file import Way
-    from limber.planning.regions import View
+    from limber.planning.regions import Region
     from limber.planning.timing import Pace
     from limber.robot.cell import Cell
 
@@ -76,7 +76,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
     from limber.stages.loading import load_grasp_model
-    from limber.stages.plan_cell import reached_by
+    from limber.stages.plan_cell import reached_by, require_taken
     from limber.stages.plan_doubt import young_doubt
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
@@ -100,7 +100,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     digests = digests | {"stiffer": f"{stiffer:.6f}"}
     asked = Limits.of(settings, stiffer)
     doubt = None if settings.confidence is None else young_doubt(branch, grasp_model, asked)
-    in_cell = None if cell_file is None else _InCell.of(branch, cell_file, asked, progress)
+    in_cell = None if cell_file is None else _InCell.of(branch, cell_file, settings, asked,
+                                                              progress)
     if in_cell is not None:
         digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
@@ -113,7 +114,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
         found = plan_motion(field, grasp_model, settings, limits=limits,
-                            view=in_cell and in_cell.view, doubt=doubt, workers=workers,
+                            region=in_cell and in_cell.region, doubt=doubt, workers=workers,
                             progress=progress)
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:
@@ -121,6 +122,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
+            if settings.second_arm:
+                require_taken(in_cell.cell, np.array(found.summary["target_end_m"]))
             found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
                                                 limits.obstacles, pace.speed)
         progress(0.95, "writing")
@@ -136,15 +139,16 @@ class _InCell:
 
     cell: Cell
     limits: Limits
-    view: View | None
+    region: Region | None
 
     @classmethod
-    def of(cls, branch: Branch, path: Path, limits: Limits, progress: Progress) -> _InCell:
-        from limber.stages.plan_cell import cell_for, cell_obstacles, limits_in, view_of
+    def of(cls, branch: Branch, path: Path, settings: PlanSettings, limits: Limits,
+           progress: Progress) -> _InCell:
+        from limber.stages.plan_cell import cell_for, cell_obstacles, limits_in, region_of
 
         cell = cell_for(branch, path, progress)
         return cls(cell, limits_in(cell, limits, cell_obstacles(cell, path.parent)),
-                   view_of(cell))
+                   region_of(cell, settings))
 
 
     def slowed(self, pace: Pace) -> Pace:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError, NoPathError
 from limber.geometry.surface.input import usable_surface
@@ -11,15 +12,18 @@ from limber.geometry.surface.surface import Surface
 from limber.planning.limits import Limits
 from limber.planning.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.plan_file import Way
-from limber.planning.regions import View
+from limber.planning.regions import Ball, Region, View
+from limber.planning.settings import PlanSettings
 from limber.progress import Progress
+from limber.robot.arms import arm_named
 from limber.robot.belonging import check_branch
 from limber.robot.cell import BoxEntry, Cell, read_cell
 from limber.robot.execution import robot_motion
-from limber.robot.kinematics import inverted, matrices
+from limber.robot.kinematics import inverse, inverted, matrices
 from limber.store import Branch
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_TURNS = 200  # directions from which a second arm may take a target
 _CAPSULE_POINTS = 9  # along a part of the gripper
 _LARGE = 20.0  # [m] an obstacle that is larger is in another unit
 
@@ -60,7 +64,35 @@ def cell_obstacles(cell: Cell, folder: Path) -> tuple[Obstacle, ...]:
     return tuple(found)
 
 
-def view_of(cell: Cell) -> View | None:
+def region_of(cell: Cell, settings: PlanSettings) -> Region | None:
+    """Return what the settings ask of the cell: its camera's view or its second arm's reach."""
+    if settings.in_view:
+        return _view_of(cell)
+    if not settings.second_arm or cell.second_arm is None:
+        return None
+    arm = arm_named(cell.second_arm.model)
+    shoulder = (matrices(np.array(cell.second_arm.base_pose)) @ [0.0, 0.0, arm.d[0], 1.0])[:3]
+    return Ball(tuple(map(float, shoulder)), arm.reach)
+
+
+def require_taken(cell: Cell, place: np.ndarray) -> None:
+    """Raise NoPathError where the second arm can take nothing at ``place`` [3] from any side."""
+    entry = cell.second_arm
+    assert entry is not None
+    arm = arm_named(entry.model)
+    turns = Rotation.random(_TURNS, rng=np.random.default_rng(0)).as_matrix()
+    frames = np.tile(np.eye(4), (_TURNS, 1, 1))
+    frames[:, :3, :3], frames[:, :3, 3] = turns, place
+    flange = inverted(matrices(np.array(entry.base_pose))) @ frames @ inverted(
+        matrices(np.array(entry.grasp_pose)))
+    if np.isnan(inverse(arm, flange)).any(axis=-1).all():
+        where = ", ".join(f"{x:.3f}" for x in place)
+        raise NoPathError(f"The second arm ({arm.name}) cannot take the target at ({where}) m.",
+                          f"None of {_TURNS} directions has inverse kinematics there.",
+                          "Put the arm nearer or farther, or give a --target-box.")
+
+
+def _view_of(cell: Cell) -> View | None:
     """Return what the cell's camera sees; None without one that stands still."""
     camera = cell.camera
     if camera is None or camera.mount != "branch":
