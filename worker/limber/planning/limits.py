@@ -121,7 +121,8 @@ class Limits:
                              "Correct --workspace-low and --workspace-high.")
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
                    settings.max_strain or np.inf, (settings.max_stress or np.inf) / stiffer,
-                   settings.max_axial_force or np.inf, settings.max_torque or np.inf, low, high)
+                   settings.max_axial_force or np.inf, settings.max_torque or np.inf, low=low,
+                   high=high)
 
     def tightened(self, factors: dict[str, float]) -> "Limits":
         """Return the limits divided by ``factors``, by the names of ``UNITS``."""
@@ -142,7 +143,6 @@ class Limits:
                   **samples.loads}
         inner = ~known.region.is_face()
         found = dict.fromkeys(UNITS, 0.0)
-        values["closeness"] = samples.closeness
         for name, limit in self.asked().items():
             if values[name] is None:
                 raise InputError(f"The energy field knows no {name.replace('_', ' ')}.",
