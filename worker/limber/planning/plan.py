@@ -32,7 +32,7 @@ from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread
 
-_RESERVE = 1.01  # on factors of limits: they change a little with the path
+_RESERVE = 1.01  # on what limits are tightened by: the risk changes a little with the path
 _OWN = 0.003  # [m] of the surface about a target that does not hide it
 _WIDE_GAP = 5.0  # percent, above which the user is told in a warning
 
@@ -104,8 +104,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         if doubt is not None and not broken:
             risks.append(doubt.risk(grasp_model, plan, limits, settings.confidence))
             broken = risks[-1].told()
-            planned_limits = limits.tightened(
-                {name: _RESERVE * factor for name, factor in risks[-1].factors.items()})
+            planned_limits = planned_limits.tightened(
+                {name: _RESERVE * share for name, share in risks[-1].excess.items() if share > 1.0})
         off = field_error(field, plan.solved)
         rounds.append({"broken": broken, "sample_count": len(field.samples.poses),
                        "margins": pair.margins, "field_energy_error": off,
