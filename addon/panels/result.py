@@ -19,7 +19,6 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         self.layout.prop(settings.scene, "plan")
         self.layout.prop(settings.scene, "motion")
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
-        self.layout.operator("limber.grab", icon="VIEW_PAN")
         self.layout.prop(settings, "show_expert")
         if not preferences.has_worker():
             column = self.layout.column(align=True)
@@ -29,6 +28,7 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
                             icon="PREFERENCES").module = preferences.KEY
         surface = scene.find_surface(context.scene)
         if surface is not None:
+            self.layout.operator("limber.grab", icon="VIEW_PAN")
             _draw_legend(self.layout, json.loads(surface[scene.INFO_KEY]))
 
 
