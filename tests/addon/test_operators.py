@@ -143,7 +143,7 @@ def test_check_worker(bpy, registered):
 def test_no_worker(bpy, registered, monkeypatch):
     """Without a worker the error says how to bring one."""
     monkeypatch.setenv("LIMBER_PYTHON", "/nowhere/python")
-    with pytest.raises(RuntimeError, match="does not bring along yet"):
+    with pytest.raises(RuntimeError, match="Install that zip, or the worker"):
         bpy.ops.limber.check_worker()
 
 
