@@ -1,5 +1,6 @@
 """Open a branch folder: its surface coloured and moving, paths, goal and marks."""
 
+import json
 import tempfile
 from pathlib import Path
 
@@ -37,6 +38,9 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
 
     def finish(self, context, result):
         with self._temporary:
+            if not self._data_path.is_file():
+                raise ValueError(f"The worker ended well but wrote nothing to show. It said: "
+                                 f"{json.dumps(result)} {' '.join(self._job.log)}")
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
         scene.place_scans(context.scene, data)

@@ -70,8 +70,15 @@ def waited(seconds):
 def open_result():
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
-    with override():
-        bpy.ops.limber.open_result(directory=str(FOLDER / "beam.branch"))
+    try:
+        with override():
+            bpy.ops.limber.open_result(directory=str(FOLDER / "beam.branch"))
+    except RuntimeError as error:
+        # Seen once beside another Blender: what the worker had written was not there.
+        if "opening_failed" in seen:
+            raise
+        seen["opening_failed"] = str(error)
+        return False
     view()[1].spaces.active.region_3d.view_perspective = "ORTHO"
     return True
 
