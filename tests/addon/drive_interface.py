@@ -200,4 +200,6 @@ def run():
 
 
 bpy.context.preferences.view.show_splash = False
+# Blender keeps what was changed when it quits: the next test would start with it.
+bpy.context.preferences.use_preferences_save = False
 bpy.app.timers.register(run, first_interval=2.0)
