@@ -6,6 +6,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from limber.errors import ConvergenceError
+from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import BranchModel
 
 _SPARE = 4
@@ -45,15 +46,30 @@ def lowest_modes(model: BranchModel, count: int, displacement: np.ndarray | None
     vectors[:, model.fixed] = 0.0
     before = np.zeros(count)
     for _ in range(_ITERATIONS):
-        pushed = np.array([model.mass_times(vector) for vector in vectors])
-        vectors = np.array([tangent.solve(force) for force in pushed])
-        flat = vectors.reshape(len(vectors), -1)
-        stiffness = flat @ pushed.reshape(len(vectors), -1).T
-        mass = flat @ np.array([model.mass_times(vector).ravel() for vector in vectors]).T
-        squares, mix = eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
-        vectors = np.tensordot(mix.T, vectors, axes=1)
+        squares, vectors = subspace_round(model, tangent, vectors)
         if np.abs(squares[:count] - before).max() <= _TOLERANCE * squares[:count].max():
             return Modes(np.sqrt(squares[:count]) / (2 * np.pi), vectors[:count])
         before = squares[:count]
     raise ConvergenceError(f"The {count} lowest modes have not settled in {_ITERATIONS} rounds.",
                            "They may lie very close together.", "Ask for fewer.")
+
+
+def subspace_round(model: BranchModel, tangent: Tangent, vectors: np.ndarray,
+                   ) -> tuple[np.ndarray, np.ndarray]:
+    """Do one round of subspace iteration (Bathe), with Rayleigh and Ritz.
+
+    Args:
+        tangent: Of the equilibrium.
+        vectors: Of the subspace, shape [k, node_count, 3].
+
+    Returns:
+        Squared angular frequencies [1/s^2], ascending, shape [k], and their modes, of unit modal
+        mass, of the subspace one round on.
+    """
+    pushed = np.array([model.mass_times(vector) for vector in vectors])
+    vectors = np.array([tangent.solve(force) for force in pushed])
+    flat = vectors.reshape(len(vectors), -1)
+    stiffness = flat @ pushed.reshape(len(vectors), -1).T
+    mass = flat @ np.array([model.mass_times(vector).ravel() for vector in vectors]).T
+    squares, mix = eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
+    return squares, np.tensordot(mix.T, vectors, axes=1)

@@ -6,10 +6,10 @@ of the undeformed branch: the change is small, and wanted as a weight, not as a 
 """
 
 import numpy as np
-from scipy.linalg import eigh
 
 from limber.mechanics.dynamics.motion import NewmarkSettings
 from limber.mechanics.model import BranchModel
+from limber.mechanics.vibration import subspace_round
 
 MODES = 16
 """That carry the change of a motion; the rest follows statically. Chosen, not measured."""
@@ -54,13 +54,7 @@ def _modes(model: BranchModel, loads: np.ndarray) -> tuple[np.ndarray, np.ndarra
     free[:, model.fixed] = 0.0
     vectors = np.concatenate([static, free])
     for _ in range(ITERATIONS):
-        pushed = np.array([model.mass_times(vector) for vector in vectors])
-        vectors = np.array([tangent.solve(force) for force in pushed])
-        flat = vectors.reshape(len(vectors), -1)
-        stiffness = flat @ pushed.reshape(len(vectors), -1).T
-        mass = flat @ np.array([model.mass_times(v).ravel() for v in vectors]).T
-        squares, mix = eigh((stiffness + stiffness.T) / 2, (mass + mass.T) / 2)
-        vectors = np.tensordot(mix.T, vectors, axes=1)
+        squares, vectors = subspace_round(model, tangent, vectors)
     return squares[:MODES], vectors[:MODES], static
 
 
