@@ -1,36 +1,19 @@
 """Bends a branch with the mouse inside a Blender with a window; test_real_blender.py starts it.
 
-    blender --enable-event-simulate --python drive_grab.py -- FOLDER
-
-FOLDER has beam.branch; log.json is written there, and a picture is asked for as drive_interface.py
-does. A step is a function that returns True when it is done.
+FOLDER has beam.branch.
 """
 
-import json
 import sys
-import time
-import traceback
 from pathlib import Path
 
 import bpy
 from bpy_extras import view3d_utils
 from mathutils import Vector
 
-FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
-KEY = "bl_ext.user_default.limber"
-seen = {"error": None}
+sys.path.insert(0, str(Path(__file__).parent))
+from driving import FOLDER, KEY, drive, override, picture, seen, view, waited
+
 state = {}
-
-
-def view():
-    window = bpy.context.window_manager.windows[0]
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
-    return window, area, next(region for region in area.regions if region.type == "WINDOW")
-
-
-def override():
-    window, area, region = view()
-    return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
 
 
 def surface():
@@ -61,10 +44,6 @@ def event(kind, value="NOTHING", move=(0, 0)):
 
 def sessions():
     return sys.modules[f"{KEY}.session"]._open
-
-
-def waited(seconds):
-    return time.monotonic() - state["step"] > seconds
 
 
 def open_result():
@@ -120,14 +99,6 @@ def is_bent():
     return bent > 0.02
 
 
-def picture():
-    request = FOLDER / "grab.request"
-    if "asked" not in state:
-        state["asked"] = request.touch()
-        return False
-    return not request.exists()
-
-
 def let_go():
     return event("LEFTMOUSE", "RELEASE", move=(60, -4))
 
@@ -163,29 +134,5 @@ def is_left():
     return not sessions()
 
 
-STEPS = [open_result, begin, is_loaded, hover, press, drag, is_bent, picture, let_go, keep,
-         is_kept, undo, begin, is_loaded, escape, is_left]
-
-
-def run():
-    """Do what is next; called again after a while until all is done or something failed."""
-    try:
-        state.setdefault("step", time.monotonic())
-        if STEPS[0]():
-            STEPS.pop(0)
-            del state["step"]
-        elif waited(100):
-            raise TimeoutError(f"{STEPS[0].__name__}, {len(STEPS)} steps from the end")
-        if STEPS:
-            return 0.05
-    except Exception:
-        seen["error"] = traceback.format_exc()
-    (FOLDER / "log.json").write_text(json.dumps(seen))
-    bpy.ops.wm.quit_blender()
-    return None
-
-
-bpy.context.preferences.view.show_splash = False
-# Blender keeps what was changed when it quits: the next test would start with it.
-bpy.context.preferences.use_preferences_save = False
-bpy.app.timers.register(run, first_interval=2.0)
+drive([open_result, begin, is_loaded, hover, press, drag, is_bent, picture("grab"), let_go, keep,
+       is_kept, undo, begin, is_loaded, escape, is_left], longest=100)

@@ -1,46 +1,19 @@
 """Drives Limber's interface inside a Blender with a window; test_real_blender.py starts it.
 
-    blender --enable-event-simulate --python drive_interface.py -- FOLDER
-
-FOLDER has scan.ply, slow_worker and beam.branch; log.json is written there. A step is a function
-that returns True when it is done; a timer calls the current one. A picture is asked for by a file
-NAME.request, and has been taken when that file is gone.
+FOLDER has scan.ply, slow_worker and beam.branch.
 """
 
-import json
 import sys
-import time
-import traceback
 from pathlib import Path
 
 import bpy
 
-FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
-KEY = "bl_ext.user_default.limber"
-seen = {"error": None}
-started = {}
-
-
-def view():
-    """Return window, 3D view area and its sidebar region."""
-    window = bpy.context.window_manager.windows[0]
-    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
-    return window, area, next(region for region in area.regions if region.type == "UI")
-
-
-def override():
-    window, area, _ = view()
-    region = next(region for region in area.regions if region.type == "WINDOW")
-    return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
+sys.path.insert(0, str(Path(__file__).parent))
+from driving import FOLDER, KEY, drive, override, picture, seen, started, view, waited
 
 
 def jobs():
     return sys.modules[f"{KEY}.jobs"]
-
-
-def waited(seconds):
-    """Whether the current step has lasted that long."""
-    return time.monotonic() - started["step"] > seconds
 
 
 def open_sidebar():
@@ -49,7 +22,7 @@ def open_sidebar():
 
 
 def open_tab():
-    _, area, sidebar = view()
+    _, area, sidebar = view("UI")
     if not waited(0.5):
         return False
     sidebar.active_panel_category = "Limber"
@@ -61,24 +34,9 @@ def open_tab():
     return True
 
 
-def picture(name):
-    def step():
-        request = FOLDER / f"{name}.request"
-        if "picture" not in started:
-            if not waited(1.0):
-                return False
-            started["picture"] = request
-            request.touch()
-        if request.exists():
-            return False
-        del started["picture"]
-        return True
-    return step
-
-
 def button_place(offset):
     """Return window coordinates of the middle of the sidebar, ``offset`` pixels below its top."""
-    sidebar = view()[2]
+    sidebar = view("UI")[2]
     return sidebar.x + sidebar.width // 2 - 10, sidebar.y + sidebar.height - offset
 
 
@@ -173,33 +131,7 @@ def played():
     return bpy.context.scene.frame_current > 1
 
 
-STEPS = [open_sidebar, open_tab, picture("tab"), click(270), imported, click(365), reconstructed,
-         start_slow_job, slow_job_reports, picture("job"), click(124), job_cancelled,
-         open_result, opened, picture("opened"), play, played, picture("playing"),
-         start_slow_job, slow_job_left_running]
-
-
-def run():
-    """Do what is next; called again after a while until all is done or something failed."""
-    try:
-        if "step" not in started:
-            started["step"] = time.monotonic()
-            started["name"] = getattr(STEPS[0], "__name__", "step")
-        if STEPS[0]():
-            STEPS.pop(0)
-            del started["step"]
-        elif waited(80):
-            raise TimeoutError(f"{started['name']}, {len(STEPS)} steps from the end")
-        if STEPS:
-            return 0.05
-    except Exception:
-        seen["error"] = traceback.format_exc()
-    (FOLDER / "log.json").write_text(json.dumps(seen))
-    bpy.ops.wm.quit_blender()
-    return None
-
-
-bpy.context.preferences.view.show_splash = False
-# Blender keeps what was changed when it quits: the next test would start with it.
-bpy.context.preferences.use_preferences_save = False
-bpy.app.timers.register(run, first_interval=2.0)
+drive([open_sidebar, open_tab, picture("tab"), click(270), imported, click(365), reconstructed,
+       start_slow_job, slow_job_reports, picture("job"), click(124), job_cancelled,
+       open_result, opened, picture("opened"), play, played, picture("playing"),
+       start_slow_job, slow_job_left_running], longest=80)

@@ -1,0 +1,82 @@
+"""What scripts share that drive a Blender with a window; they run in Blender's Python.
+
+    blender --enable-event-simulate --python drive_NAME.py -- FOLDER
+
+A step is a function that returns True when it is done; a timer calls the current one. What was seen
+is written to FOLDER/log.json. A picture is asked for by a file NAME.request, and has been taken
+when that file is gone.
+"""
+
+import json
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+
+FOLDER = Path(sys.argv[sys.argv.index("--") + 1])
+KEY = "bl_ext.user_default.limber"
+seen = {"error": None}
+started = {}
+
+
+def view(kind="WINDOW"):
+    """Return window, 3D view area and its region of a kind."""
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    return window, area, next(region for region in area.regions if region.type == kind)
+
+
+def override():
+    window, area, region = view()
+    return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
+
+
+def waited(seconds):
+    """Whether the current step has lasted that long."""
+    return time.monotonic() - started["step"] > seconds
+
+
+def picture(name):
+    """Return the step that has a picture taken, a second after the step before."""
+    def step():
+        request = FOLDER / f"{name}.request"
+        if "picture" not in started:
+            if not waited(1.0):
+                return False
+            started["picture"] = request
+            request.touch()
+        if request.exists():
+            return False
+        del started["picture"]
+        return True
+    return step
+
+
+def drive(steps, longest):
+    """Do the steps one after the other, none longer than ``longest`` [s]; quit Blender then."""
+    left = list(steps)
+
+    def run():
+        try:
+            if "step" not in started:
+                started["step"] = time.monotonic()
+                started["name"] = getattr(left[0], "__name__", "step")
+            if left[0]():
+                left.pop(0)
+                del started["step"]
+            elif waited(longest):
+                raise TimeoutError(f"{started['name']}, {len(left)} steps from the end")
+            if left:
+                return 0.05
+        except Exception:
+            seen["error"] = traceback.format_exc()
+        (FOLDER / "log.json").write_text(json.dumps(seen))
+        bpy.ops.wm.quit_blender()
+        return None
+
+    bpy.context.preferences.view.show_splash = False
+    # Blender keeps what was changed when it quits: the next test would start with it.
+    bpy.context.preferences.use_preferences_save = False
+    bpy.app.timers.register(run, first_interval=2.0)
