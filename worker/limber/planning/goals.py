@@ -162,16 +162,23 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
 
     Of the samples deflected by over three quarters of the largest deflection, the one with the
     least energy, drawn a little towards the rest pose so that the region lies where the field is
-    trusted.
+    trusted. The trusted region is a shell, often thinner than the tolerance: what counts is how
+    much of the goal lies in it along the shell.
     """
-    offset = field.samples.positions - field.rest
-    away = np.linalg.norm(offset, axis=1)
+    chart = field.region.chart.plain
+    samples = chart.map(field.samples.positions)
+    rest = chart.map(field.rest)[0]
+    away = np.linalg.norm(field.samples.positions - field.rest, axis=1)
     far = np.flatnonzero(away >= 0.75 * away.max())
+    around = ball(100, np.random.default_rng(0)) * tolerance
+    if chart.radius > 0.0:
+        around[:, 2] = 0.0
     for index in far[np.argsort(field.samples.energies[far])]:
         for shrink in (1.0, 0.95, 0.9, 0.85):
-            position = field.rest + shrink * offset[index]
-            around = position + ball(100, np.random.default_rng(0)) * tolerance
-            if field.region.contains(around).mean() > 0.5 and field.region.contains(position)[0]:
+            centre = rest + shrink * (samples[index] - rest)
+            position = chart.curved(centre[None])[0]
+            if (field.region.contains(chart.curved(centre + around)).mean() > 0.5
+                    and field.region.contains(position)[0]):
                 return GraspGoal(tuple(map(float, position)), tolerance)
     raise NoPathError("No far pose lies well inside the sampled region.",
                       f"Too few of {len(away)} accepted samples are far from the rest pose.",
