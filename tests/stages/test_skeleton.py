@@ -1,6 +1,7 @@
 """`limber skeleton`, and the skeleton that reconstruct keeps in the scan's own coordinates."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from limber.geometry.generated import generate_branch
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.files import read_skeleton, read_swc
 from limber.progress import Progress
+from limber.scene.data import scene_data
+from limber.scene.shape import EDITED
 from limber.stages.reconstruct import reconstruct
 from limber.stages.skeleton import review_skeleton
 from limber.store import Branch
@@ -82,6 +85,31 @@ def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     edits.write_text("[]")
     assert review_skeleton(target, edits_path=edits)["edits"] == []
     assert not (target / "edits.json").exists()
+
+
+def test_edits_in_the_branchs_frame_come_after_those_before(made, tmp_path) -> None:
+    """Metres along the branch's axes; the scene marks what is not as it was found, no more."""
+    folder, _ = made
+    target, edits = tmp_path / "g.branch", tmp_path / "edits.json"
+    shutil.copytree(folder / "a.branch", target)
+    before = read_skeleton(target / "skeleton.csv")
+    node = np.flatnonzero(before.branch == 1)[3]
+    onto = before.nodes[node] + [0.0, 0.002, 0.001]
+    for edit in ({"do": "move", "at": before.nodes[node].tolist(), "to": onto.tolist()},
+                 {"do": "radius", "at": onto.tolist(), "radius": 1.1 * before.radius[node]}):
+        edits.write_text(json.dumps([edit]))
+        told = review_skeleton(target, edits_path=edits, frame="branch", append=True)
+    assert [edit["do"] for edit in told["edits"]] == ["move", "radius"]
+    after = read_skeleton(target / "skeleton.csv")
+    moved = np.linalg.norm(after.nodes - onto, axis=1).argmin()
+    np.testing.assert_allclose(after.nodes[moved], onto, atol=1e-7)
+    assert after.radius[moved] == pytest.approx(1.1 * before.radius[node], rel=1e-6)
+    arrays = scene_data(Branch.open(target)).arrays
+    marked = np.flatnonzero(arrays["skeleton_flags"] & EDITED)
+    # The moved node, and the one that hangs on it.
+    assert set(marked) == {moved, *np.flatnonzero(arrays["skeleton_parent"] == moved)}
+    assert not (scene_data(Branch.open(folder / "a.branch")).arrays["skeleton_flags"] & EDITED
+                ).any()
 
 
 def test_a_failed_mesh_leaves_the_skeleton(made, tmp_path, monkeypatch, capsys) -> None:

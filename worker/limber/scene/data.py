@@ -18,8 +18,8 @@ Arrays (m, s, J, Pa; what a folder does not have is left out):
 ``cloud`` [c, 3], ``cloud_color`` [c, 4]        the aligned scan
 ``skeleton`` [n, 3], ``skeleton_parent``,       the centreline; flags: 1 root, 2 fork, 4 tip, 8
 ``skeleton_radius``, ``skeleton_radius_sigma``  radius limited, 16 interpolated, 32 unresolved, 64
-``skeleton_order``, ``skeleton_probability``,   bridged; the probability that a node is there
-``skeleton_flags`` [n]
+``skeleton_order``, ``skeleton_probability``,   bridged, 128 edited; the probability that a node
+``skeleton_flags`` [n]                          is there
 ``control_points`` [k, 3], ``grasp`` [1, 3],    marks at rest, the radii of the balls that mark them
 ``targets`` [t, 3]; each with ``_radius``       (``info["targets"]`` names the targets)
 ``control_points_motion`` [frames, k, 3],       where they are in each frame

@@ -6,16 +6,24 @@ from typing import Any
 import numpy as np
 
 from limber.geometry.cloud.files import read_cloud
-from limber.geometry.skeleton.skeleton import BRIDGED, INTERPOLATED, LIMITED, UNRESOLVED
+from limber.geometry.skeleton.edits import differing
+from limber.geometry.skeleton.skeleton import (
+    BRIDGED,
+    INTERPOLATED,
+    LIMITED,
+    UNRESOLVED,
+    Skeleton,
+)
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of, linear_of
-from limber.stages.loading import load_skeleton
+from limber.stages.loading import load_found_skeleton, load_skeleton
+from limber.stages.reconstruct import KEPT
 from limber.store import Branch
 
 ROOT, FORK, TIP, RADIUS_LIMITED, RADIUS_INTERPOLATED = 1, 2, 4, 8, 16
-RADIUS_UNRESOLVED, BRIDGE = 32, 64
+RADIUS_UNRESOLVED, BRIDGE, EDITED = 32, 64, 128
 """Bits of ``skeleton_flags``."""
 CLOUD_LIMIT = 2_000_000
 """Most points of a scan that are handed on; of more, evenly chosen ones."""
@@ -61,7 +69,17 @@ def add_skeleton(data: SceneData, branch: Branch) -> None:
                            + TIP * (children == 0) + RADIUS_LIMITED * (state == LIMITED)
                            + RADIUS_INTERPOLATED * (state == INTERPOLATED)
                            + RADIUS_UNRESOLVED * (state == UNRESOLVED)
-                           + BRIDGE * (state == BRIDGED)).astype(np.int32)}
+                           + BRIDGE * (state == BRIDGED)
+                           + EDITED * _edited(branch, skeleton)).astype(np.int32)}
+
+
+def _edited(branch: Branch, skeleton: Skeleton) -> np.ndarray:
+    """Return which nodes are not as reconstruct found them, shape [n]."""
+    made = branch.manifest.stages.get("reconstruct")
+    if made is None or "edits" not in made.reads or not branch.has(f"{KEPT}.csv"):
+        return np.zeros(skeleton.node_count, bool)
+    found = load_found_skeleton(branch, branch.manifest.alignment, made.settings["unit"])
+    return differing(skeleton, found)
 
 
 def add_marks(data: SceneData, mesh: TetMesh, used: np.ndarray) -> None:

@@ -11,10 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from limber.alignment import Alignment
+from limber.constants import UNIT_METRES
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
-from limber.geometry.skeleton.files import read_cylinders, read_swc
+from limber.geometry.skeleton.files import read_cylinders, read_skeleton, read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added import HungTwig, PointMass
@@ -25,6 +27,7 @@ from limber.progress import SILENT, Progress
 from limber.reading import read_json_as
 from limber.recordings.checks import clean
 from limber.recordings.recording import Pull, read_pull
+from limber.stages.reconstruct import KEPT
 from limber.store import Branch
 
 TARGETS_FORMAT = 1
@@ -74,6 +77,20 @@ def load_skeleton(branch: Branch) -> Skeleton:
     if branch.has("skeleton.csv"):
         return read_cylinders(branch.path("skeleton.csv"))
     return read_swc(branch.require("skeleton.swc", "reconstruct"))
+
+
+def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skeleton:
+    """Return the axes as reconstruct found them, before edits, in the frame of ``alignment`` [m].
+
+    Args:
+        unit: Of the scan's file, in which they are kept.
+
+    Raises:
+        BranchFolderError: they are not kept: an older Limber made the branch.
+    """
+    found = read_skeleton(branch.require(f"{KEPT}.csv", "reconstruct"),
+                          scale=UNIT_METRES[unit])
+    return found.moved(alignment.apply(found.nodes / alignment.scale))
 
 
 def load_masses(branch: Branch) -> list[dict[str, Any]]:

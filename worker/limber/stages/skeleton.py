@@ -13,7 +13,8 @@ file, as the list of doubtful parts gives them:
   {"do": "radius", "at": [...], "radius": r}           with "to": all along the axes to there
   {"do": "confirm", "at": [x, y, z]}                   the branch is there, no more doubt
 
-They stay in the branch folder and are applied again by each reconstruct.
+They stay in the branch folder and are applied again by each reconstruct. With --frame branch places
+and radii are in the branch's frame [m]; with --append they come after those that it has.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -47,23 +48,30 @@ _SHOWN = 30  # doubtful parts in the table; the JSON result has all
 class SkeletonInputs(BranchInputs):
     """A branch folder, edits of its skeleton, and where to write the skeleton."""
 
-    groups: ClassVar[Groups] = {"input": ("edits",), "output": ("output",)}
+    groups: ClassVar[Groups] = {"input": ("edits", "frame", "append"), "output": ("output",)}
 
     edits: Path | None = Field(
         None, description="Edits (JSON) that take the place of those that the branch has; an "
         "empty list undoes all.")
+    frame: Literal["scan", "branch"] = Field(
+        "scan", description="Whose coordinates the edits are in: those of the scan's file, or the "
+        "branch's [m].")
+    append: bool = Field(False, description="The edits come after those that the branch has.")
     output: Path | None = Field(
         None, description="Also write the skeleton, edits applied, in the scan's coordinates: "
         ".swc, or .csv with intervals and probabilities.", json_schema_extra={"short": "-o"})
 
 
-def review_skeleton(folder: Path, *, edits_path: Path | None = None, output: Path | None = None,
-                    progress: Progress = SILENT) -> dict[str, Any]:
+def review_skeleton(folder: Path, *, edits_path: Path | None = None,
+                    frame: Literal["scan", "branch"] = "scan", append: bool = False,
+                    output: Path | None = None, progress: Progress = SILENT) -> dict[str, Any]:
     """List what is doubtful in a branch's skeleton, after edits of it if there are any to make.
 
     Args:
         folder: The branch folder.
         edits_path: Edits to apply to the skeleton as it was found; surface and mesh are made anew.
+        frame: Of the edits' places: the scan file's coordinates, or the branch's frame [m].
+        append: The edits come after those that the branch has, not in their place.
         output: ``.swc`` or ``.csv`` to write, in the scan file's coordinates and unit.
         progress: Called as it goes; gets what the user should know.
 
@@ -80,9 +88,7 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None, output: Pat
 
     branch = Branch.open(folder)
     if edits_path is not None:
-        from limber.geometry.skeleton.edits import read_edits
-
-        _remade(branch, read_edits(edits_path), progress)
+        _remade(branch, _wanted(branch, edits_path, frame, append), progress)
         branch = Branch.open(folder)
     skeleton, alignment, mesh = _latest(branch)
     if mesh == "out of date":
@@ -90,12 +96,26 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None, output: Pat
                       "the mesh is of an earlier one.")
     if output is not None:
         _write(skeleton.in_file(alignment), output, branch.manifest.source.get("unit", "m"))
-    applied = load_edits(branch) if "edits" in _entry(branch).reads else []
+    applied = _applied(branch)
     return {"doubtful": [_told(doubt, alignment) for doubt in doubtful_parts(skeleton)],
             "node_count": skeleton.node_count, "branch_count": skeleton.branch_count,
             "length_m": skeleton.length, "mesh": mesh, "unit": _unit(branch),
             "edits": [edit.model_dump(mode="json", exclude_none=True) for edit in applied],
             "output": output}
+
+
+def _wanted(branch: Branch, path: Path, frame: str, append: bool) -> list[Edit]:
+    """The edits that the branch shall have, in the coordinates of the scan's file."""
+    from limber.geometry.skeleton.edits import read_edits
+
+    edits = read_edits(path)
+    if frame == "branch":
+        edits = [edit.in_file(branch.manifest.alignment) for edit in edits]
+    return [*_applied(branch), *edits] if append else edits
+
+
+def _applied(branch: Branch) -> list[Edit]:
+    return load_edits(branch) if "edits" in _entry(branch).reads else []
 
 
 def _entry(branch: Branch) -> Any:
@@ -112,8 +132,8 @@ def _unit(branch: Branch) -> str:
 
 def _latest(branch: Branch) -> tuple[Skeleton, Alignment, str]:
     """The newest skeleton in the branch's frame, its alignment, and how the mesh stands to it."""
-    from limber.constants import UNIT_METRES
     from limber.geometry.skeleton.files import read_skeleton
+    from limber.stages.loading import load_found_skeleton
 
     known = branch.manifest.stages
     made, early = known.get("reconstruct"), known.get("skeleton")
@@ -122,9 +142,7 @@ def _latest(branch: Branch) -> tuple[Skeleton, Alignment, str]:
         return read_skeleton(path), branch.manifest.alignment, "current"
     if early is not None and (made is None or not _belong(early, made)):
         alignment = Alignment.model_validate(early.result["alignment"])
-        skeleton = read_skeleton(branch.require(f"{KEPT}.csv", "reconstruct"),
-                                 scale=UNIT_METRES[early.settings["unit"]])
-        return (skeleton.moved(alignment.apply(skeleton.nodes / alignment.scale)), alignment,
+        return (load_found_skeleton(branch, alignment, early.settings["unit"]), alignment,
                 "missing" if made is None else "out of date")
     path = branch.require("skeleton.csv", "reconstruct")
     return read_skeleton(path), branch.manifest.alignment, "current"
@@ -139,14 +157,12 @@ def _belong(early: Any, made: Any) -> bool:
 
 def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     """Apply edits to the skeleton as it was found; make surface and mesh of what comes out."""
-    from limber.constants import UNIT_METRES
     from limber.geometry.cloud.files import read_points
     from limber.geometry.reconstruct import labelled, mesh_skeleton
     from limber.geometry.settings import ReconstructSettings
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
-    from limber.geometry.skeleton.files import read_skeleton
-    from limber.stages.loading import load_masses
+    from limber.stages.loading import load_found_skeleton, load_masses
 
     known = branch.manifest.stages
     made, early = known.get("reconstruct"), known.get("skeleton")
@@ -158,9 +174,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     settings = ReconstructSettings.model_validate(made.settings)
     alignment = branch.manifest.alignment
     digests = {name: value for name, value in made.reads.items() if name != "edits"}
-    found = read_skeleton(branch.require(f"{KEPT}.csv", "reconstruct"),
-                          scale=UNIT_METRES[settings.unit])
-    found = found.moved(alignment.apply(found.nodes / alignment.scale))
+    found = load_found_skeleton(branch, alignment, settings.unit)
     skeleton = edited(found, [edit.aligned(alignment) for edit in edits])
     cloud = read_points(branch.require("cloud.ply", "reconstruct"))
     warnings = list(made.result.get("skeleton_warnings", []))
@@ -216,8 +230,8 @@ def tables(result: dict[str, Any]) -> list[tuple[str, Sequence[Sequence[str]]]]:
 def run(inputs: SkeletonInputs, _settings: NoSettings, _options: NoOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
-    return review_skeleton(inputs.branch_folder, edits_path=inputs.edits, output=inputs.output,
-                           progress=progress)
+    return review_skeleton(inputs.branch_folder, edits_path=inputs.edits, frame=inputs.frame,
+                           append=inputs.append, output=inputs.output, progress=progress)
 
 
 STAGE = StageDescription(

@@ -8,13 +8,14 @@ file, as `limber skeleton` lists them::
      {"do": "radius", "at": [0.00, 0.01, 0.30], "radius": 0.011}]
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from scipy.spatial import cKDTree
 
 from limber.alignment import Alignment
 from limber.errors import InputError
@@ -23,6 +24,7 @@ from limber.geometry.skeleton.skeleton import BRIDGED, MEASURED, Skeleton
 Place = tuple[float, float, float]
 _FAR = 4.0  # radii from an axis, from which a place is none on it
 _KNOWN = 0.02  # of a radius that a user gave
+_SAME = 1e-3  # radii within which a place is the same: files round
 
 
 class _Edit(BaseModel):
@@ -32,9 +34,16 @@ class _Edit(BaseModel):
 
     def aligned(self, alignment: Alignment) -> Self:
         """Return the edit with places and radius in the branch's frame [m]."""
-        places = {name: tuple(alignment.apply(np.array(getattr(self, name))).tolist())
+        return self._placed(alignment.apply, alignment.scale)
+
+    def in_file(self, alignment: Alignment) -> Self:
+        """Return an edit of the branch's frame [m] in the coordinates of the scan's file."""
+        return self._placed(alignment.undo, 1.0 / alignment.scale)
+
+    def _placed(self, taken: Callable[[np.ndarray], np.ndarray], factor: float) -> Self:
+        places = {name: tuple(taken(np.array(getattr(self, name))).tolist())
                   for name in ("at", "to") if getattr(self, name, None) is not None}
-        sizes = {"radius": self.radius * alignment.scale} if hasattr(self, "radius") else {}
+        sizes = {"radius": self.radius * factor} if hasattr(self, "radius") else {}
         return self.model_copy(update=places | sizes)
 
 
@@ -297,3 +306,19 @@ def _remade(skeleton: Skeleton, *, nodes: np.ndarray | None = None,
     return Skeleton.from_edges(
         skeleton.nodes if nodes is None else nodes,
         skeleton.parent if parent is None else parent, skeleton.radius, **_data(skeleton))
+
+
+def differing(skeleton: Skeleton, found: Skeleton) -> np.ndarray:
+    """Return which nodes of an edited skeleton are not as they were found, shape [n].
+
+    A node is as it was found where one with its place, radius, carrier and probability was found.
+    """
+    distance, same = cKDTree(found.nodes).query(skeleton.nodes)
+
+    def carrier(tree: Skeleton, nodes: np.ndarray) -> np.ndarray:
+        return tree.nodes[np.where(tree.parent[nodes] < 0, nodes, tree.parent[nodes])]
+    near = _SAME * skeleton.radius
+    rehung = np.linalg.norm(carrier(skeleton, np.arange(skeleton.node_count))
+                            - carrier(found, same), axis=1)
+    return ((distance > near) | (np.abs(skeleton.radius - found.radius[same]) > near)
+            | (rehung > near) | (np.abs(skeleton.probability - found.probability[same]) > 1e-2))
