@@ -1,4 +1,4 @@
-"""Physical constants and what units are in SI, each once."""
+"""Physical constants, what units are in SI, and names that several rooms share, each once."""
 
 STANDARD_GRAVITY = 9.80665
 """Standard acceleration of free fall [m/s^2]."""
@@ -9,3 +9,6 @@ FORCE_UNITS_N = {"N": 1.0, "gf": 1e-3 * STANDARD_GRAVITY, "mN": 1e-3,
 """Newtons in one of the units that force sensors report."""
 UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
 """Metres in one of the units that scans, surfaces and skeletons come in."""
+
+FOUND_SKELETON = "scan_skeleton"
+"""The skeleton as a scan showed it, in the coordinates of the scan's file: .swc and .csv."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.constants import FOUND_SKELETON
 from limber.geometry.cloud.files import read_cloud
 from limber.geometry.skeleton.edits import differing
 from limber.geometry.skeleton.skeleton import (
@@ -19,7 +20,6 @@ from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of, linear_of
 from limber.stages.loading import load_found_skeleton, load_skeleton
-from limber.stages.reconstruct import KEPT
 from limber.store import Branch
 
 ROOT, FORK, TIP, RADIUS_LIMITED, RADIUS_INTERPOLATED = 1, 2, 4, 8, 16
@@ -76,7 +76,7 @@ def add_skeleton(data: SceneData, branch: Branch) -> None:
 def _edited(branch: Branch, skeleton: Skeleton) -> np.ndarray:
     """Return which nodes are not as reconstruct found them, shape [n]."""
     made = branch.manifest.stages.get("reconstruct")
-    if made is None or "edits" not in made.reads or not branch.has(f"{KEPT}.csv"):
+    if made is None or "edits" not in made.reads or not branch.has(f"{FOUND_SKELETON}.csv"):
         return np.zeros(skeleton.node_count, bool)
     found = load_found_skeleton(branch, branch.manifest.alignment, made.settings["unit"])
     return differing(skeleton, found)

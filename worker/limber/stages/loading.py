@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from limber.alignment import Alignment
-from limber.constants import UNIT_METRES
+from limber.constants import FOUND_SKELETON, UNIT_METRES
 from limber.errors import InputError
 from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
@@ -27,7 +27,6 @@ from limber.progress import SILENT, Progress
 from limber.reading import read_json_as
 from limber.recordings.checks import clean
 from limber.recordings.recording import Pull, read_pull
-from limber.stages.reconstruct import KEPT
 from limber.store import Branch
 
 TARGETS_FORMAT = 1
@@ -88,7 +87,7 @@ def load_found_skeleton(branch: Branch, alignment: Alignment, unit: str) -> Skel
     Raises:
         BranchFolderError: they are not kept: an older Limber made the branch.
     """
-    found = read_skeleton(branch.require(f"{KEPT}.csv", "reconstruct"),
+    found = read_skeleton(branch.require(f"{FOUND_SKELETON}.csv", "reconstruct"),
                           scale=UNIT_METRES[unit])
     return found.moved(alignment.apply(found.nodes / alignment.scale))
 

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from limber.alignment import Alignment
+from limber.constants import FOUND_SKELETON
 from limber.errors import Cancelled, InputError, LimberError, WorkError
 from limber.files import file_digest, require_file
 from limber.geometry.settings import ReconstructSettings
@@ -28,8 +29,6 @@ if TYPE_CHECKING:
 
 EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
-KEPT = "scan_skeleton"
-"""The skeleton as it was found, in the coordinates of the scan's file: .swc and .csv."""
 
 
 class ReconstructInputs(Settings):
@@ -125,8 +124,9 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         except LimberError as error:
             if kept and not isinstance(error, Cancelled):
                 progress.warn(
-                    f"The skeleton as it was found is in {branch.folder / KEPT}.swc, in the scan's "
-                    "coordinates: mend it and give it back (--skeleton), or edit it (--edits).")
+                    f"The skeleton as it was found is in {branch.folder / FOUND_SKELETON}.swc, "
+                    "in the scan's coordinates: mend it and give it back (--skeleton), or edit it "
+                    "(--edits).")
             raise
         stage.manifest.alignment = made.alignment
         stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
@@ -190,8 +190,8 @@ def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit:
     from limber.geometry.skeleton.files import write_cylinders
 
     in_file = skeleton.in_file(alignment)
-    in_file.write_swc(stage.path(f"{KEPT}.swc"), unit=unit)
-    write_cylinders(in_file, stage.path(f"{KEPT}.csv"))
+    in_file.write_swc(stage.path(f"{FOUND_SKELETON}.swc"), unit=unit)
+    write_cylinders(in_file, stage.path(f"{FOUND_SKELETON}.csv"))
     stage.result.update(node_count=skeleton.node_count, length_m=skeleton.length,
                         alignment=alignment)
 
@@ -283,4 +283,4 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
 STAGE = StageDescription(
     "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", f"{KEPT}.swc", f"{KEPT}.csv", EDITS, "truth/"))
+            "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", EDITS, "truth/"))

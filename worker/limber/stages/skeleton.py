@@ -29,11 +29,12 @@ import numpy as np
 from pydantic import Field
 
 from limber.alignment import Alignment
+from limber.constants import FOUND_SKELETON
 from limber.errors import InputError
 from limber.progress import SILENT, Progress
 from limber.settings import Groups
 from limber.stages.inputs import BranchInputs, NoOptions, NoSettings
-from limber.stages.reconstruct import EDITS, KEPT, edits_digest, load_edits, write_branch
+from limber.stages.reconstruct import EDITS, edits_digest, load_edits, write_branch
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -236,6 +237,6 @@ def run(inputs: SkeletonInputs, _settings: NoSettings, _options: NoOptions,
 
 STAGE = StageDescription(
     "skeleton", 25, run, SkeletonInputs, NoSettings, NoOptions, key="reconstruct",
-    reads=("cloud.ply", "skeleton.csv", f"{KEPT}.csv"),
+    reads=("cloud.ply", "skeleton.csv", f"{FOUND_SKELETON}.csv"),
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
             "point_masses.json", EDITS), tables=tables)
