@@ -120,7 +120,10 @@ class Path:
             increment = self._predict(tangent, target, pins, part)
         trial = self.displacement + increment
         trial[held] = target[held]
-        return self.correct(trial, increment, part, tangent)
+        diagonal_norm, steady = tangent.diagonal_norm, tangent.is_positive_definite
+        # Its memory serves the tangents on the way.
+        del tangent
+        return self.correct(trial, increment, part, diagonal_norm, steady)
 
     def load_at(self, part: float) -> np.ndarray:
         return self.goal.load - (1.0 - part) * self.imbalance
@@ -136,12 +139,13 @@ class Path:
         return tangent.solve(right, pins - now.reshape(-1, 3)) + moved
 
     def correct(self, trial: np.ndarray, increment: np.ndarray, part: float,
-                tangent: Tangent) -> float | None:
+                diagonal_norm: float, steady: bool) -> float | None:
         """Iterate from ``trial`` to equilibrium at ``part`` of the way.
 
         Args:
             trial: Displacement [m], shape [node_count, 3], after ``increment``.
-            tangent: Near it: tells the floor that round-off sets.
+            diagonal_norm: Of a tangent near it [N/m]: tells the floor that round-off sets.
+            steady: Whether that tangent is positive definite.
 
         Returns:
             The length taken, None if none was found.
@@ -149,7 +153,7 @@ class Path:
         settings, equations = self.settings, self.equations
         load = self.load_at(part)
         best, worse = np.inf, 0
-        stable, steady = True, tangent.is_positive_definite
+        stable = True
         for _ in range(settings.max_iterations):
             state = self.model.internal(trial)
             out = load - state.force
@@ -160,7 +164,7 @@ class Path:
                 return None
             reference = float(np.linalg.norm(out - residual) + np.linalg.norm(load))
             self.history.append(norm / reference if reference else 0.0)
-            if norm <= max(settings.tolerance * reference, self._floor(tangent)):
+            if norm <= max(settings.tolerance * reference, self._floor(diagonal_norm)):
                 return self._accept(trial, state, part, stable, steady)
             worse = worse + 1 if norm > 0.9 * best else 0
             best = min(best, norm)
@@ -168,20 +172,30 @@ class Path:
                 self.trouble = "Newton's iteration does not converge"
                 return None
             self.iterations += 1
-            try:
-                tangent = equations.tangent(
-                    self.model, trial, increment=increment if self.problem.mixed else None)
-            except NotPositiveDefiniteError:
-                self.trouble = "the stiffness has no positive pivots"
+            solved = self._newton_increment(trial, increment, residual)
+            if solved is None:
                 return None
-            stable = tangent.is_positive_definite
+            increment, stable, diagonal_norm = solved
             steady = steady and stable
-            increment = tangent.solve(residual)
             if not self.problem.mixed:
                 increment = self._searched(trial, increment, load, residual)
             trial = trial + increment
         self.trouble = f"no convergence in {settings.max_iterations} iterations"
         return None
+
+    def _newton_increment(self, trial: np.ndarray, increment: np.ndarray, residual: np.ndarray,
+                          ) -> tuple[np.ndarray, bool, float] | None:
+        """Return Newton's increment, and of its tangent whether it is stable and its norm.
+
+        The tangent itself is freed: there is never more than one of a large mesh in memory.
+        """
+        try:
+            tangent = self.equations.tangent(
+                self.model, trial, increment=increment if self.problem.mixed else None)
+        except NotPositiveDefiniteError:
+            self.trouble = "the stiffness has no positive pivots"
+            return None
+        return tangent.solve(residual), tangent.is_positive_definite, tangent.diagonal_norm
 
     def _searched(self, trial: np.ndarray, increment: np.ndarray, load: np.ndarray,
                   residual: np.ndarray) -> np.ndarray:
@@ -196,9 +210,9 @@ class Path:
             length *= 0.5
         return length * increment
 
-    def _floor(self, tangent: Tangent) -> float:
+    def _floor(self, diagonal_norm: float) -> float:
         # Differences of displacements in an element carry round-off of about one unit each.
-        return 8 * np.finfo(float).eps * tangent.diagonal_norm * self.model.mean_edge
+        return 8 * np.finfo(float).eps * diagonal_norm * self.model.mean_edge
 
     def _accept(self, trial: np.ndarray, state: InternalState, part: float,
                 stable: bool, steady: bool) -> float | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from limber.mechanics.linear.equations import Equations, Tangent
+from limber.mechanics.linear.equations import Equations
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel
 from limber.sparse import NotPositiveDefiniteError
@@ -54,13 +54,13 @@ def settle(path: "Path", part: float) -> float | None:
             if drag > 1:
                 break
             continue
-        trial, quick, error, tangent = crept
-        stable = tangent.is_positive_definite
+        trial, quick, error, stable, diagonal_norm = crept
         if error < _RESTING and not stable and pushes < _PUSHES:
             trial, pushed = pushed_off(path.model, path.equations, trial, load)
             pushes += pushed
         elif error < _RESTING and stable:
-            taken = path.correct(trial, np.zeros_like(trial), part, tangent)
+            taken = path.correct(trial, np.zeros_like(trial), part, diagonal_norm,
+                                 stable)
             if taken is not None:
                 path.snaps.append((path.reached + taken, pushes > 0))
                 return taken
@@ -70,8 +70,12 @@ def settle(path: "Path", part: float) -> float | None:
 
 
 def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray,
-           load: np.ndarray, drag: float) -> tuple[np.ndarray, bool, float, Tangent] | None:
-    """Return the state after one creep, whether it was quick, its imbalance and tangent."""
+           load: np.ndarray, drag: float,
+           ) -> tuple[np.ndarray, bool, float, bool, float] | None:
+    """Return the state after one creep, whether it was quick, and its imbalance.
+
+    And of its tangent, whether it is positive definite and the norm of its diagonal [N/m].
+    """
     model, equations, held = path.model, path.equations, path.equations.held
     moved = np.where(held[:, None], target - start, 0.0)
     now = np.array([g.weights @ start[g.nodes] for g in equations.pinned]).reshape(-1, 3)
@@ -88,7 +92,9 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
             left = float(np.linalg.norm(equations.free_part(out)))
             # Unloaded there is nothing that the imbalance could be a part of.
             part = left / max(reference, 1e-300)
-            return trial, count <= 4, part, equations.tangent(model, trial)
+            tangent = equations.tangent(model, trial)
+            return (trial, count <= 4, part, tangent.is_positive_definite,
+                    tangent.diagonal_norm)
         path.iterations += 1
         try:
             tangent = equations.tangent(model, trial, increment=increment, drag=drag)
@@ -102,6 +108,8 @@ def _creep(path: "Path", start: np.ndarray, target: np.ndarray, pins: np.ndarray
             increment = tangent.solve(right, pins - now) + moved
         else:
             increment = tangent.solve(pull)
+        # Its memory serves the next one.
+        del tangent
         trial = trial + increment
     return None
 
