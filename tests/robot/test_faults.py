@@ -16,6 +16,7 @@ from benchmarks.robot_faults import (
 )
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
+from limber.robot.expected import ExpectedWrench
 from limber.robot.link import RobotLink
 
 pytest.importorskip("rtde_control")
@@ -67,7 +68,7 @@ def test_a_path_is_followed_within_a_millimetre(model, worker_address):
         start = np.array(robot.state["pose"])
         poses = densely(np.array([start, start + [0, 0.05, 0, 0, 0, 0],
                                   start + [0, 0.05, 0.03, 0, 0.1, 0]]))
-        path = Trajectory(along(poses, 0.03, 0.2), poses, np.zeros_like(poses))
+        path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
         rows = []
         with RobotLink(cell_for(worker_address, model), rows.append) as link:
             time.sleep(0.2)

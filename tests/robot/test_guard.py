@@ -39,10 +39,10 @@ class Bench:
         return 0.05 * self.rng.standard_normal(6)
 
     def look(self, force=(0, 0, 0), torque=(0, 0, 0), expected=None, grasp=INSIDE, sent=None,
-             **changes):
+             doubt=None, **changes):
         wrench = np.r_[force, torque].astype(float) + self.noise()
         return self.guard.look(self.sample(**changes), wrench=wrench,
-                               raw=np.stack([wrench, wrench]), grasp=grasp, sent=sent,
+                               raw=np.stack([wrench, wrench]), grasp=grasp, sent=sent, doubt=doubt,
                                expected=None if expected is None else np.r_[expected, 0, 0, 0])
 
     def run(self, count: int = 30, **changes):
@@ -180,6 +180,18 @@ def test_slip_is_told_from_the_predicted_force():
     bench.run(200, force=(5, 0, 0), expected=(5, 0, 0))
     decision = bench.run(200, force=(0.5, 0, 0), expected=(5, 0, 0))
     assert decision.verdict == Verdict.STOP and "slipped" in decision.reason
+
+
+@pytest.mark.parametrize("off, sigma, verdict", [
+    ((0, 0, 4.5), 2.0, Verdict.GO), ((0, 4.5, 0), 2.0, Verdict.STOP),
+    ((0, 0, 6.0), 2.0, Verdict.STOP), ((0, 0, 14.0), 50.0, Verdict.STOP)])
+def test_more_is_allowed_where_the_prediction_is_unsure_never_more_than_the_soft_limit(
+        off, sigma, verdict):
+    """3 N are allowed; along z, where the force is known to 2 N, 3 and 4 N in quadrature."""
+    bench = Bench()
+    bench.guard.begin()
+    doubt = np.diag([0, 0, sigma**2, 0, 0, 0])
+    assert bench.run(200, force=off, expected=(0, 0, 0), doubt=doubt).verdict == verdict
 
 
 def test_slip_is_told_without_a_prediction_by_a_sudden_fall(bench):

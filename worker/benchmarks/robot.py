@@ -23,6 +23,7 @@ from benchmarks.table import Row
 from limber.errors import LimberError
 from limber.progress import Progress
 from limber.robot.arms import ARMS
+from limber.robot.expected import ExpectedWrench
 from limber.robot.kinematics import forward, inverse
 from limber.robot.link import RobotLink
 from limber.robot.trajectory import Trajectory, along, densely
@@ -120,7 +121,7 @@ def _path(seed: int) -> Row:
         corners = start + np.array([[0, 0, 0, 0, 0, 0], [0, 0.08, 0, 0, 0, 0],
                                     [0, 0.08, 0.05, 0, 0.1, 0], [0.03, 0.02, 0.05, 0, 0, 0]])
         poses = densely(corners, spacing=0.0005)
-        path = Trajectory(along(poses, 0.03, 0.2), poses, np.zeros_like(poses))
+        path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
         with RobotLink(cell_for(_ADDRESS), collected.append) as link:
             time.sleep(0.2)
             link.tare()

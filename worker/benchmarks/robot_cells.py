@@ -34,7 +34,8 @@ def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: 
     tool = forward(arm_named(model), np.array(HOME)) @ matrices(np.array(GRASP_POSE))
     base = pose_vectors(gripper @ inverted(tool))
     return Cell(
-        branch=branch.uuid, base={"pose": tuple(map(float, base)), "position_sigma_m": 1e-3},
+        branch=branch.uuid, base={"pose": tuple(map(float, base)), "position_sigma_m": 1e-3,
+              "rotation_sigma_rad": 2e-3},
         robot={"model": model, "address": address},
         tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output"},
         sensor={"kind": "controller" if model.endswith("e") else "ft300"},

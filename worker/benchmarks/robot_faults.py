@@ -10,6 +10,7 @@ import numpy as np
 
 from limber.errors import LimberError
 from limber.robot.cell import Cell
+from limber.robot.expected import ExpectedWrench
 from limber.robot.link import RobotLink
 from limber.robot.trajectory import Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
@@ -76,7 +77,7 @@ def straight(robot: VirtualRobot, way: tuple[float, float, float], speed: float 
     start = np.array(robot.state["pose"])
     poses = densely(np.array([start, start + np.r_[way, 0, 0, 0]]))
     return Trajectory(along(poses, speed, 0.3), poses,
-                      np.zeros_like(poses) if expected else None)
+                      ExpectedWrench.nothing(poses) if expected else None)
 
 
 def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) -> Outcome:

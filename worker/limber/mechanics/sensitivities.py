@@ -111,6 +111,50 @@ def static_sensitivities(model: BranchModel, result: StaticResult,
     return StaticSensitivities(wanted.labels(), np.stack(columns, axis=-1), reaction, energies)
 
 
+@dataclass(frozen=True)
+class GraspSlopes:
+    """How a branch in a clamped grasp changes with the grasp's pose.
+
+    Columns are position [m] and rotation [rad, about the axes of the branch's frame].
+
+    Attributes:
+        wrench: Of force [N] and torque [N m] about the moved pose, shape [6, 6].
+        displacement: Of all nodes [m], shape [node_count, 3, 6].
+    """
+
+    wrench: np.ndarray
+    displacement: np.ndarray
+
+
+def grasp_slopes(model: BranchModel, grasp: Grasp, displacement: np.ndarray) -> GraspSlopes:
+    """Differentiate a state to the pose of the clamped grasp that holds it.
+
+    Args:
+        model: In equilibrium at ``displacement`` [node_count, 3].
+    """
+    pose = grasp.pose_of(model.mesh.nodes, displacement)
+    positions = model.mesh.nodes[grasp.nodes] + displacement[grasp.nodes]
+    arm = positions - pose[:3]
+    tangent = model.equations([grasp]).tangent(model, displacement)
+    state = model.internal(displacement)
+    held = state.force[grasp.nodes] - model.weight_force[grasp.nodes]
+    stiffness = np.empty((6, 6))
+    changes = np.empty((*displacement.shape, 6))
+    for k in range(6):
+        change = np.zeros_like(displacement)
+        axis = np.eye(3)[k % 3]
+        moved = np.tile(axis, (len(arm), 1)) if k < 3 else np.cross(axis, arm)
+        change[grasp.nodes] = moved
+        change = change + tangent.solve(-model.tangent_times(displacement, change))
+        changes[..., k] = change
+        forces = model.tangent_times(displacement, change)[grasp.nodes]
+        stiffness[:3, k] = forces.sum(axis=0)
+        stiffness[3:, k] = np.cross(arm, forces).sum(axis=0)
+        if k >= 3:
+            stiffness[3:, k] += np.cross(moved, held).sum(axis=0)
+    return GraspSlopes(stiffness, changes)
+
+
 def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],
                   right: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
     """Return x with force(x) = right on the free nodes, to ``tolerance``, from a nearby tangent.

@@ -48,6 +48,9 @@ class RobotEntry(_Entry):
     address: str = Field("127.0.0.1", min_length=1, description="Address of the controller.")
     version: str | None = Field(None, pattern=r"^\d+\.\d+(\.\d+)*$",
                                 description="Controller version that was seen when calibrating.")
+    pose_sigma_m: float = Field(
+        5e-5, ge=0, le=0.01, description="How exactly the arm goes a way of some centimetres.")
+    pose_sigma_rad: float = Field(3e-4, ge=0, le=0.1, description="And a turn.")
     joint_limits_rad: tuple[tuple[float, float], ...] | None = Field(
         None, min_length=6, max_length=6,
         description="Narrower limits of the joints, as set in the controller's safety.")
@@ -81,6 +84,8 @@ class ToolEntry(_Entry):
     mass_kg: float = Field(0.0, ge=0, le=20)
     centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="In the frame of the flange.")
     parts: tuple[CapsuleEntry, ...] = ()
+    compliance_m_per_n: float = Field(
+        5e-5, ge=0, le=1e-2, description="What arm, fingers and bark give way by.")
     gripper: Literal["none", "digital_output", "by_hand"] = "by_hand"
     close_output: int = Field(0, ge=0, le=7, description="Digital output that closes it.")
 

@@ -22,7 +22,8 @@ import numpy as np
 
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
-from limber.robot.frames import frame_of, pose_of
+from limber.robot.expected import ExpectedWrench
+from limber.robot.frames import frame_of, pose_of, turn_between
 from limber.robot.guard import Decision, Guard, GuardSettings, State, Verdict
 from limber.robot.real_time import claim_real_time
 from limber.robot.samples import Dashboard, Sample, SampleStream
@@ -39,6 +40,8 @@ _STOP_DECELERATION = 8.0  # rad/s^2 of the joints
 _START_TOLERANCE = 0.005  # m
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
+_NOTHING = np.full(6, np.nan)
+_UPPER = np.triu_indices(3)
 
 
 @dataclass
@@ -83,6 +86,8 @@ class Driver:
         self._gone: Trajectory | None = None
         self._stopped_at: float | None = None
         self._command: np.ndarray | None = None
+        self._held_for: np.ndarray | None = None
+        self._held_at = np.zeros(6)
         self._tare_until: float | None = None
         self._batch: list[list[float]] = []
         self._batch_since = time.monotonic()
@@ -109,7 +114,8 @@ class Driver:
             reading = self._sensor.read(sample)
             now, _ = chain.wrench(sample, reading)
             guard.look(sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]),
-                       expected=now, grasp=sample.pose[:3])
+                       expected=now, doubt=np.eye(6), grasp=sample.pose[:3])
+            turn_between(sample.pose, sample.pose)
             guard.state = State.MOVING
             guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
             pose_of(self._base @ frame_of(sample.pose))
@@ -223,7 +229,8 @@ class Driver:
         elif name == "follow":
             self._begin(Trajectory(
                 np.array(order["times"], float), np.array(order["poses"], float),
-                None if order.get("expected") is None else np.array(order["expected"], float)))
+                None if order.get("expected") is None else ExpectedWrench(**{
+                    part: np.array(value, float) for part, value in order["expected"].items()})))
         elif name == "stop":
             self._judge(self.guard.event("asked to stop"))
         elif name == "resume":
@@ -249,24 +256,39 @@ class Driver:
             return
         now, smooth = self._chain.wrench(sample, reading)
         following = self._following
-        expected = sent = None
+        expected = doubt = sent = None
         if following is not None:
             # The arm is where its target was a look-ahead ago.
             behind = max(following.time - _LOOKAHEAD * following.rate, 0.0)
-            expected = following.trajectory.wrench(behind)
-            sent = following.trajectory.pose(behind)[:3]
+            planned = following.trajectory.pose(behind)
+            sent = planned[:3]
+            expected, doubt = self._expected(following.trajectory, behind, planned, sample.pose)
         grasp = self._base @ frame_of(sample.pose)
         decision = self.guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
-            grasp=grasp[:3, 3], sent=sent)
+            doubt=doubt, grasp=grasp[:3, 3], sent=sent)
         if reading.age > 0.05 and decision.verdict != Verdict.STOP:
             decision = self.guard.event(f"the force sensor is silent for {reading.age:.3f} s")
         self._judge(decision, sample)
         pose = pose_of(grasp)
         self._batch.append([sample.clock, *pose, *now, *smooth, *sample.joints,
-                            *(np.full(6, np.nan) if expected is None else expected)])
+                            *(_NOTHING if expected is None else expected),
+                            *(_NOTHING if doubt is None else doubt[:3, :3][_UPPER])])
         if self._tare_until is not None and sample.clock >= self._tare_until:
             self._end_tare()
+
+    def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
+                  pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """What the branch is felt as where the gripper is, which is not quite where it was sent."""
+        felt = trajectory.felt(time)
+        if felt is None or trajectory.expected is None:
+            return None, None
+        wrench, slopes, covariance = felt
+        rest = trajectory.expected.rest_pose
+        off = np.concatenate((pose[:3] - planned[:3] - self._held_at[:3] + rest[:3],
+                              turn_between(planned, pose) - turn_between(rest, self._held_at)))
+        turn = self._base[:3, :3]
+        return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
 
     def _judge(self, decision: Decision, sample: Sample | None = None) -> None:
         if decision.verdict == Verdict.STOP and self._stopped_at is None:
@@ -337,6 +359,10 @@ class Driver:
         self._stopped_at = None
         self._following = Following(trajectory)
         self._command = sample.pose.copy()
+        rest = None if trajectory.expected is None else trajectory.expected.rest_pose
+        if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
+            # Here the gripper closed on the resting branch: ways are measured from here.
+            self._held_for, self._held_at = rest, sample.pose.copy()
         self.tell(event="started", seconds=trajectory.duration)
 
     def _move(self, step: float) -> None:

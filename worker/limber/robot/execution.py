@@ -7,10 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError, NoPathError
 from limber.robot.cell import Cell
+from limber.robot.expected import ExpectedWrench, Predicted, at_places
 from limber.robot.joint_path import JointPath, joint_path
 from limber.robot.kinematics import inverted, matrices, pose_vectors
 from limber.robot.trajectory import Trajectory, along, densely
 
+_WITHIN = 7.815  # squared deviations that hold 95 % of a vector's draws
 _TURNS = 12  # directions about the branch from which the gripper may come
 
 
@@ -35,9 +37,7 @@ class RobotMotion:
     @property
     def way_back(self) -> Trajectory:
         """The path reversed, with what is expected on it."""
-        path = self.path
-        expected = None if path.expected is None else path.expected[::-1]
-        return Trajectory(path.duration - path.times[::-1], path.poses[::-1], expected)
+        return self.path.backwards()
 
     @property
     def leaving(self) -> Trajectory:
@@ -46,14 +46,13 @@ class RobotMotion:
         return Trajectory(approach.duration - approach.times[::-1], approach.poses[::-1])
 
 
-def robot_motion(cell: Cell, poses: np.ndarray, forces: np.ndarray, axis: np.ndarray, *,
+def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
                  speed: float, rotation: np.ndarray | None = None,
                  start_joints: np.ndarray | None = None) -> RobotMotion:
     """Turn a path of the grasped piece of branch into motion of the robot.
 
     Args:
-        poses: Of the grasped piece from its rest pose on, branch frame [m, rad], shape [n, 6].
-        forces: What the gripper exerts on the branch at each, branch frame [N], shape [n, 3].
+        predicted: The grasped piece from its rest pose on, and what is felt of it.
         axis: Direction of the branch at the grasp, branch frame, shape [3].
         speed: Of the gripper [m/s].
         rotation: Of the gripper at the grasp, branch frame [rad], shape [3]. Without it the
@@ -73,7 +72,7 @@ def robot_motion(cell: Cell, poses: np.ndarray, forces: np.ndarray, axis: np.nda
     refusal: NoPathError | None = None
     for turn in wanted:
         try:
-            motion = _motion(cell, poses, forces, turn, speed, start_joints)
+            motion = _motion(cell, predicted, turn, speed, start_joints)
         except NoPathError as error:
             refusal = refusal or error
             continue
@@ -104,8 +103,9 @@ def across(axis: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _motion(cell: Cell, poses: np.ndarray, forces: np.ndarray, rotation: np.ndarray, speed: float,
+def _motion(cell: Cell, predicted: Predicted, rotation: np.ndarray, speed: float,
             start_joints: np.ndarray | None) -> RobotMotion:
+    poses = predicted.poses
     grip = inverted(matrices(poses[0])) @ matrices(np.r_[poses[0, :3], rotation])
     held = matrices(poses) @ grip
     back = held[0].copy()
@@ -122,14 +122,12 @@ def _motion(cell: Cell, poses: np.ndarray, forces: np.ndarray, rotation: np.ndar
                         singularity_margin=limits.singularity,
                         joint_margin=limits.joint_margin_rad)
     times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
-    # Expected wrenches stand at the plan's poses: carried to the dense ones by the way between.
+    # What is predicted stands at the plan's poses: carried to the dense ones by the way between.
     ways = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
     dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
-    expected = np.zeros((len(path), 6))
-    for k in range(3):
-        expected[:, k] = np.interp(dense, ways, forces[:, k])
+    expected = at_places(predicted, ways, dense).felt(cell, path[0])
     coming = along(approach, speed, limits.acceleration_m_s2)
-    return RobotMotion(Trajectory(coming, approach, np.zeros_like(approach)),
+    return RobotMotion(Trajectory(coming, approach, ExpectedWrench.nothing(approach)),
                        Trajectory(times, path, expected), joints, rotation)
 
 
@@ -142,15 +140,24 @@ class Followed:
         path_error: Greatest distance of the grasp from the path [m].
         force_error: Share of the peak force by which the smoothed force differs from the
             expected one, 95 % of the samples below it; NaN without expected forces.
+        force_within: Share of the samples whose force differs from the expected one by less than
+            5 % of the peak, or lies in the 95 % interval of the two together; NaN likewise.
     """
 
     peak_force: float
     path_error: float
     force_error: float
+    force_within: float
 
 
-def followed(samples: np.ndarray, path: np.ndarray) -> Followed:
-    """Compare samples (:data:`limber.robot.link.COLUMNS`) with the path [n, 3], branch frame."""
+def followed(samples: np.ndarray, path: np.ndarray, force_sigma: float = 0.0) -> Followed:
+    """Compare what a robot did with what was planned and expected.
+
+    Args:
+        samples: As in :data:`limber.robot.link.COLUMNS`.
+        path: [m], branch frame, shape [n, 3].
+        force_sigma: Of the smoothed force: noise, tare and drift of the sensor [N].
+    """
     force = samples[:, 13:16]
     # Distance from segments, not from points.
     start, way = path[:-1], np.diff(path, axis=0)
@@ -163,9 +170,14 @@ def followed(samples: np.ndarray, path: np.ndarray) -> Followed:
     expected = samples[:, 25:28]
     known = np.isfinite(expected).all(axis=1)
     peak = float(np.linalg.norm(force, axis=1).max())
-    error = float("nan")
+    error = within = float("nan")
     if known.any():
-        largest = np.linalg.norm(expected[known], axis=1).max()
-        off = np.linalg.norm(force[known] - expected[known], axis=1)
-        error = float(np.quantile(off, 0.95) / max(largest, 1e-9))
-    return Followed(peak, float(nearest.max()), error)
+        largest = max(float(np.linalg.norm(expected[known], axis=1).max()), 1e-9)
+        off = force[known] - expected[known]
+        size = np.linalg.norm(off, axis=1)
+        error = float(np.quantile(size, 0.95) / largest)
+        covariance = np.nan_to_num(samples[known, 31:37])[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+        covariance = covariance.reshape(-1, 3, 3) + max(force_sigma, 1e-6) ** 2 * np.eye(3)
+        distance = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0])
+        within = float(np.mean((size <= 0.05 * largest) | (distance <= _WITHIN)))
+    return Followed(peak, float(nearest.max()), error, within)

@@ -22,6 +22,8 @@ from limber.robot.samples import Sample
 
 _RUNNING, _NORMAL, _PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
+_DEVIATIONS = 2.0  # of a prediction that are allowed for
+_NO_DOUBT = np.zeros((6, 6))
 
 
 class State(Enum):
@@ -178,8 +180,8 @@ class Guard:
         return self._stop(reason)
 
     def look(self, sample: Sample, *, wrench: np.ndarray, raw: np.ndarray,
-             expected: np.ndarray | None = None, grasp: np.ndarray | None = None,
-             sent: np.ndarray | None = None) -> Decision:
+             expected: np.ndarray | None = None, doubt: np.ndarray | None = None,
+             grasp: np.ndarray | None = None, sent: np.ndarray | None = None) -> Decision:
         """Judge a sample.
 
         Args:
@@ -188,6 +190,8 @@ class Guard:
             raw: The reading as it came and turned to the flange's axes, shape [2, 6]. A frozen
                 sensor repeats one of them to the last digit, whatever the robot turns.
             expected: The same as the model predicts it, or None.
+            doubt: Covariance of that prediction, shape [6, 6]: what is allowed of the difference is
+                wider by twice its deviations, never by more than the soft force limit.
             grasp: Where the grasp is, branch frame [m], shape [3].
             sent: Where the tool was sent to be by now, base frame [m], shape [3], or None.
         """
@@ -196,7 +200,7 @@ class Guard:
         for check in (self._check_clock(sample), self._check_modes(sample),
                       self._check_wrench(sample, wrench, raw),
                       self._check_place(sample, grasp, sent),
-                      self._check_expected(wrench, expected)):
+                      self._check_expected(wrench, expected, doubt)):
             if check.verdict == Verdict.STOP:
                 return check
         force = float(np.linalg.norm(wrench[:3]))
@@ -298,7 +302,8 @@ class Guard:
                 return self._stop("off its path [m]", off, settings.off_path)
         return _GO
 
-    def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None) -> Decision:
+    def _check_expected(self, wrench: np.ndarray, expected: np.ndarray | None,
+                        doubt: np.ndarray | None) -> Decision:
         settings, memory = self._settings, self._memory
         if self.state not in (State.MOVING, State.PAUSED):
             return _GO
@@ -317,20 +322,27 @@ class Guard:
                 return self._stop("the force fell at once: slip or break [N]", lost,
                                   max(settings.lost_share * memory.peak, settings.least_force))
             return _GO
+        doubt = _NO_DOUBT if doubt is None else doubt
         wanted = float(np.linalg.norm(expected[:3]))
         if wanted > settings.least_force:
             along = float(filtered[:3] @ expected[:3]) / wanted
-            if along < (1 - settings.lost_share) * wanted - settings.least_force:
+            unsure = _DEVIATIONS * float(np.sqrt(max(
+                expected[:3] @ doubt[:3, :3] @ expected[:3], 0.0))) / wanted
+            if along < (1 - settings.lost_share) * wanted - settings.least_force - unsure:
                 return self._stop("the branch slipped, broke or was never held: force along the "
                                   "predicted one [N]", along, wanted)
-        error = float(np.linalg.norm(filtered[:3] - expected[:3]))
-        if error > settings.limits.unexpected_force_n:
-            return self._stop("force unlike the predicted one [N]", error,
-                              settings.limits.unexpected_force_n)
-        twist = float(np.linalg.norm(filtered[3:] - expected[3:]))
-        if twist > settings.largest_torque_error:
-            return self._stop("torque unlike the predicted one [N m]", twist,
-                              settings.largest_torque_error)
+        limits = settings.limits
+        for name, part, allowed, most in (
+                ("force unlike the predicted one [N]", slice(0, 3), limits.unexpected_force_n,
+                 limits.soft_force_n),
+                ("torque unlike the predicted one [N m]", slice(3, 6),
+                 settings.largest_torque_error, limits.hard_torque_nm)):
+            off = filtered[part] - expected[part]
+            error = float(np.linalg.norm(off))
+            if error > allowed:
+                within = _allowed(off, doubt[part, part], allowed, most)
+                if error > within:
+                    return self._stop(name, error, within)
         return _GO
 
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
@@ -339,6 +351,17 @@ class Guard:
             self.state = State.STOPPED
             self.reason = str(decision)
         return decision
+
+
+def _allowed(off: np.ndarray, covariance: np.ndarray, least: float, most: float) -> float:
+    """How large a difference may be in the direction of ``off`` [3], which is not 0.
+
+    The border is an ellipsoid: ``least``, wider by deviations of the prediction up to ``most``.
+    """
+    squares, axes = np.linalg.eigh(covariance)
+    radii = least**2 + np.minimum(_DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)
+    along = axes.T @ (off / np.linalg.norm(off))
+    return float(1.0 / np.sqrt((along**2 / radii).sum()))
 
 
 _SAFETY = {3: "protective stop", 4: "recovery mode", 5: "safeguard stop", 6: "emergency stop",

@@ -25,8 +25,11 @@ COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
            "smooth_tx_nm", "smooth_ty_nm", "smooth_tz_nm",
            "q1_rad", "q2_rad", "q3_rad", "q4_rad", "q5_rad", "q6_rad",
            "expected_fx_n", "expected_fy_n", "expected_fz_n",
-           "expected_tx_nm", "expected_ty_nm", "expected_tz_nm")
-"""What a row of samples holds: grasp pose and wrench on the branch, in the branch's frame."""
+           "expected_tx_nm", "expected_ty_nm", "expected_tz_nm",
+           "expected_xx_n2", "expected_xy_n2", "expected_xz_n2",
+           "expected_yy_n2", "expected_yz_n2", "expected_zz_n2")
+"""What a row of samples holds: grasp pose and wrench on the branch, in the branch's frame; the
+last six are the covariance of the expected force."""
 
 
 class RobotLink:
@@ -34,7 +37,7 @@ class RobotLink:
 
     Args:
         cell: The robot's cell.
-        on_samples: Called with each batch of samples, shape [n, 31] as in :data:`COLUMNS`, from a
+        on_samples: Called with each batch of samples, shape [n, 37] as in :data:`COLUMNS`, from a
             thread of its own.
         python: Interpreter that has ur-rtde; by default this one.
 
@@ -83,7 +86,8 @@ class RobotLink:
         expected = trajectory.expected
         self._order(order="follow", times=trajectory.times.tolist(),
                     poses=trajectory.poses.tolist(),
-                    expected=None if expected is None else expected.tolist())
+                    expected=None if expected is None else {
+                        name: value.tolist() for name, value in vars(expected).items()})
         self.wait("started", seconds=5.0)
 
     def follow(self, trajectory: Trajectory) -> dict[str, Any]:

@@ -31,7 +31,7 @@ class PullRecorder:
     Attributes:
         count: Samples written.
         peak_force: [N].
-        last: The last sample taken, shape [31] as in :data:`limber.robot.link.COLUMNS`.
+        last: The last sample taken, shape [37] as in :data:`limber.robot.link.COLUMNS`.
     """
 
     def __init__(self, lines: Lines, point: np.ndarray):
@@ -51,7 +51,7 @@ class PullRecorder:
         self._offset = inverted(matrices(self.last[1:7])) @ rest
 
     def take(self, samples: np.ndarray) -> None:
-        """Write a batch of samples [n, 31]; before the gripper has closed they only pass by."""
+        """Write a batch of samples [n, 37]; before the gripper has closed they only pass by."""
         self.last = samples[-1]
         if self._offset is None:
             return

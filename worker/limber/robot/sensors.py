@@ -23,6 +23,8 @@ from limber.robot.frames import frame_of, inverse_of, turned_wrench, weight_wren
 from limber.robot.samples import Sample
 
 FT300_PORT = 63351
+INDEPENDENT_READINGS = 2
+"""At least so many are in a smoothed wrench: an FT300 sends fewer than a controller asks for."""
 
 _MESSAGE = re.compile(r"\(([^()]*)\)")
 

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from limber.errors import InputError
+from limber.robot.expected import ExpectedWrench
 from limber.robot.frames import pose_between
 
 
@@ -16,13 +17,13 @@ class Trajectory:
     Attributes:
         times: [s], from 0, ascending, shape [n].
         poses: Of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
-        expected: Wrench of the gripper on the branch, branch frame [N, N m], shape [n, 6], or
-            None where nothing is predicted.
+        expected: What the gripper will feel of the branch at each pose, or None where nothing is
+            predicted.
     """
 
     times: np.ndarray
     poses: np.ndarray
-    expected: np.ndarray | None = None
+    expected: ExpectedWrench | None = None
 
     def __post_init__(self) -> None:
         shaped = (self.times.ndim == 1 and len(self.times) >= 2
@@ -31,8 +32,10 @@ class Trajectory:
             raise InputError(f"A trajectory of {self.times.shape} times and {self.poses.shape} "
                              "poses.", "It needs ascending times and one finite pose each.",
                              "Check the path.")
-        if self.expected is not None and (self.expected.shape != self.poses.shape
-                                          or not np.isfinite(self.expected).all()):
+        if self.expected is not None and (
+                self.expected.wrenches.shape != self.poses.shape
+                or not all(np.isfinite(part).all() for part in (
+                    self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
             raise InputError("Expected wrenches that do not fit the poses.",
                              "Each pose has one of six numbers.", "Check the plan.")
 
@@ -45,12 +48,14 @@ class Trajectory:
         k, part = self._place(time)
         return pose_between(self.poses[k], self.poses[k + 1], part)
 
-    def wrench(self, time: float) -> np.ndarray | None:
-        """Return the expected wrench at a time [s], shape [6]."""
-        if self.expected is None:
-            return None
-        k, part = self._place(time)
-        return (1 - part) * self.expected[k] + part * self.expected[k + 1]
+    def felt(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return expected wrench [6], its slopes [6, 6] and covariance [6, 6] at a time [s]."""
+        return None if self.expected is None else self.expected.at(*self._place(time))
+
+    def backwards(self) -> "Trajectory":
+        """Return it from its end to its start, as fast, with what is expected on it."""
+        return Trajectory(self.duration - self.times[::-1], self.poses[::-1],
+                          None if self.expected is None else self.expected.reversed())
 
     def until(self, time: float) -> "Trajectory":
         """Return the way back: what was gone until ``time`` [s], reversed in time."""

@@ -6,6 +6,8 @@ import csv
 import json
 import re
 import time
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -22,10 +24,18 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.mechanics import BranchModel, Grasp, StaticResult
+    from limber.planning.chance import YoungDoubt
     from limber.robot.cell import Cell
     from limber.robot.execution import RobotMotion
+    from limber.robot.expected import Predicted
     from limber.robot.link import RobotLink
     from limber.robot.trajectory import Trajectory
+
+_SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
+# a branch by 3 micrometres
+_MOST_POSES = 120
+_BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
 
 
 class ExecuteInputs(BranchInputs):
@@ -91,14 +101,14 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
     progress(0.02, "forces along the path")
-    poses, forces, axis = _predicted(branch, name, settings, progress)
+    predicted, axis = _predicted(branch, name, settings, progress)
     progress(0.4, "inverse kinematics")
     from limber.robot.execution import robot_motion
 
-    motion = robot_motion(cell, poses, forces, axis, speed=settings.speed,
+    motion = robot_motion(cell, predicted, axis, speed=settings.speed,
                           rotation=settings.gripper_rotation)
-    result = _summary(cell, motion, forces)
-    _check_limits(cell, poses, forces)
+    result = _summary(cell, motion)
+    _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
     if not options.arm:
         _write_preview(branch, name, settings, cell, motion)
         return result | {"armed": False, "reached": None, "stop_reason": None,
@@ -108,27 +118,82 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
 
 
 def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: Progress,
-               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses and forces of the grasp from rest to the path's end, and the branch's axis there."""
+               ) -> tuple[Predicted, np.ndarray]:
+    """What the model predicts from rest to the path's end, and the branch's axis at the grasp.
+
+    The grasp goes through the plan's positions turned as the branch would turn by itself, close
+    enough that straight lines between stretch nothing; the wrench is that of the branch clamped so.
+    """
+    from limber.mechanics import follow_poses
+    from limber.mechanics.sensitivities import grasp_slopes
     from limber.planning.field.grasp_model import refusal
+    from limber.robot.expected import Predicted
     from limber.stages.loading import load_grasp_model
+    from limber.stages.plan_doubt import estimated_doubt
 
     model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
-    positions = _positions(branch, name, model.rest_position)
-    poses, forces, state = [], [], model.rest.displacement
+    doubt = estimated_doubt(branch, model)
+    if doubt is None:
+        progress.warn("How uncertain Young's modulus is, is not known (no estimate): the interval "
+                      "of the predicted force leaves it out.")
+    positions = _closely(_positions(branch, name, model.rest_position))
+    clamped = replace(model.grasp, mode="clamped")
+    poses, wrenches, stiffness, covariances = [], [], [], []
+    state = held = model.rest.displacement
     for number, position in enumerate(positions):
-        result = model.follow(position[None], state)[0]
-        if reason := refusal(result):
+        free = model.follow(position[None], state)[0]
+        reason = refusal(free)
+        if reason is None:
+            state = free.displacement
+            pose = np.r_[position, model.pose(state)[3:]]
+            result = follow_poses(model.model, clamped, pose[None], start=held)[0]
+            reason = refusal(result)
+        if reason is not None:
             raise WorkError(f"Pose {number + 1} of {len(positions)} has no believable solution "
                             f"({reason}).", "Its force is not known, so it is not taken there.",
                             "Plan a gentler path.")
-        state = result.displacement
-        poses.append(model.pose(state))
-        forces.append(result.reaction_force)
+        held = result.displacement
+        poses.append(pose)
+        wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
+        stiffness.append(grasp_slopes(model.model, clamped, held).wrench)
+        covariances.append(np.zeros((3, 3)) if doubt is None
+                           else _by_young(model.model, clamped, result, doubt))
         progress(0.02 + 0.38 * number / len(positions), "forces along the path")
-    poses = np.array(poses)
-    poses[:, :3] = positions
-    return poses, np.array(forces), model.reach.axis
+    return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
+                     np.array(covariances)), model.reach.axis
+
+
+def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, doubt: YoungDoubt,
+              ) -> np.ndarray:
+    """Covariance of the force for what is not known of Young's modulus [N^2], shape [3, 3]."""
+    from limber.mechanics.sensitivities import static_sensitivities
+
+    slopes = static_sensitivities(model, result, grasp, None, shares=doubt.shares.T)
+    scaled = slopes.reaction_force * doubt.deviations
+    return scaled @ doubt.correlation @ scaled.T
+
+
+def _force_sigma(cell: Cell, samples: np.ndarray) -> float:
+    """Of the smoothed force by the sensor's noise and what it has drifted since its tare [N]."""
+    from limber.robot.sensors import INDEPENDENT_READINGS
+
+    minutes = (samples[-1, 0] - samples[0, 0] + _BEFORE_PATH_SECONDS) / 60.0
+    return float(np.hypot(cell.sensor.force_sigma_n / np.sqrt(INDEPENDENT_READINGS),
+                          cell.sensor.drift_n_per_minute * minutes))
+
+
+def _closely(positions: np.ndarray) -> np.ndarray:
+    """Return positions [n, 3] with more between them, on a smooth line that hardly overshoots."""
+    from scipy.interpolate import Akima1DInterpolator
+
+    kept = np.r_[True, np.linalg.norm(np.diff(positions, axis=0), axis=1) > 1e-9]
+    positions = positions[kept]
+    places = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1))]
+    spacing = max(_SPACING, places[-1] / _MOST_POSES)
+    wanted = np.concatenate([
+        np.linspace(a, b, max(int(np.ceil((b - a) / spacing)), 1) + 1)[:-1]
+        for a, b in pairwise(places)] + [places[-1:]])
+    return Akima1DInterpolator(places, positions, method="makima")(wanted)
 
 
 def _positions(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
@@ -167,13 +232,17 @@ def _check_limits(cell: Cell, poses: np.ndarray, forces: np.ndarray) -> None:
                              "The guard would stop there.", "Plan inside it, or correct the cell.")
 
 
-def _summary(cell: Cell, motion: RobotMotion, forces: np.ndarray) -> dict[str, Any]:
+def _summary(cell: Cell, motion: RobotMotion) -> dict[str, Any]:
     steps = np.concatenate([motion.approach.times,
                             motion.approach.duration + motion.path.times[1:]])
+    felt = motion.path.expected
+    assert felt is not None
+    largest = np.linalg.eigvalsh(felt.covariance[:, :3, :3])[:, -1].max()
     return {
         "robot": cell.arm.name, "duration_s": 2 * (motion.approach.duration + motion.path.duration),
         "pose_count": len(motion.path.times),
-        "predicted_peak_force_n": float(np.linalg.norm(forces, axis=1).max()),
+        "predicted_peak_force_n": float(np.linalg.norm(felt.wrenches[:, :3], axis=1).max()),
+        "predicted_force_sigma_n": float(np.sqrt(max(largest, 0.0))),
         "singularity_distance": motion.joints.singularity,
         "joint_limit_margin_rad": motion.joints.limit_margin,
         "joint_speed_share": motion.joints.speed_share(cell.arm, steps),
@@ -195,7 +264,7 @@ def _write_preview(branch: Branch, name: str, settings: ExecuteSettings, cell: C
         poses = pose_vectors(base @ matrices(trajectory.poses))
         assert trajectory.expected is not None
         rows.append(np.column_stack([begin + trajectory.times, poses, joints,
-                                     trajectory.expected[:, :3]]))
+                                     trajectory.expected.wrenches[:, :3]]))
         begin += trajectory.duration + 0.5
     header = ("t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,"
               "fx_n,fy_n,fz_n")
@@ -234,14 +303,16 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
         samples = np.concatenate(batches)[on_path[0]:on_path[1]] if on_path else None
         base = matrices(np.array(cell.base.pose))
         path = (base @ matrices(motion.path.poses))[:, :3, 3]
-        found = followed(samples, path) if samples is not None and len(samples) else None
+        found = (followed(samples, path, _force_sigma(cell, samples))
+                 if samples is not None and len(samples) else None)
         reached = event["event"] == "reached"
         result = summary | {
             "armed": True, "reached": reached,
             "stop_reason": None if reached else event["reason"],
             "peak_force_n": found.peak_force if found else None,
             "path_error_m": found.path_error if found else None,
-            "force_error_of_peak": found.force_error if found else None}
+            "force_error_of_peak": found.force_error if found else None,
+            "force_within_share": found.force_within if found else None}
         with branch.stage(f"execute:{name}", settings, reads=[f"plans/{name}.csv"]) as stage:
             stage.adopt(log)
             from limber.plain import plain

@@ -14,10 +14,7 @@ _INTERVAL = 2 * 1.96  # standard deviations in an interval of 95 %
 
 
 def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> YoungDoubt:
-    """Return the moduli's distribution by the branch's estimate.
-
-    Deviations are those of the stated intervals, all that is not known included; correlations those
-    of the fit. Control points of one group have one modulus.
+    """Return the moduli's distribution by the branch's estimate, for a plan with limits.
 
     Raises:
         InputError: there is no limit, no estimate, or one without intervals.
@@ -26,16 +23,31 @@ def young_doubt(branch: Branch, grasp_model: GraspModel, limits: Limits) -> Youn
         raise InputError("--confidence is given without a limit.",
                          "It is the probability with which limits are kept.",
                          "Give --max-force, --max-strain or another limit as well.")
-    if "estimate" not in branch.manifest.stages:
+    doubt = estimated_doubt(branch, grasp_model)
+    if doubt is None:
         raise InputError("--confidence is given, and nothing is estimated.",
                          "How uncertain Young's modulus is comes from `limber estimate`.",
                          "Import a pull and estimate, or leave --confidence away.")
+    return doubt
+
+
+def estimated_doubt(branch: Branch, grasp_model: GraspModel) -> YoungDoubt | None:
+    """Return the moduli's distribution by the branch's estimate; None where there is none.
+
+    Deviations are those of the stated intervals, all that is not known included; correlations those
+    of the fit. Control points of one group have one modulus.
+
+    Raises:
+        InputError: the estimate has no interval.
+    """
+    if not branch.has("estimate.json"):
+        return None
     found = read_estimate(branch.require("estimate.json", "estimate"))
     interval = np.array(found["young_interval_pa"], float)
     if not (np.isfinite(interval).all() and (interval > 0.0).all()):
         raise InputError("The estimate has no interval for some control points.",
                          "How uncertain Young's modulus is there is not known.",
-                         "Record another pull, or leave --confidence away.")
+                         "Record another pull and estimate again.")
     points = np.array(found["control_points_m"], float)
     covariance = np.array(found["covariance"], float)[np.ix_(found["groups"], found["groups"])]
     size = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))

@@ -74,8 +74,8 @@ class Load(Protocol):
         """Let what is held slide back by a part of its way."""
         ...
 
-    def seen(self) -> tuple[float, list[list[float]]]:
-        """Return points that a tracker sees [m], and how old they are [s]."""
+    def seen(self) -> list[list[float]]:
+        """Return where the points are that a tracker sees [m]."""
         ...
 
     def report(self) -> dict[str, Any]:
@@ -105,8 +105,8 @@ class Nothing:
     def slide(self, part: float) -> None:
         """Nothing is held."""
 
-    def seen(self) -> tuple[float, list[list[float]]]:
-        return 0.0, []
+    def seen(self) -> list[list[float]]:
+        return []
 
     def report(self) -> dict[str, Any]:
         return {"branch": "none"}

@@ -65,7 +65,7 @@ class Server:
             DASHBOARD_PORT: self._serve_dashboard}
         if self.controller.ft300 is not None:
             ports[FT300_PORT] = self._serve_ft300
-        if self.controller.load.seen()[1]:
+        if self.controller.load.seen():
             ports[MARKER_PORT] = self._serve_markers
         try:
             for port, serve in ports.items():
@@ -192,11 +192,9 @@ class Server:
         rng = np.random.default_rng(self.controller.step_count)
         last = -1.0
         while not writer.is_closing():
-            age, seen = self.controller.load.seen()
-            points = np.array(seen)
+            points = np.array(self.controller.load.seen())
             points = points + _MARKER_SIGMA_M * rng.standard_normal(points.shape)
-            # Stamped with the time at which the gripper was where the branch was solved.
-            seen_at = self.controller.clock - age
+            seen_at = self.controller.clock
             if seen_at > last + 1e-9:
                 line = json.dumps({"t_s": seen_at, "points_m": points.tolist()})
                 self.send(writer, f"{line}\n".encode())
