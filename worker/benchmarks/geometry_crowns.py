@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from benchmarks.scan_scores import Dense
 from benchmarks.table import Row
 from limber.geometry.generated import BranchSpec, scan
-from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.skeleton.sweep import frames, tangents

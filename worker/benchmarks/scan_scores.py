@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import MEASURED, Skeleton
 
 _STEP = 0.001  # [m] between the places on the axes that are compared

@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse.linalg import splu
 
-from limber.geometry.skeleton.radii.axis_fit import fit_precision, on_cylinders
+from limber.geometry.skeleton.radii.axis_fit import fit_precision
+from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import tangents
 from limber.geometry.tets.tet_mesh import EDGES, TetMesh

@@ -24,7 +24,7 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, edited
 from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
-from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise

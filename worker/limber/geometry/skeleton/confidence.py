@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import (
     BRIDGED,
     INTERPOLATED,

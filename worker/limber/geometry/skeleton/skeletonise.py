@@ -36,10 +36,10 @@ from limber.geometry.skeleton.radii.axis_fit import (
     fit_axes,
     limited,
     median_radii,
-    nearest_cylinders,
     resampled,
     tapered,
 )
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
 from limber.progress import SILENT, Progress
 

@@ -19,10 +19,11 @@ from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.sweep import polygon_factor, tangents
 from limber.geometry.surface.checks import SurfaceCheck, check_surface, crossings
+from limber.geometry.surface.cross_sections import SPACING, run_axis, sides_of_runs
 from limber.geometry.surface.implicit_surface import level_surface
 from limber.geometry.surface.rounded_union import distances, fillet_level, near_box, segments
 from limber.geometry.surface.surface import Surface
-from limber.geometry.surface.tubes import SPACING, largest_piece, run_axis, sides_of_runs, solid
+from limber.geometry.surface.tubes import largest_piece, solid
 
 ROUNDING = 0.5
 """Radius of a fillet, in radii of its twig or of its parent, whichever is thinner."""

@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 
 from limber.errors import MeshingError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.sweep import frames, polygon_factor, resample, rings, tangents
+from limber.geometry.skeleton.sweep import frames, polygon_factor, rings, tangents
 from limber.geometry.surface.checks import crossings
+from limber.geometry.surface.cross_sections import SPACING, run_axis, sides_of_runs
 from limber.geometry.surface.surface import Surface
 
 
@@ -23,13 +24,8 @@ class Tube:
     flat_start: bool
 
 
-SPACING = 1.5
-"""Distance of cross-sections in local radii."""
-
-_SIDES, _MOST_SIDES = 12, 48
 _CAP = np.deg2rad([35.0, 65.0])  # where the rings of a rounded end lie on its half sphere
 _CORNER = np.deg2rad(30.0)
-_FACET = 0.025  # how far a carrier's facets may be off its circle, in radii of its thinnest twig
 
 
 def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: float = SPACING,
@@ -61,21 +57,6 @@ def branch_surface(skeleton: Skeleton, *, sides: int | None = None, spacing: flo
         # pieces from one cross-section to the next always are.
         in_pieces |= more
     return surface
-
-
-def sides_of_runs(skeleton: Skeleton, given: int | None = None) -> list[int]:
-    """Sides of each run's cross-section: so many that facets do not show beside a twig, or given.
-    """
-    if given is not None:
-        return [given] * skeleton.branch_count
-    sides = [_SIDES] * skeleton.branch_count
-    for members in skeleton.runs()[1:]:
-        carrier = int(skeleton.branch[members[0]])
-        ratio = skeleton.radius[members[0]] / max(skeleton.radius[members[1]], 1e-300)
-        # polygon_factor(n) is about 1 + pi^2 / (3 n^2).
-        wanted = 2 * int(np.ceil(np.pi * np.sqrt(ratio / (3 * _FACET)) / 2))
-        sides[carrier] = min(max(sides[carrier], wanted), _MOST_SIDES)
-    return sides
 
 
 def _union(tubes: dict[int, list[Tube]], in_pieces: set[int], sides: list[int], tolerance: float,
@@ -142,24 +123,6 @@ def tubes_of_run(skeleton: Skeleton, run: int, spacing: float) -> list[Tube]:
     at_root = np.linalg.norm(points[0] - skeleton.nodes[0]) < 1.2 * skeleton.radius[0]
     return [Tube(p, r, tangents(p), flat_start=bool(at_root and part == 0))
             for part, (p, r) in enumerate(_split_at_bends(points, radius))]
-
-
-def run_axis(skeleton: Skeleton, run: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Axis [m], shape [k, 3], and radii [m] of a run, ``spacing`` radii from point to point.
-
-    A side run starts on its parent's axis, with a radius that stays inside the parent.
-    """
-    nodes = skeleton.runs()[run]
-    points, radius = skeleton.nodes[nodes], skeleton.radius[nodes].copy()
-    if run > 0:
-        # The first node is the parent's, whose radius is not this twig's.
-        radius[0] = min(radius[1] if len(radius) > 1 else radius[0], 0.95 * radius[0])
-    points, radius = resample(points, radius, spacing * radius)
-    if len(points) < 3:
-        middle = np.linspace(0, 1, 3)[:, None]
-        points = points[0] + middle * (points[-1] - points[0])
-        radius = np.linspace(radius[0], radius[-1], 3)
-    return points, radius
 
 
 def tube_triangles(tube: Tube, sides: int) -> tuple[np.ndarray, np.ndarray]:

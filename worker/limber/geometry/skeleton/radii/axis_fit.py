@@ -14,7 +14,8 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.radii.fit_kernels import nearest_of, normal_blocks
+from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, match_cylinders
+from limber.geometry.skeleton.radii.fit_kernels import normal_blocks
 from limber.geometry.skeleton.radii.noisy_rings import (
     SCATTERED_ALONG_SIGHT,
     SeenSides,
@@ -26,7 +27,6 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, S
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
-_CANDIDATES = 6
 _MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
@@ -83,8 +83,8 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         # The cylinders around a point are looked up anew once axes have moved.
         moved = np.linalg.norm(nodes - found_at, axis=1)
         if near is None or (moved > _MOVED * radius).any():
-            near, found_at = _around(skeleton.parent, nodes, points), nodes
-        match = _match(skeleton.parent, skeleton.order, nodes, radius, points, near)
+            near, found_at = cylinders_around(skeleton.parent, nodes, points), nodes
+        match = match_cylinders(skeleton.parent, skeleton.order, nodes, radius, points, near)
         # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
         noise = max(_robust_sigma(match.residual, radius[match.segment]), 1e-4 * floor)
         spread = noise if settled else max(noise, 0.6 * spread)
@@ -105,7 +105,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         progress((number + 1) / rounds, "fitting axes", noise_m=noise)
         if number > rounds // 2 + 1 and size.max() < 1e-3 * floor and spread <= 1.01 * noise:
             break
-    match = _match(skeleton.parent, skeleton.order, nodes, radius, points)
+    match = match_cylinders(skeleton.parent, skeleton.order, nodes, radius, points)
     noise = _robust_sigma(match.residual, radius[match.segment])
     sigma, state = skeleton.radius_sigma, skeleton.radius_state
     if uncertainty:
@@ -124,7 +124,7 @@ def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
     return np.minimum(_TUKEY * spread, 0.9 * radius + 3 * np.minimum(noise, radius))
 
 
-def _places(parent: np.ndarray, nodes: np.ndarray, match: "_Match", weight: np.ndarray,
+def _places(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
             noise: float, known: SeenSides | None) -> tuple[np.ndarray, SeenSides]:
     """Mean direction to where on its cylinder each point comes from, shape [m, 3]; what was seen.
     """
@@ -283,17 +283,6 @@ def median_radii(skeleton: Skeleton, points: np.ndarray, neighbours: int = 24) -
     return np.median(distance, axis=1)
 
 
-def nearest_cylinders(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each point the node whose cylinder is nearest, and its distance [m] from it."""
-    segments, residuals = [], []
-    for begin in range(0, len(points), 100_000):
-        match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                       points[begin:begin + 100_000])
-        segments.append(match.segment)
-        residuals.append(match.residual)
-    return np.concatenate(segments), np.concatenate(residuals)
-
-
 def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_matrix, float]:
     """How firmly points hold a fitted skeleton, and their noise [m].
 
@@ -304,60 +293,11 @@ def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_ma
     kinds, to 1.2 to 1.4 on 6 more of one side only. Where the axis ran into a twig and back, at a
     fork that one side hides, they were far larger.
     """
-    match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius, points)
+    match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
+                            points)
     noise = max(_robust_sigma(match.residual, skeleton.radius[match.segment]), 1e-12)
     weight = _tukey(match.residual, np.full(len(points), _TUKEY * noise))
     return _system(skeleton, skeleton.nodes, skeleton.radius, match, weight, noise).matrix, noise
-
-
-def on_cylinders(skeleton: Skeleton, points: np.ndarray,
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Where points lie along the cylinders that they are nearest to, or inside of.
-
-    Returns:
-        Lower and upper node of each, shape [m] each, the share of the way between them, shape
-        [m] (1 throughout in the first cylinder of a twig, whose radius is the twig's), and the
-        way from the axis to the point [m], shape [m, 3].
-    """
-    match = _match(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius, points)
-    low, high = skeleton.parent[match.segment], match.segment
-    foot = (1 - match.share)[:, None] * skeleton.nodes[low] + match.share[:, None] * (
-        skeleton.nodes[high])
-    return low, high, np.where(match.own_radius, 1.0, match.share), points - foot
-
-
-@dataclass(frozen=True)
-class _Match:
-    segment: np.ndarray
-    share: np.ndarray
-    normal: np.ndarray
-    residual: np.ndarray
-    thick: np.ndarray
-    own_radius: np.ndarray
-
-
-def _match(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.ndarray,
-           points: np.ndarray, near: np.ndarray | None = None) -> _Match:
-    """Find for each point the cylinder to whose surface it is nearest.
-
-    Args:
-        near: Upper nodes of the cylinders that may be, shape [m, k]; None: those around.
-    """
-    near = _around(parent, nodes, points) if near is None else near
-    # The first cylinder of a side run has the twig's radius all along, not its carrier's.
-    own = order > order[parent]
-    segment, share, normal, residual, thick = nearest_of(
-        np.ascontiguousarray(points, np.float64), np.ascontiguousarray(near), parent, own,
-        np.ascontiguousarray(nodes, np.float64), np.ascontiguousarray(radius, np.float64))
-    return _Match(segment, share, normal, residual, thick, own[segment])
-
-
-def _around(parent: np.ndarray, nodes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Upper nodes of the cylinders whose middles are nearest to each point, shape [m, k]."""
-    ends = np.arange(1, len(nodes))
-    tree = cKDTree((nodes[ends] + nodes[parent[ends]]) / 2)
-    _, near = tree.query(points, k=min(_CANDIDATES, len(ends)))
-    return ends[near.reshape(len(points), -1)]
 
 
 def _robust_sigma(residual: np.ndarray, radius: np.ndarray) -> float:
@@ -387,7 +327,7 @@ class _System:
                     options={"SymmetricMode": True}).solve(self.right).reshape(-1, 4)
 
 
-def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _Match,
+def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
             weight: np.ndarray, noise: float, place: np.ndarray | None = None) -> _System:
     data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place)
     smooth = _smoothness(skeleton, nodes, radius, per_node, noise)
@@ -397,7 +337,7 @@ def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _M
     return _System(matrix, right - smooth @ state)
 
 
-def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: _Match, weight: np.ndarray,
+def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
                 place: np.ndarray | None = None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
     """Normal equations of the residuals in (x, y, z, r) of both ends, and weight a node.
@@ -509,7 +449,7 @@ def _anchor(skeleton: Skeleton, nodes: np.ndarray, per_node: np.ndarray) -> spar
     return sparse.bsr_matrix((block, np.arange(len(nodes)), np.arange(len(nodes) + 1))).tocsc()
 
 
-def _uncertainty(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: _Match,
+def _uncertainty(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
                  weight: np.ndarray, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviation of each radius [m], and whether the node has points of its own."""
     system = _system(skeleton, nodes, radius, match, weight, noise)

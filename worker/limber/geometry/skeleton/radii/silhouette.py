@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from limber.geometry.cloud.sight import View
-from limber.geometry.skeleton.radii.axis_fit import nearest_cylinders
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import LIMITED, UNRESOLVED, Skeleton
 
 _ASIDE = 0.5  # sine of the least angle to the line of sight at which a silhouette tells the width
