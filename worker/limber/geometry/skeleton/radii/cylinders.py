@@ -16,7 +16,7 @@ def nearest_cylinders(skeleton: Skeleton, points: np.ndarray) -> tuple[np.ndarra
     segments, residuals = [], []
     for begin in range(0, len(points), 100_000):
         match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
-                       points[begin:begin + 100_000])
+                                points[begin:begin + 100_000])
         segments.append(match.segment)
         residuals.append(match.residual)
     return np.concatenate(segments), np.concatenate(residuals)
@@ -54,7 +54,7 @@ class Match:
 
 
 def match_cylinders(parent: np.ndarray, order: np.ndarray, nodes: np.ndarray, radius: np.ndarray,
-           points: np.ndarray, near: np.ndarray | None = None) -> Match:
+                    points: np.ndarray, near: np.ndarray | None = None) -> Match:
     """Find for each point the cylinder to whose surface it is nearest.
 
     Args:
