@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from benchmarks.table import Row
-from benchmarks.worker_batches import killed, memory, speed_up
+from benchmarks.worker_batches import killed, memory, on_dask, speed_up
 from benchmarks.worker_exports import rows as exported
 from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_readers import READERS
@@ -28,7 +28,8 @@ def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[R
         keep = (out or Path(place)) / "harmful"
         table += _fuzzed(20 if quick else 200, seed, keep, progress.part(0.1, 0.5))
     table.append(memory(30 if quick else 100, TEMPLATE, progress.part(0.5, 0.6)))
-    table.append(killed(3 if quick else 30, 2 if quick else 4, seed, progress.part(0.6, 0.8)))
+    table.append(killed(3 if quick else 30, 2 if quick else 4, seed, progress.part(0.6, 0.75)))
+    table += on_dask(2 if quick else 8, seed, progress.part(0.75, 0.8))
     table.append(speed_up(4 if quick else 40, seed, progress.part(0.8, 1.0)))
     return table
 

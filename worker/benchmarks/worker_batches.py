@@ -43,6 +43,29 @@ def speed_up(count: int, seed: int, progress: Progress) -> Row:
                times >= 1.8)
 
 
+def on_dask(count: int, seed: int, progress: Progress) -> list[Row]:
+    """The same jobs on the pool's two processes and on a Dask scheduler with two workers."""
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        folder = Path(place)
+        _scans(folder, count, seed)
+        seconds, codes = [], []
+        for number, where in enumerate(("pool", "dask")):
+            progress(0.5 * number, where)
+            jobs = _jobs(folder, where, _STAGES + _ESTIMATE)
+            started = time.perf_counter()
+            words = ["--cluster", "local"] if where == "dask" else []
+            codes.append(_batch(jobs, 2, *words).wait())
+            seconds.append(time.perf_counter() - started)
+        same = _digests(folder / "pool") == _digests(folder / "dask")
+    more = seconds[1] / seconds[0] - 1
+    return [
+        Row(f"{count} branches on a Dask scheduler and two workers, against the pool",
+            "within 15 %", f"{100 * more:+.1f} % ({seconds[0]:.0f} s, {seconds[1]:.0f} s)",
+            more <= 0.15 and codes == [0, 0]),
+        Row("their files, times aside", "bit for bit the same",
+            "the same" if same else "DIFFERENT", same)]
+
+
 def killed(kills: int, branches: int, seed: int, progress: Progress) -> Row:
     """Kill -9 of the batch and all its workers at random moments, then let it end."""
     rng = np.random.default_rng(seed)
@@ -107,9 +130,9 @@ def _jobs(folder: Path, name: str, stages: str) -> Path:
     return path
 
 
-def _batch(jobs: Path, workers: int) -> subprocess.Popen:
+def _batch(jobs: Path, workers: int, *more: str) -> subprocess.Popen:
     return subprocess.Popen(
-        [sys.executable, "-m", "limber", "batch", str(jobs), "--workers", str(workers)],
+        [sys.executable, "-m", "limber", "batch", str(jobs), "--workers", str(workers), *more],
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
         env=os.environ | {"LIMBER_CORES": str(workers)})
 

@@ -26,6 +26,10 @@ class BranchFolderError(InputError):
     """A branch folder is missing, damaged, of a newer format, or lacks a stage's files."""
 
 
+class BranchBusyError(BranchFolderError):
+    """Another program is writing to the branch folder."""
+
+
 class WorkError(LimberError):
     """The input was understood but the work failed (exit code 3)."""
 

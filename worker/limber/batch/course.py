@@ -1,10 +1,12 @@
-"""Runs a job file on the pool: branches side by side, the stages of each one after the other."""
+"""Runs a job file: branches side by side, the stages of each one after the other."""
 
 import time
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
+from limber.batch.cluster import Cluster, ClusterLostError
 from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.batch.records import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
 from limber.batch.task import run_task
@@ -18,7 +20,8 @@ _MEMORY_MB_EACH = 1000.0
 
 
 def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
-             workers: int | None = None, progress: Progress = SILENT) -> None:
+             workers: int | None = None, cluster: str | None = None,
+             scheduler: str | None = None, progress: Progress = SILENT) -> None:
     """Run what is not up to date; a failure ends its own branch alone.
 
     What has failed before, with the same settings, is run again only with ``retry_failed``. Each
@@ -29,41 +32,80 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
         records: Take in how each task ends, as it happens.
         retry_failed: Try again what has failed.
         workers: At most so many branches side by side; by default the file's, or the core budget.
+            On a queue's cluster: how many jobs to ask for.
+        cluster: Where, as one of :data:`limber.batch.job_file.CLUSTERS`; by default the file's, or
+            this process's own pool.
+        scheduler: Address of a Dask scheduler to use instead.
         progress: Cancelling it stops all; what was done stays.
 
     Raises:
         Cancelled: it was cancelled.
+        WorkError: the cluster could not be had, or was lost.
     """
     jobs.out.mkdir(parents=True, exist_ok=True)
-    count = worker_count(len(jobs.branches), wanted=workers or jobs.workers,
-                         memory_mb_each=_MEMORY_MB_EACH)
-    with records.writing(), Pool(count, name="a stage of the batch") as pool:
-        _Course(jobs, records, pool, progress, retry_failed=retry_failed).run(count)
+    kind = None if scheduler else cluster or jobs.cluster
+    with records.writing(), (
+            Cluster(jobs, kind, address=scheduler, workers=workers, progress=progress)
+            if kind or scheduler else _ThisProcess(jobs, workers)) as machines:
+        _Course(jobs, records, machines, progress, retry_failed=retry_failed).run()
+
+
+class Machines(Protocol):
+    """Where tasks are run: so many at a time, stopped all at once."""
+
+    @property
+    def count(self) -> int: ...
+
+    def submit(self, task: StageTask, folder: Path) -> Future: ...
+
+    def cancel(self) -> None: ...
+
+
+class _ThisProcess:
+    """The pool of this process."""
+
+    def __init__(self, jobs: JobFile, workers: int | None):
+        self.count = worker_count(len(jobs.branches), wanted=workers or jobs.workers,
+                                  memory_mb_each=_MEMORY_MB_EACH)
+        self._limits = jobs.limits
+        self._pool = Pool(self.count, name="a stage of the batch")
+
+    def submit(self, task: StageTask, folder: Path) -> Future:
+        return self._pool.submit(run_task, task, folder, limits=self._limits)
+
+    def cancel(self) -> None:
+        self._pool.cancel(wait_for_end=True)
+
+    def __enter__(self) -> "_ThisProcess":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._pool.close()
 
 
 class _Course:
-    def __init__(self, jobs: JobFile, records: Records, pool: Pool, progress: Progress, *,
+    def __init__(self, jobs: JobFile, records: Records, machines: Machines, progress: Progress, *,
                  retry_failed: bool):
-        self.jobs, self.records, self.pool, self.progress = jobs, records, pool, progress
+        self.jobs, self.records, self.machines, self.progress = jobs, records, machines, progress
         self.retry_failed = retry_failed
         self.waiting = deque(jobs.branches)
         self.running: dict[Future, tuple[BranchJob, int, float]] = {}
         self.ended = 0
 
-    def run(self, count: int) -> None:
+    def run(self) -> None:
         total = max(len(self.jobs.branches), 1)
         started = time.monotonic()
         try:
             while self.waiting or self.running:
                 # A branch is brought to its end before another is begun: results come early.
-                while self.waiting and len(self.running) < count:
+                while self.waiting and len(self.running) < self.machines.count:
                     self.submit(self.waiting.popleft(), 0)
                 done, _ = wait(self.running, _TICK_SECONDS, FIRST_COMPLETED)
                 for future in done:
                     self.take(future)
                 self.report(total, time.monotonic() - started)
         except BaseException:
-            self.pool.cancel(wait_for_end=True)
+            self.machines.cancel()
             raise
 
     def report(self, total: int, seconds: float) -> None:
@@ -85,7 +127,7 @@ class _Course:
             self.ended += 1
             return
         self.records.begin(branch, task)
-        future = self.pool.submit(run_task, task, branch.folder, limits=self.jobs.limits)
+        future = self.machines.submit(task, branch.folder)
         self.running[future] = branch, number, time.monotonic()
 
     def take(self, future: Future) -> None:
@@ -104,7 +146,7 @@ class _Course:
     def outcome(self, future: Future, seconds: float) -> Record:
         try:
             told = future.result()
-        except Cancelled:
+        except (Cancelled, ClusterLostError):
             raise
         except LimberError as error:
             # It crashed, or went over its limits: the pool says so.

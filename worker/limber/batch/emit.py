@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.batch.lines import line_of_task
 from limber.files import write_atomically
-from limber.options import command_line
 
 KINDS = ("slurm", "snakemake")
 _HOURS = 24.0
@@ -37,8 +37,7 @@ def commands(branch: BranchJob) -> list[str]:
 
 
 def _command(task: StageTask) -> str:
-    line = command_line(task.inputs, task.settings, task.options)
-    return shlex.join(["limber", task.stage, *line])
+    return shlex.join(["limber", *line_of_task(task)])
 
 
 def _minutes(jobs: JobFile, branch_tasks: int) -> int:

@@ -4,6 +4,7 @@
 
     out = "results"                       # where the branch folders, the table and the page go
     time_limit = "1 h"                    # of each stage; memory_limit = "4 GB"
+    cluster = "slurm"                     # or "local", "pbs" ...; default: this process's pool
 
     [[job]]
     scans = ["scans/*.ply"]               # a branch each; or folders = ["old/*.branch"]
@@ -53,7 +54,9 @@ NOT_IN_BATCHES = {
     "record": "It moves a robot: somebody has to stand beside it.",
     "execute": "It may move a robot: run it at a terminal.",
     "generate": "It makes a scan, not a branch: run it before, and name its cloud under scans."}
-_KEYS = ("out", "workers", "time_limit", "memory_limit", "job")
+CLUSTERS = ("local", "slurm", "pbs", "lsf", "sge", "oar", "moab", "htcondor")
+"""Where a batch may run beside this process's own pool: a Dask cluster here, or of a queue."""
+_KEYS = ("out", "workers", "cluster", "time_limit", "memory_limit", "job")
 _JOB_KEYS = ("scans", "folders", "stage", "sweep")
 _PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 _MOST_BRANCHES = 100_000
@@ -100,6 +103,7 @@ class JobFile:
     out: Path
     branches: tuple[BranchJob, ...]
     workers: int | None = None
+    cluster: str | None = None
     limits: Limits = field(default_factory=Limits)
 
 
@@ -135,6 +139,9 @@ class _Reader:
         workers = self.typed(content, "workers", int, (), None)
         if workers is not None and workers < 1:
             self.problem(("workers",), "workers is at least 1.")
+        cluster = self.typed(content, "cluster", str, (), None)
+        if cluster is not None and cluster not in CLUSTERS:
+            self.problem(("cluster",), f"cluster = {cluster!r}: {_nearest(cluster, CLUSTERS)}")
         limits = Limits(self.limit("time_limit", "s"), self.limit("memory_limit", "MB"))
         branches: list[BranchJob] = []
         jobs = self.tables(content, "job", ())
@@ -144,7 +151,7 @@ class _Reader:
             branches += self.job(job, ("job", number))
         self.check_folders(branches)
         self.stop_on_problems()
-        return JobFile(self.path, self.out, tuple(branches), workers, limits)
+        return JobFile(self.path, self.out, tuple(branches), workers, cluster, limits)
 
     def problem(self, place: Place, text: str) -> None:
         self.problems.append((line_of(self.lines, place), text))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from limber.batch.job_file import StageTask
-from limber.errors import BranchFolderError, Cancelled, LimberError
+from limber.errors import BranchBusyError, BranchFolderError, Cancelled, LimberError
 from limber.jobs.pool import memory_mb
 from limber.plain import plain
 from limber.progress import Progress
@@ -26,6 +26,7 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
         settings.
 
     Raises:
+        BranchBusyError: another program is writing to the branch.
         Cancelled: it was.
     """
     warnings: list[str] = []
@@ -36,7 +37,7 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
         try:
             outcome["result"] = plain(stage_description(task.stage).run(
                 task.inputs, task.settings, task.options, progress.keeping(warnings)))
-        except Cancelled:
+        except (BranchBusyError, Cancelled):
             raise
         except LimberError as error:
             outcome["error"] = str(error)

@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from limber.batch.job_file import CLUSTERS
 from limber.cli import Run, stage_command
 
 
@@ -14,16 +15,23 @@ from limber.cli import Run, stage_command
 @click.option("--retry-failed", is_flag=True, help="Run again also what has failed before.")
 @click.option("--emit", type=click.Choice(["slurm", "snakemake"]), help=(
     "Run nothing; write a Slurm array job, a task a branch, or a Snakefile, for a cluster."))
+@click.option("--cluster", type=click.Choice(CLUSTERS), help=(
+    "Run on a Dask cluster: started here (local, loopback only), or asked of a queue with the "
+    "settings of dask-jobqueue (jobqueue.slurm and so on in Dask's configuration)."))
+@click.option("--scheduler", metavar="tls://HOST:PORT", help=(
+    "Run on the Dask cluster of this scheduler; tcp:// only on loopback."))
 @click.option("--workers", type=click.IntRange(min=1), help=(
-    "At most so many branches side by side; by default as the file says, or one a core."))
+    "At most so many branches side by side; by default as the file says, or one a core. "
+    "Of a queue: so many jobs."))
 def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: str | None,
-            workers: int | None) -> dict[str, Any]:
+            cluster: str | None, scheduler: str | None, workers: int | None) -> dict[str, Any]:
     """Run stages on many branches, side by side.
 
     \b
     out = "results"                     # where all goes; default: the file's name
     workers = 2
     time_limit = "1 h"                  # of each stage; memory_limit = "4 GB"
+    cluster = "slurm"                   # or local, pbs, ...; default: the cores of this computer
     [[job]]
     scans = ["scans/*.ply"]             # a branch each; or folders = ["old/*.branch"]
     [[job.stage]]
@@ -46,8 +54,11 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     from limber.batch.job_file import read_jobs
     from limber.batch.records import Records, path_of_page, path_of_table
     from limber.batch.summary import counts, failures, write_page, write_table
-    from limber.errors import WorkError
+    from limber.errors import InputError, WorkError
 
+    if cluster is not None and scheduler is not None:
+        raise InputError("Both --cluster and --scheduler are given.",
+                         "The one starts a cluster, the other uses one.", "Leave one out.")
     jobs = read_jobs(job_file)
     if emit is not None:
         from limber.batch.emit import write_script
@@ -61,7 +72,8 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
         return {"branch_count": len(jobs.branches), "task_count": len(planned),
                 "planned": [[branch.name, task.label, told] for branch, task, told in planned]}
     try:
-        run_jobs(jobs, records, retry_failed=retry_failed, workers=workers, progress=run.progress)
+        run_jobs(jobs, records, retry_failed=retry_failed, workers=workers,
+                 cluster=cluster, scheduler=scheduler, progress=run.progress)
     finally:
         if jobs.out.is_dir():
             write_table(jobs, records)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, Timeout
 
-from limber.errors import BranchFolderError
+from limber.errors import BranchBusyError, BranchFolderError
 from limber.files import write_atomically
 
 COMMIT_LOCK = ".lock"
@@ -38,14 +38,14 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
         Whether this program did not hold it yet.
 
     Raises:
-        BranchFolderError: another program has it; says who and since when.
+        BranchBusyError: another program has it; says who and since when.
     """
     # One lock object a folder in this program, however often it is asked for.
     lock = FileLock((folder / RUN_LOCK).resolve(), is_singleton=True, thread_local=False)
     try:
         _acquire(lock, folder, 0.0)
     except Timeout as error:
-        raise BranchFolderError(
+        raise BranchBusyError(
             f"Another Limber is writing to {folder}: {_holder(folder)}.",
             "Two at once would spoil each other's results; reading goes on meanwhile.",
             "Wait for it to end, or stop it.") from error
