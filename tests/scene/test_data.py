@@ -138,6 +138,26 @@ def test_frames_of_another_mesh_are_refused(tmp_path, mesh):
             scene_data(branch)
 
 
+def test_frames_of_an_earlier_mesh_are_left_out(tmp_path, mesh):
+    """The mesh was made anew: the branch is shown without its old motion, and that is said."""
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    branch = _branch(tmp_path / "a", mesh)
+    with branch.stage("plan:p", reads=["mesh.vtu"]) as stage:
+        for name, text in _plan({}, [[0.0, 0.0, 0.3]]).items():
+            stage.path(name).write_text(text)
+        stage.path("frames/p.pc2").write_bytes(_pc2(surface[None, 1:]))
+    branch.manifest.stages["plan:p"].finished = "2026-01-01T00:00:00+00:00"
+    (branch.folder / "branch.json").write_text(branch.manifest.text())
+    with branch.stage("reconstruct") as stage:
+        mesh.with_data(cell_data={"young": np.full(mesh.tet_count, 2e8)}).write(
+            stage.path("mesh.vtu"))
+    data = scene_data(branch)
+    assert "frames" not in data.info and "path:plan" in data.arrays
+    assert any("p is of an earlier mesh" in note for note in data.info["notes"])
+    with pytest.raises(InputError, match="another mesh"):
+        scene_data(branch, motion="p")
+
+
 def test_a_path_without_numbers_is_refused(tmp_path, mesh):
     """A damaged table is named; a NaN is not handed on."""
     for name, text in (("words", "x_m,y_m,z_m\n1,2,three\n"), ("nan", "x_m,y_m,z_m\n1,2,nan\n"),

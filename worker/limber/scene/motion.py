@@ -1,7 +1,5 @@
 """What moves in a scene: frames with their values, marks along them, and what was observed."""
 
-from pathlib import Path
-
 import numpy as np
 
 from limber.errors import BranchFolderError, InputError
@@ -41,7 +39,17 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
         name = max(names, key=lambda each: _finished(branch, each))
     if name is None:
         return
-    positions = _read_frames(branch.path(f"frames/{name}.pc2"), len(data.arrays["vertices"]))
+    count = len(data.arrays["vertices"])
+    positions, _, _ = read_pc2(branch.path(f"frames/{name}.pc2"))
+    if positions.shape[1] != count:
+        if motion is None and _is_of_an_earlier_mesh(branch, name):
+            data.info["notes"].append(f"{name} is of an earlier mesh: its motion is not shown")
+            return
+        raise BranchFolderError(
+            f"frames/{name}.pc2 moves {positions.shape[1]} vertices; the mesh's surface has "
+            f"{count}.",
+            "The frames belong to another mesh; Blender would silently show the rest shape.",
+            "Run the stage that makes them again.")
     about = _about(branch, name, len(positions))
     _add_times(data, name, about, len(positions))
     data.arrays["frame_bounds"] = np.array(
@@ -93,6 +101,14 @@ def _finished(branch: Branch, name: str) -> str:
     """Return when frames were written, as the manifest says: a file's own time a copy changes."""
     return max((entry.finished for entry in branch.manifest.stages.values()
                 if f"frames/{name}.pc2" in entry.writes), default="")
+
+
+def _is_of_an_earlier_mesh(branch: Branch, name: str) -> bool:
+    """Whether the mesh has been made anew since the frames were."""
+    stages = branch.manifest.stages
+    meshed = max((stages[key].finished for key in ("reconstruct", "mesh") if key in stages),
+                 default="")
+    return _finished(branch, name) < meshed
 
 
 def _about(branch: Branch, name: str, count: int) -> FramesFile:
@@ -169,15 +185,3 @@ def _along(points: np.ndarray, count: int) -> np.ndarray:
     length = np.concatenate([[0.0], np.cumsum(steps)])
     places = np.linspace(0.0, length[-1], count)
     return np.column_stack([np.interp(places, length, points[:, axis]) for axis in range(3)])
-
-
-def _read_frames(path: Path, vertex_count: int) -> np.ndarray:
-    """Return the frames of a PC2 file, shape [frames, v, 3]; it must fit the mesh's surface."""
-    positions, _, _ = read_pc2(path)
-    points = positions.shape[1]
-    if points != vertex_count:
-        raise BranchFolderError(
-            f"{path} moves {points} vertices; the mesh's surface has {vertex_count}.",
-            "The frames belong to another mesh; Blender would silently show the rest shape.",
-            "Run `limber plan` again.")
-    return positions
