@@ -11,6 +11,9 @@ IS_MODULE = bool(getattr(bpy.app, "module", False))
 PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (5, 0, 0) else set()
 """Options of a property that holds a path: it may begin with ``//``, and Blender keeps it right."""
 
+POINT_SHADER = "POINT_UNIFORM_COLOR" if bpy.app.version >= (4, 5, 0) else "UNIFORM_COLOR"
+"""Built-in shader of points that have a size in pixels."""
+
 
 def can_denoise() -> bool:
     """Whether Cycles has OpenImageDenoise; Debian's build has not, and renders nothing with it."""

@@ -9,8 +9,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .bridge import animation, curves, materials, meshes
+from .bridge import animation, curves, materials, meshes, skeletons
 from .scene_data import SceneData
+from .skeleton_edits import Skeleton
 
 FOLDER_KEY = "limber_folder"
 SCAN_KEY = "limber_scan_sha256"
@@ -58,10 +59,14 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     Raises:
         bridge.animation.CacheError: the frames cannot move this surface.
     """
+    if bpy.context.mode != "OBJECT":
+        # What is being edited may be what is shown anew.
+        bpy.ops.object.mode_set(mode="OBJECT")
+    before = _remove_shown(scene, data.info["name"], data.folder)
     shown = _new_branch(scene, data, scalar)
     _add_paths(shown, data)
     _add_trees(shown, data)
-    _add_skeleton(shown, data)
+    _add_skeleton(shown, data, before)
     _add_points(shown, data)
     _add_goal(shown, data)
     _add_base(shown, data)
@@ -117,7 +122,6 @@ def add_object(collection: bpy.types.Collection, name: str, data: bpy.types.ID,
 
 def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> ShownBranch:
     name = data.info["name"]
-    _remove_shown(scene, name, data.folder)
     collection = bpy.data.collections.new(name)
     collection[FOLDER_KEY], collection[NAME_KEY] = animation.shown_path(data.folder), name
     scene.collection.children.link(collection)
@@ -139,16 +143,30 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
     return ShownBranch(collection, surface)
 
 
-def _remove_shown(scene: bpy.types.Scene, name: str, folder: Path) -> None:
+@dataclass
+class _Before:
+    """What stays of a branch that is shown anew: its skeleton where edits are not applied yet."""
+
+    edited: bpy.types.Mesh | None = None
+    has_skeleton_in_sight: bool = False
+
+
+def _remove_shown(scene: bpy.types.Scene, name: str, folder: Path) -> _Before:
     """Remove what was shown of this branch before, also when its folder has moved since."""
+    found = _Before()
     for collection in list(scene.collection.children):
         if FOLDER_KEY not in collection:
             continue
         before = Path(bpy.path.abspath(collection[FOLDER_KEY]))
         if before == folder or (collection[NAME_KEY] == name and not before.is_dir()):
             for thing in list(collection.objects):
+                mesh = thing.data if thing.type == "MESH" else None
+                if mesh is not None and skeletons.NODES_KEY in mesh:
+                    found.has_skeleton_in_sight = not thing.hide_viewport
+                    found.edited = mesh if skeletons.is_edited(thing) else None
                 bpy.data.objects.remove(thing)
             bpy.data.collections.remove(collection)
+    return found
 
 
 def _add_paths(shown: ShownBranch, data: SceneData) -> None:
@@ -180,20 +198,47 @@ def _lines(name: str, data: SceneData, nodes: str, parents: str) -> bpy.types.Me
     return meshes.new_lines(name, data.arrays[nodes], np.column_stack([parent[hung], hung]))
 
 
-def _add_skeleton(shown: ShownBranch, data: SceneData) -> None:
-    """Add the centreline with its radii, hidden: it lies inside the branch."""
+def _add_skeleton(shown: ShownBranch, data: SceneData, before: _Before) -> None:
+    """Add the centreline with its radii, hidden at first: it lies inside the branch.
+
+    Edits of it that are not applied yet stay where it is the same skeleton.
+    """
     if "skeleton" not in data.arrays:
         return
-    mesh = _lines("Skeleton", data, "skeleton", "skeleton_parent")
-    meshes.set_scalars(mesh, "radius", data.arrays["skeleton_radius"])
-    meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
-    if "skeleton_probability" in data.arrays:
-        meshes.set_scalars(mesh, "probability", data.arrays["skeleton_probability"])
-    meshes.set_integers(mesh, "flags", data.arrays["skeleton_flags"])
+    skeleton = Skeleton(data.arrays["skeleton"], data.arrays["skeleton_radius"],
+                        data.arrays["skeleton_parent"])
+    mesh = before.edited
+    if mesh is not None and not skeletons.is_of(mesh, skeleton):
+        data.info["notes"].append("The skeleton was made anew: edits not applied are gone")
+        bpy.data.meshes.remove(mesh)
+        mesh = None
+    if mesh is None:
+        mesh = skeletons.new_skeleton("Skeleton", skeleton, data.arrays["skeleton_flags"])
+        meshes.set_scalars(mesh, "radius_sigma", data.arrays["skeleton_radius_sigma"])
+        if "skeleton_probability" in data.arrays:
+            meshes.set_scalars(mesh, "probability", data.arrays["skeleton_probability"])
     thing = add_object(shown.collection, "Skeleton", mesh)
-    thing.hide_viewport = thing.hide_render = True
+    thing.hide_viewport = not before.has_skeleton_in_sight
+    thing.hide_render = True
     thing.show_in_front = True
     shown.objects["skeleton"] = [thing]
+
+
+def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """Return the skeleton of the branch last opened in ``scene``, if it has one."""
+    surface = find_surface(scene)
+    return None if surface is None else next(
+        (thing for thing in surface.users_collection[0].objects
+         if thing.type == "MESH" and skeletons.NODES_KEY in thing.data), None)
+
+
+def put_skeleton_back(thing: bpy.types.Object) -> None:
+    """Give a skeleton its nodes as the worker gave them."""
+    before = thing.data
+    if thing.mode == "EDIT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    thing.data = skeletons.as_it_was(before)
+    bpy.data.meshes.remove(before)
 
 
 def _add_points(shown: ShownBranch, data: SceneData) -> None:

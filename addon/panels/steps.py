@@ -12,6 +12,7 @@ from ..steps import FROM_SCENE, NOT_FROM_HERE, STEPS, WAYS, StageView, Step, Ste
 from ..steps import next_step as step_after
 from .results import draw_results
 from .sidebar import SidebarPanel
+from .skeleton import draw_skeleton
 
 _FIRST_ORDER = 2
 _registered: list[type] = []
@@ -41,6 +42,8 @@ class StepPanel(SidebarPanel):
             _draw_scene_button(layout, context, step)
         else:
             _draw_stage(layout, context, view, is_primary=True)
+        if step.name == "skeleton":
+            draw_skeleton(layout, context)
         if step.name == "report":
             layout.operator("limber.open_report", icon="URL")
         _draw_groups(layout, context, view)

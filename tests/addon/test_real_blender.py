@@ -173,6 +173,18 @@ def test_grab(run, blender, environment, beam, tmp_path):
     assert _colour_count(tmp_path / "grab.png") > 50
 
 
+def test_skeleton(run, blender, environment, tmp_path):
+    """In Edit Mode: a node moved, a twig cut, one hung over; undone; applied by the worker."""
+    require_screen()
+    shutil.copytree(FOLDER.parents[1] / "blend_files" / "bending_branch", tmp_path / "twig.branch")
+    seen = driven("drive_skeleton.py", blender, environment, tmp_path)
+    assert (seen["moved"], seen["deleted"], seen["split"]) == (1, 2, 3)
+    assert (seen["after_undo"], seen["still_editing"]) == (2, "EDIT")
+    assert seen["node_count_after"] < seen["node_count"] and seen["edited"] >= 1
+    for name in ("edited", "applied"):
+        assert _colour_count(tmp_path / f"{name}.png") > 50
+
+
 def require_screen() -> None:
     missing = [name for name in ("Xvfb", "import") if shutil.which(name) is None]
     if missing:

@@ -1,0 +1,131 @@
+"""The skeleton as a mesh of nodes that can be edited, to and from arrays.
+
+What a user marks stands in attributes of the vertices, not in properties of the object: undo in
+Edit Mode brings back the mesh alone.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import bmesh
+import bpy
+import numpy as np
+
+from ..skeleton_edits import Mark, Nodes, Skeleton, SkeletonEditError, edits_of
+from . import meshes
+
+NODES_KEY = "limber_skeleton_m"
+"""Property of the mesh: places [m] as the worker gave them, three numbers a node."""
+_RADIUS_KEY, _PARENT_KEY, _FLAGS_KEY = (
+    "limber_skeleton_radius_m", "limber_skeleton_parent", "limber_skeleton_flags")
+# Truth values too: bmesh has no layers of them before Blender 5.0.
+_INTEGERS = ("node", "mark", "mark_target", "mark_turn", "root", "flags")
+
+
+def new_skeleton(name: str, skeleton: Skeleton, flags: np.ndarray) -> bpy.types.Mesh:
+    """Make a mesh with a vertex a node and an edge to what carries it.
+
+    Attributes of the vertices: ``node`` (its number), ``radius`` [m], ``root`` (1 there), ``flags``
+    of the worker, and the marks of :class:`~..skeleton_edits.Nodes`.
+    """
+    hung = np.flatnonzero(skeleton.parent >= 0)
+    edges = np.column_stack([skeleton.parent[hung], hung])
+    mesh = meshes.new_lines(name, skeleton.nodes, edges)
+    count = len(skeleton.nodes)
+    meshes.set_scalars(mesh, "radius", skeleton.radius)
+    for attribute in _INTEGERS:
+        meshes.set_integers(mesh, attribute, np.zeros(count, int))
+    meshes.set_integers(mesh, "node", np.arange(count))
+    meshes.set_integers(mesh, "flags", flags)
+    meshes.set_integers(mesh, "root", (skeleton.parent < 0).astype(int))
+    mesh[NODES_KEY] = skeleton.nodes.astype(float).ravel().tolist()
+    mesh[_RADIUS_KEY] = skeleton.radius.astype(float).tolist()
+    mesh[_PARENT_KEY] = skeleton.parent.tolist()
+    mesh[_FLAGS_KEY] = flags.tolist()
+    return mesh
+
+
+def as_given(mesh: bpy.types.Mesh) -> Skeleton:
+    """Return the skeleton as the worker gave it."""
+    return Skeleton(np.array(mesh[NODES_KEY], float).reshape(-1, 3),
+                    np.array(mesh[_RADIUS_KEY], float), np.array(mesh[_PARENT_KEY], int))
+
+
+def flags_of(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return the worker's flags of the nodes that it gave, shape [n]."""
+    return np.array(mesh[_FLAGS_KEY], int)
+
+
+def is_of(mesh: bpy.types.Mesh, skeleton: Skeleton) -> bool:
+    """Whether the mesh was made of this skeleton."""
+    given = as_given(mesh)
+    return all(np.array_equal(one, other) for one, other in (
+        (given.nodes, skeleton.nodes), (given.radius, skeleton.radius),
+        (given.parent, skeleton.parent)))
+
+
+def is_edited(thing: bpy.types.Object) -> bool:
+    """Whether the nodes are not as the worker gave them."""
+    try:
+        return bool(edits_of(as_given(thing.data), nodes_of(thing)))
+    except SkeletonEditError:
+        return True
+
+
+def as_it_was(mesh: bpy.types.Mesh) -> bpy.types.Mesh:
+    """Return a new mesh of the skeleton as the worker gave it."""
+    return new_skeleton(mesh.name, as_given(mesh), flags_of(mesh))
+
+
+def nodes_of(thing: bpy.types.Object) -> Nodes:
+    """Return the nodes as they are now, in Edit Mode too."""
+    with nodes_edited(thing, is_changed=False) as builder:
+        layer = {name: builder.verts.layers.int[name] for name in _INTEGERS}
+        radius = builder.verts.layers.float["radius"]
+        found = [(vertex.co[:], vertex[radius], [vertex[layer[name]] for name in _INTEGERS])
+                 for vertex in builder.verts]
+        edges = [[vertex.index for vertex in edge.verts] for edge in builder.edges]
+    numbers = np.array([entry[2] for entry in found], int).reshape(-1, len(_INTEGERS))
+    return Nodes(
+        numbers[:, 0], np.array([entry[0] for entry in found], np.float32).reshape(-1, 3),
+        np.array([entry[1] for entry in found], np.float32),
+        numbers[:, 4] > 0, numbers[:, 1], numbers[:, 2], numbers[:, 3],
+        np.array(edges, int).reshape(-1, 2))
+
+
+@contextmanager
+def nodes_edited(thing: bpy.types.Object, *, is_changed: bool = True,
+                 ) -> Iterator[bmesh.types.BMesh]:
+    """Give the mesh of ``thing`` to be read or changed, in Edit Mode as in Object Mode."""
+    if thing.mode == "EDIT":
+        builder = bmesh.from_edit_mesh(thing.data)
+        builder.verts.index_update()
+        yield builder
+        if is_changed:
+            bmesh.update_edit_mesh(thing.data)
+        return
+    builder = bmesh.new()
+    try:
+        builder.from_mesh(thing.data)
+        yield builder
+        if is_changed:
+            builder.to_mesh(thing.data)
+            thing.data.update()
+    finally:
+        builder.free()
+
+
+def mark(builder: bmesh.types.BMesh, vertex: bmesh.types.BMVert, kind: Mark,
+         target: int = -1) -> None:
+    """Mark a node; a mark that it had before is gone."""
+    layers = builder.verts.layers.int
+    turn = 1 + max(other[layers["mark_turn"]] for other in builder.verts)
+    for name, value in (("mark", int(kind)), ("mark_target", target), ("mark_turn", turn)):
+        vertex[layers[name]] = value
+
+
+def set_root(builder: bmesh.types.BMesh, vertex: bmesh.types.BMVert) -> None:
+    """Make a node the root, and no other."""
+    layer = builder.verts.layers.int["root"]
+    for other in builder.verts:
+        other[layer] = int(other is vertex)

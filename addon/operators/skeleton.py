@@ -1,0 +1,233 @@
+"""Edit the skeleton: nodes are moved and deleted as any mesh's, the rest by these operators.
+
+Nothing is computed here: :class:`LIMBER_OT_apply_skeleton` hands what was changed to the worker.
+"""
+
+import json
+import tempfile
+from pathlib import Path
+from typing import ClassVar
+
+import bmesh
+import bpy
+
+from .. import scene
+from ..bridge import skeletons
+from ..skeleton_edits import Mark, SkeletonEditError, edits_of
+from .worker_operator import WorkerOperator
+
+_ACTIONS = (
+    ("DELETE", "Delete Branch", "Cut the branch off, from the chosen nodes outwards"),
+    ("BRIDGE", "Bridge", "Hang the whole branch of the first node on the last one chosen"),
+    ("MERGE", "Merge", "Up to the first node it is one with the branch of the last one chosen"),
+    ("SPLIT", "Split", "Cut at the first node; what lies beyond hangs on the last one chosen"),
+    ("ROOT", "Set Root", "The chosen node is the root"),
+    ("RADIUS", "Set Radius", "Give the chosen nodes this radius"),
+    ("CONFIRM", "Confirm", "The branch of the chosen nodes is there: no more doubt"),
+    ("NONE", "Take Mark Away", "Take bridges, merges, splits and confirmations of the chosen "
+                               "nodes back"))
+
+
+class _SkeletonOperator:
+    """Mix-in: needs a skeleton in the scene."""
+
+    @classmethod
+    def poll(cls, context):
+        if scene.find_skeleton(context.scene) is None:
+            cls.poll_message_set("Open a result first")
+            return False
+        return True
+
+
+class LIMBER_OT_edit_skeleton(_SkeletonOperator, bpy.types.Operator):
+    """Show the skeleton and edit its nodes: move them with G, delete them with X"""
+
+    bl_idname = "limber.edit_skeleton"
+    bl_label = "Edit Nodes"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        thing = scene.find_skeleton(context.scene)
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        thing.hide_viewport = False
+        thing.hide_set(False)
+        for other in context.selected_objects:
+            other.select_set(False)
+        thing.select_set(True)
+        context.view_layer.objects.active = thing
+        bpy.ops.object.mode_set(mode="EDIT")
+        context.tool_settings.mesh_select_mode = (True, False, False)
+        return {"FINISHED"}
+
+
+class LIMBER_OT_edit_node(_SkeletonOperator, bpy.types.Operator):
+    """Change how the chosen nodes hang; the worker does it when the edits are applied"""
+
+    bl_idname = "limber.edit_node"
+    bl_label = "Edit Node"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    action: bpy.props.EnumProperty(name="What", items=_ACTIONS)
+    radius: bpy.props.FloatProperty(
+        name="Radius [m]", default=0.005, min=1e-5, soft_max=0.5, precision=5,
+        description="Of the chosen nodes")
+    node: bpy.props.IntProperty(
+        name="Node", default=-1, min=-1, options={"SKIP_SAVE"},
+        description="Number of the node; -1: what is chosen in the view")
+    target: bpy.props.IntProperty(
+        name="Target", default=-1, min=-1, options={"SKIP_SAVE"},
+        description="Number of the node that it leads to; -1: the last one chosen in the view")
+
+    @classmethod
+    def description(cls, _context, properties):
+        return next(told for name, _, told in _ACTIONS if name == properties.action)
+
+    def invoke(self, context, event):
+        thing = scene.find_skeleton(context.scene)
+        if self.action != "RADIUS" or thing.mode != "EDIT":
+            return self.execute(context)
+        with skeletons.nodes_edited(thing, is_changed=False) as builder:
+            chosen = [vertex for vertex in builder.verts if vertex.select]
+            if chosen:
+                self.radius = chosen[-1][builder.verts.layers.float["radius"]]
+        return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, context):
+        self.layout.prop(self, "radius")
+
+    def execute(self, context):
+        thing = scene.find_skeleton(context.scene)
+        try:
+            with skeletons.nodes_edited(thing) as builder:
+                self._act(thing, builder)
+        except SkeletonEditError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+    def _act(self, thing, builder: bmesh.types.BMesh) -> None:
+        has_target = self.action in Mark.__members__ and Mark[self.action].has_target
+        chosen, target = self._chosen(builder, has_target)
+        number = builder.verts.layers.int["node"]
+        if self.action == "DELETE":
+            self._delete(thing, builder, chosen)
+        elif self.action == "RADIUS":
+            for vertex in chosen:
+                vertex[builder.verts.layers.float["radius"]] = self.radius
+        elif self.action == "ROOT":
+            if len(chosen) != 1:
+                raise SkeletonEditError("Choose one node to be the root.")
+            skeletons.set_root(builder, chosen[0])
+        else:
+            for vertex in chosen:
+                skeletons.mark(builder, vertex, Mark[self.action],
+                               target[number] if target is not None else -1)
+
+    def _chosen(self, builder: bmesh.types.BMesh, has_target: bool):
+        """Return the nodes meant, and the one that they lead to; SkeletonEditError without."""
+        number = builder.verts.layers.int["node"]
+        by_number = {vertex[number]: vertex for vertex in builder.verts}
+        for given in (self.node, self.target):
+            if given >= 0 and given not in by_number:
+                raise SkeletonEditError(f"There is no node {given}.")
+        target = by_number.get(self.target)
+        if has_target and target is None and self.node < 0:
+            target = builder.select_history.active
+            if not isinstance(target, bmesh.types.BMVert):
+                raise SkeletonEditError("Choose the node of the branch first, then with Shift "
+                                        "the node that it leads to.")
+        chosen = [by_number[self.node]] if self.node >= 0 else [
+            vertex for vertex in builder.verts
+            if vertex.select and not (has_target and vertex is target)]
+        if not chosen or (has_target and target is None):
+            raise SkeletonEditError("Choose nodes of the skeleton first, in Edit Mode"
+                                    + (": that of the branch, then with Shift the one that it "
+                                       "leads to." if has_target else "."))
+        return chosen, target if has_target else None
+
+    def _delete(self, thing, builder: bmesh.types.BMesh, chosen) -> None:
+        layers = builder.verts.layers.int
+        skeleton = skeletons.as_given(thing.data)
+        by_number = {vertex[layers["node"]]: vertex for vertex in builder.verts}
+        # What is hung over to another branch stays.
+        stops = {number for number, vertex in by_number.items()
+                 if Mark(vertex[layers["mark"]]).has_target}
+        gone = set().union(*(skeleton.outwards(vertex[layers["node"]], stops)
+                             for vertex in chosen))
+        if skeleton.root in gone:
+            raise SkeletonEditError("The root carries all: nothing would be left.")
+        bmesh.ops.delete(builder, geom=[by_number[number] for number in gone
+                                        if number in by_number], context="VERTS")
+
+
+class LIMBER_OT_apply_skeleton(_SkeletonOperator, WorkerOperator, bpy.types.Operator):
+    """Make surface and mesh anew with the edits of the skeleton; they stay through a reconstruct"""
+
+    bl_idname = "limber.apply_skeleton"
+    bl_label = "Apply Edits"
+    title = "Applying edits"
+
+    restore: bpy.props.BoolProperty(
+        name="Restore", options={"SKIP_SAVE"},
+        description="Take all edits back instead: the skeleton as it was found")
+    _temporary = None
+
+    @classmethod
+    def poll(cls, context):
+        return _SkeletonOperator.poll.__func__(cls, context) and (
+            WorkerOperator.poll.__func__(cls, context))
+
+    def arguments(self, context):
+        thing = scene.find_skeleton(context.scene)
+        edits = [] if self.restore else edits_of(
+            skeletons.as_given(thing.data), skeletons.nodes_of(thing))
+        if not edits and not self.restore:
+            raise ValueError("Nothing is changed: move or delete nodes first.")
+        self._folder = bpy.path.abspath(thing.users_collection[0][scene.FOLDER_KEY])
+        self._temporary = tempfile.TemporaryDirectory(prefix="limber-edits-")
+        path = Path(self._temporary.name) / "edits.json"
+        path.write_text(json.dumps(edits), encoding="utf-8")
+        how = [] if self.restore else ["--frame", "branch", "--append"]
+        return ["skeleton", "--edits", str(path), *how, "--", self._folder]
+
+    def finish(self, context, result):
+        self.report({"INFO"}, f"{self.title}: done in {result['seconds']:.0f} s")
+        thing = scene.find_skeleton(context.scene)
+        if thing is not None:
+            # They are in the folder now.
+            scene.put_skeleton_back(thing)
+        bpy.ops.limber.open_result("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT",
+                                   directory=self._folder)
+
+    def ended(self, context, outcome):
+        self._temporary.cleanup()
+
+
+class LIMBER_OT_discard_skeleton(_SkeletonOperator, bpy.types.Operator):
+    """Forget the edits that are not applied yet"""
+
+    bl_idname = "limber.discard_skeleton"
+    bl_label = "Discard"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        thing = scene.find_skeleton(context.scene)
+        if thing.mode == "EDIT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        scene.put_skeleton_back(thing)
+        return {"FINISHED"}
+
+
+_CLASSES = (LIMBER_OT_edit_skeleton, LIMBER_OT_edit_node, LIMBER_OT_apply_skeleton,
+            LIMBER_OT_discard_skeleton)
+
+
+def register() -> None:
+    for each in _CLASSES:
+        bpy.utils.register_class(each)
+
+
+def unregister() -> None:
+    for each in reversed(_CLASSES):
+        bpy.utils.unregister_class(each)

@@ -1,0 +1,122 @@
+"""Edits a skeleton inside a Blender with a window; test_real_blender.py starts it.
+
+FOLDER has twig.branch.
+"""
+
+import sys
+from pathlib import Path
+
+import bmesh
+import bpy
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from driving import FOLDER, KEY, drive, override, picture, seen, view, waited
+
+state = {}
+
+
+def skeleton():
+    return sys.modules[f"{KEY}.scene"].find_skeleton(bpy.context.scene)
+
+
+def marks():
+    return sys.modules[f"{KEY}.skeleton_overlay"].marks_in_sight(skeleton())
+
+
+def open_result():
+    view()[1].spaces.active.show_region_ui = True
+    for thing in list(bpy.data.objects):
+        bpy.data.objects.remove(thing)
+    with override():
+        bpy.ops.limber.open_result(directory=str(FOLDER / "twig.branch"))
+    return True
+
+
+def open_tab():
+    if not waited(0.5):
+        return False
+    _, area, sidebar = view("UI")
+    sidebar.active_panel_category = "Limber"
+    area.tag_redraw()
+    with override():
+        bpy.ops.limber.edit_skeleton()
+        bpy.ops.ed.undo_push(message="editing")
+        bpy.ops.view3d.view_axis(type="FRONT")
+        bpy.ops.view3d.view_all()
+    return True
+
+
+def choose(*numbers):
+    """Choose nodes as clicks with Shift do, the last one active."""
+    builder = bmesh.from_edit_mesh(skeleton().data)
+    layer = builder.verts.layers.int["node"]
+    by_number = {vertex[layer]: vertex for vertex in builder.verts}
+    for vertex in builder.verts:
+        vertex.select = False
+    builder.select_history.clear()
+    for number in numbers:
+        by_number[number].select = True
+        builder.select_history.add(by_number[number])
+    bmesh.update_edit_mesh(skeleton().data)
+
+
+def edit():
+    """A twig's tip is moved with G's operator, another twig hung elsewhere, a twig cut off."""
+    if not waited(0.5):
+        return False
+    given = sys.modules[f"{KEY}.bridge.skeletons"].as_given(skeleton().data)
+    carried = [int(k) for k in np.flatnonzero(np.bincount(
+        given.parent[given.parent >= 0], minlength=len(given.parent)) == 0)]
+    seen["node_count"], seen["tips"] = len(given.parent), carried
+    one, other = carried[:2]
+    state["tip"] = one
+    with override():
+        choose(one)
+        bpy.ops.transform.translate(value=(0.01, 0.0, 0.0))
+        seen["moved"] = marks().edit_count
+        choose(other)
+        bpy.ops.limber.edit_node("EXEC_DEFAULT", action="DELETE")
+        seen["deleted"] = marks().edit_count
+        # A user's clicks push these steps; calls from a script do not.
+        bpy.ops.ed.undo_push(message="deleted")
+        choose(int(given.parent[given.parent[one]]), 3)
+        bpy.ops.limber.edit_node("EXEC_DEFAULT", action="SPLIT")
+        seen["split"] = marks().edit_count
+        bpy.ops.ed.undo_push(message="split")
+    return True
+
+
+def undo():
+    if not waited(0.5):
+        return False
+    with override():
+        bpy.ops.ed.undo()
+    return True
+
+
+def undone():
+    seen["after_undo"] = marks().edit_count
+    seen["still_editing"] = skeleton().mode
+    return True
+
+
+def apply():
+    with override():
+        bpy.ops.limber.apply_skeleton("INVOKE_DEFAULT")
+    return True
+
+
+def applied():
+    if sys.modules[f"{KEY}.jobs"].is_running() or not waited(2.0):
+        return False
+    thing = skeleton()
+    if thing is None or marks().edit_count or not len(marks().points["edited"]):
+        return False
+    seen["node_count_after"] = len(thing.data.vertices)
+    seen["edited"] = len(marks().points["edited"])
+    return True
+
+
+drive([open_result, open_tab, edit, picture("edited"), undo, undone, apply, applied,
+       picture("applied")], longest=80)

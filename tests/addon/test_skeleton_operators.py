@@ -1,0 +1,111 @@
+"""The skeleton edited in Blender and by the worker: what is done to its nodes is what comes out."""
+
+import importlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.files import read_skeleton
+
+EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+
+
+@pytest.fixture()
+def opened(bpy, registered, tmp_path):
+    """The example's branch, copied and opened; returns its folder and its skeleton's object."""
+    folder = tmp_path / "twig.branch"
+    shutil.copytree(EXAMPLE, folder)
+    bpy.ops.limber.open_result(directory=str(folder))
+    scene = importlib.import_module("limber_addon.scene")
+    return folder, lambda: scene.find_skeleton(bpy.context.scene)
+
+
+def _places(thing):
+    return importlib.import_module("limber_addon.bridge.meshes").positions(thing.data)
+
+
+def _move(thing, node, by):
+    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    places = meshes.positions(thing.data)
+    places[node] += by
+    meshes.set_positions(thing.data, places)
+
+
+def _tip(folder):
+    skeleton = read_skeleton(folder / "skeleton.csv")
+    return int(np.flatnonzero(skeleton.branch == 1)[-1])
+
+
+def test_edits_reach_the_mesh_and_are_marked(bpy, opened):
+    """A node moved, a radius set, a twig's end cut: the worker's skeleton has it; it is marked."""
+    folder, skeleton = opened
+    before = read_skeleton(folder / "skeleton.csv")
+    tip = _tip(folder)
+    bpy.ops.limber.edit_skeleton()
+    assert skeleton().mode == "EDIT" and not skeleton().hide_viewport
+    assert bpy.ops.limber.edit_node(action="DELETE", node=tip) == {"FINISHED"}
+    assert bpy.ops.limber.edit_node(action="RADIUS", node=3, radius=0.012) == {"FINISHED"}
+    bpy.ops.object.mode_set(mode="OBJECT")
+    _move(skeleton(), 4, [0.001, 0.0, 0.0])
+    overlay = importlib.import_module("limber_addon.skeleton_overlay")
+    skeletons = importlib.import_module("limber_addon.bridge.skeletons")
+    marks = overlay.marks_of(skeletons.nodes_of(skeleton()), skeleton().data)
+    assert (marks.edit_count, marks.trouble) == (3, "")
+    assert len(marks.points["pending"]) == 2
+    assert bpy.ops.limber.apply_skeleton() == {"FINISHED"}
+    after = read_skeleton(folder / "skeleton.csv")
+    assert after.node_count == before.node_count - 1
+    near = np.linalg.norm(after.nodes - before.nodes[4] - [0.001, 0, 0], axis=1).argmin()
+    np.testing.assert_allclose(after.nodes[near], before.nodes[4] + [0.001, 0, 0], atol=1e-6)
+    assert after.radius[np.linalg.norm(after.nodes - before.nodes[3], axis=1).argmin()] == (
+        pytest.approx(0.012, rel=1e-5))
+    # It is shown anew, still in sight, with what is edited marked.
+    assert not skeleton().hide_viewport
+    marks = overlay.marks_of(skeletons.nodes_of(skeleton()), skeleton().data)
+    assert marks.edit_count == 0 and len(marks.points["edited"]) >= 2
+    assert bpy.ops.limber.apply_skeleton(restore=True) == {"FINISHED"}
+    again = read_skeleton(folder / "skeleton.csv")
+    np.testing.assert_allclose(again.nodes, before.nodes, atol=1e-8)
+
+
+def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_path):
+    """What was moved stays where the same skeleton is opened again, and in the .blend."""
+    folder, skeleton = opened
+    was = _places(skeleton())[5]
+    _move(skeleton(), 5, [0.0, 0.003, 0.0])
+    bpy.ops.limber.edit_node(action="CONFIRM", node=6)
+    bpy.ops.limber.open_result(directory=str(folder))
+    np.testing.assert_allclose(_places(skeleton())[5] - was, [0, 0.003, 0], atol=1e-6)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
+    skeletons = importlib.import_module("limber_addon.bridge.skeletons")
+    edits = importlib.import_module("limber_addon.skeleton_edits")
+    done = edits.edits_of(skeletons.as_given(skeleton().data), skeletons.nodes_of(skeleton()))
+    assert [edit["do"] for edit in done] == ["move", "confirm"]
+    assert bpy.ops.limber.discard_skeleton() == {"FINISHED"}
+    np.testing.assert_allclose(_places(skeleton())[5], was, atol=1e-7)
+    with pytest.raises(RuntimeError, match="Nothing is changed"):
+        bpy.ops.limber.apply_skeleton()
+
+
+def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
+    """A circle is the worker's error; the folder and what was marked stay."""
+    folder, skeleton = opened
+    tip = _tip(folder)
+    before = (folder / "skeleton.csv").read_bytes()
+    with pytest.raises(RuntimeError, match="There is no node 99999"):
+        bpy.ops.limber.edit_node(action="ROOT", node=99999)
+    with pytest.raises(RuntimeError, match="The root carries all"):
+        bpy.ops.limber.edit_node(action="DELETE", node=0)
+    with pytest.raises(RuntimeError, match="Choose nodes"):
+        bpy.ops.limber.edit_node(action="BRIDGE", node=tip)
+    bpy.ops.limber.edit_node(action="BRIDGE", node=1, target=tip)
+    with pytest.raises(RuntimeError, match="circle"):
+        bpy.ops.limber.apply_skeleton()
+    assert (folder / "skeleton.csv").read_bytes() == before
+    skeletons = importlib.import_module("limber_addon.bridge.skeletons")
+    assert skeletons.nodes_of(skeleton()).marks.sum() == 1
+    bpy.ops.limber.edit_node(action="NONE", node=1)
+    assert skeletons.nodes_of(skeleton()).marks.sum() == 0
