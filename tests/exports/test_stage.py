@@ -15,9 +15,10 @@ EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 
 @pytest.mark.parametrize(("name", "columns"), [
-    ("a.mat", "rtwig"), ("a.csv", "rtwig"), ("a.csv", "simpleforest"), ("a.swc", "rtwig")])
+    ("a.mat", "rtwig"), ("a.csv", "rtwig"), ("a.csv", "simpleforest"), ("a.swc", "rtwig"),
+    ("a.mtg", "rtwig")])
 def test_cylinder_models_come_back(tmp_path, name, columns):
-    """TreeQSM, rTwig, SimpleForest and SWC: the same tree, places and radii."""
+    """TreeQSM, rTwig, SimpleForest, SWC and MTG: the same tree, places and radii."""
     told = export(EXAMPLE, tmp_path / name, ExportSettings(columns=columns))
     before, after = load_skeleton(Branch.open(EXAMPLE)), read_skeleton(tmp_path / name)
     assert after.node_count == before.node_count == told.get("cylinder_count") + 1

@@ -532,6 +532,7 @@ READERS: dict[str, Reader] = {
     "calipers CSV": Reader("text", _calipers, _read_calipers),
     "MAT": Reader("binary", partial(_cylinder_models, ".mat"), _skeleton),
     "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), _skeleton),
+    "MTG": Reader("text", partial(_cylinder_models, ".mtg"), _skeleton),
     "add-on clouds": Reader("binary", lambda template, folder: [
         *_ply(template, folder), *_texts(template, folder)],
         partial(_addon_read, "clouds", "read_points")),

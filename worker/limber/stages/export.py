@@ -6,7 +6,7 @@ What is written goes by OUTPUT's suffix:
   .xml    MuJoCo (MJCF): rigid links on springs, at rest as scanned
   .urdf   the same links; springs as Gazebo reads them
   .inp    Abaqus, CalculiX: the quadratic tetrahedra, held base, a static and a frequency step
-  .mat    cylinder model of TreeQSM
+  .mat    cylinder model of TreeQSM, which SmartQSM shares
   .csv    cylinder model: --columns rtwig or simpleforest
   .mtg    multiscale tree graph of the axes
   .swc    the axes with their radii
@@ -148,6 +148,7 @@ def _elements(branch: Branch, settings: ExportSettings, progress: Progress,
 def _cylinders(branch: Branch, output: Path, settings: ExportSettings,
                ) -> tuple[str | None, dict[str, Any]]:
     from limber.geometry.skeleton import cylinder_models
+    from limber.geometry.skeleton.mtg import mtg_text
     from limber.stages.loading import load_skeleton
 
     skeleton = load_skeleton(branch)
@@ -158,7 +159,7 @@ def _cylinders(branch: Branch, output: Path, settings: ExportSettings,
                  "simpleforest": cylinder_models.simpleforest_text}[settings.columns]
         return write(skeleton), told
     if suffix == ".mtg":
-        return cylinder_models.mtg_text(skeleton), told
+        return mtg_text(skeleton), told
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         if suffix == ".swc":

@@ -44,7 +44,7 @@ class ReconstructInputs(Settings):
         json_schema_extra={"short": "-o"})
     skeleton: Path | None = Field(
         None, description="Your own skeleton in the cloud's coordinates: SWC, cylinder CSV (ours, "
-        "rTwig's, SimpleForest's) or TreeQSM's .mat.")
+        "rTwig's, SimpleForest's), .mat of TreeQSM or SmartQSM, or MTG.")
     edits: Path | None = Field(
         None, description="Edits of the skeleton (JSON, see `limber skeleton`); they stay in the "
         "branch folder and are applied again by each reconstruct without --skeleton.")

@@ -1,11 +1,12 @@
-"""Cylinder models (QSM) of other programs, in and out: TreeQSM, SimpleForest, rTwig, MTG.
+"""Cylinder models (QSM) of other programs, in and out: TreeQSM, SmartQSM, SimpleForest, rTwig.
 
 ======================  ===========================================================================
 ``.mat``                TreeQSM: a struct ``QSM`` with ``cylinder`` (radius, length, start, axis,
-                        parent, extension, branch, BranchOrder, PositionInBranch, added)
+                        parent, extension, branch, BranchOrder, PositionInBranch, added).
+                        SmartQSM writes the same struct; its radius is that of a cone's thin end,
+                        UnmodRadius that of the thick one (its ``parameterize_and_export``)
 ``.csv``                rTwig's minimum: id, parent, start_x ... end_z, radius; SimpleForest: ID,
                         parentID, startX ... endZ, radius
-``.mtg``                MTG text: axes and nodes with XX, YY, ZZ and Radius
 ======================  ===========================================================================
 """
 
@@ -21,9 +22,14 @@ TREEQSM_FIELDS = ("radius", "start", "axis", "length", "parent")
 
 
 def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
-    """Return the cylinders of a TreeQSM ``.mat`` file: ids, parents (-1: none), ends and radii.
+    """Return the cylinders of a ``.mat`` file of TreeQSM or SmartQSM.
 
-    Of several models in a file the first counts.
+    Of several models in a file the first counts. Cylinders without a parent that start where the
+    first one does hang on its start.
+
+    Returns:
+        Arrays ``id``, ``parent`` (-1: none), ``start``, ``end``, ``radius`` and ``start_radius``,
+        which is the same where the file does not tell it.
 
     Raises:
         InputError: it cannot be read (v7.3 files are HDF5 and not read), or has no cylinders.
@@ -57,7 +63,19 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
         raise InputError(f"{path} has fields of unequal length.", "Each cylinder has all of them.",
                          "Save it again.")
     return {"id": np.arange(1.0, count + 1), "parent": np.where(parent > 0, parent, -1.0),
-            "start": start, "end": start + axis * length[:, None], "radius": radius}
+            "start": start, "end": start + axis * length[:, None], "radius": radius,
+            "start_radius": _thick_ends(content, cylinder, radius)}
+
+
+def _thick_ends(content: dict[str, Any], cylinder: Any, radius: np.ndarray) -> np.ndarray:
+    """SmartQSM keeps a cone's other radius where TreeQSM has the one before its corrections."""
+    creator = getattr(getattr(content.get("QSM"), "rundata", None), "creator", "")
+    try:
+        thick = np.atleast_1d(np.asarray(getattr(cylinder, "UnmodRadius", ()), float)).ravel()
+    except (TypeError, ValueError):
+        return radius
+    fits = str(creator) == "SmartQSM" and thick.shape == radius.shape
+    return thick if fits and (np.isfinite(thick) & (thick > 0)).all() else radius
 
 
 def _cylinder_struct(content: dict[str, Any]) -> Any:
@@ -120,38 +138,4 @@ def simpleforest_text(skeleton: Skeleton) -> str:
                    skeleton.radius[node], length)
         lines.append(",".join([str(node - 1), str(up - 1), *(f"{v:.9g}" for v in numbers),
                                str(skeleton.branch[node]), str(skeleton.order[node])]))
-    return "\n".join(lines) + "\n"
-
-
-def mtg_text(skeleton: Skeleton) -> str:
-    """Return an MTG: a plant of axes of nodes, with places and radii [m].
-
-    An axis hangs with ``+`` on the node that it grows from; nodes follow each other with ``<``.
-    """
-    depth = int(skeleton.order.max()) + 1
-    tabs = "\t" * (depth + 1)
-    lines = ["CODE:\tFORM-A", "", "CLASSES:",
-             "SYMBOL\tSCALE\tDECOMPOSITION\tINDEXATION\tDEFINITION",
-             "$\t0\tFREE\tFREE\tIMPLICIT", "P\t1\tFREE\tFREE\tIMPLICIT",
-             "N\t2\tFREE\tFREE\tIMPLICIT", "", "DESCRIPTION:", "LEFT\tRIGHT\tRELTYPE\tMAX",
-             "N\tN\t+\t?", "N\tN\t<\t?", "", "FEATURES:", "NAME\tTYPE", "XX\tREAL", "YY\tREAL",
-             "ZZ\tREAL", "Radius\tREAL", "", "MTG:",
-             f"ENTITY-CODE{tabs}XX\tYY\tZZ\tRadius", f"/P1{tabs}", ""]
-    lines.pop()
-    children: dict[int, list[int]] = {}
-    for node in range(1, skeleton.node_count):
-        children.setdefault(int(skeleton.parent[node]), []).append(node)
-    waiting = [0]
-    while waiting:
-        node = waiting.pop()
-        up, column = int(skeleton.parent[node]), int(skeleton.order[node])
-        same = up < 0 or skeleton.branch[up] == skeleton.branch[node]
-        sign = "^/" if up < 0 else ("^<" if same else "+")
-        values = "\t".join(f"{value:.9g}" for value in (*skeleton.nodes[node],
-                                                        skeleton.radius[node]))
-        lines.append("\t" * column + f"{sign}N{node + 1}" + "\t" * (depth + 1 - column) + values)
-        # Side axes are told before the axis goes on: "^" means the last node of that column.
-        after = children.get(node, [])
-        on = [one for one in after if skeleton.branch[one] == skeleton.branch[node]]
-        waiting += on + [one for one in after if one not in on]
     return "\n".join(lines) + "\n"

@@ -9,6 +9,7 @@ import numpy as np
 from limber.constants import UNIT_METRES
 from limber.errors import InputError
 from limber.geometry.skeleton.cylinder_models import read_treeqsm
+from limber.geometry.skeleton.mtg import read_mtg
 from limber.geometry.skeleton.skeleton import STATES, Skeleton
 
 _ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
@@ -17,9 +18,10 @@ _ALIASES = {"id": "id", "parentid": "parent", "radius": "radius", **{
 
 
 def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
-    """Read a skeleton: ``.swc``, or a cylinder model: ``.csv``, or TreeQSM's ``.mat``.
+    """Read a skeleton: ``.swc``, ``.mtg``, or a cylinder model: ``.csv``, or TreeQSM's ``.mat``.
 
-    See :func:`read_swc`, :func:`read_cylinders` and :func:`~.cylinder_models.read_treeqsm`.
+    See :func:`read_swc`, :func:`~.mtg.read_mtg`, :func:`read_cylinders` and
+    :func:`~.cylinder_models.read_treeqsm`, which knows SmartQSM's, too.
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
@@ -28,7 +30,10 @@ def read_skeleton(path: Path, *, scale: float | None = None) -> Skeleton:
         read = read_treeqsm(path)
         table = np.column_stack([read["id"], read["parent"], read["start"], read["end"],
                                  read["radius"]])
-        return _tree_of(path, table, 1.0 if scale is None else scale)
+        return _tree_of(path, table, 1.0 if scale is None else scale,
+                        start_radius=read["start_radius"])
+    if path.suffix.lower() == ".mtg":
+        return read_mtg(path, scale=1.0 if scale is None else scale)
     return read_swc(path, scale=scale)
 
 
@@ -98,20 +103,23 @@ def read_cylinders(path: Path, *, scale: float = 1.0) -> Skeleton:
 
 
 def _tree_of(path: Path, table: np.ndarray, scale: float,
-             rows: Sequence[dict[str, str]] = ()) -> Skeleton:
+             rows: Sequence[dict[str, str]] = (), *,
+             start_radius: np.ndarray | None = None) -> Skeleton:
     """The skeleton of cylinders: id, parent, start, end and radius, shape [n, 9]."""
     _require_whole(path, table[:, :2])
     ids, up = table[:, 0].astype(np.int64), table[:, 1].astype(np.int64)
     # Some programs count from 1 and give the root the parent 0.
     parent = _parents(path, ids, np.where((up == 0) & ~(ids == 0).any(), -1, up))
     roots = np.flatnonzero(parent < 0)
-    if len(roots) != 1:
+    # Several may grow from the ground of the first one.
+    first_start = table[roots[:1], 2:5]
+    if len(roots) != 1 and not (np.abs(table[roots, 2:5] - first_start) < 1e-9).all():
         raise InputError(f"{path} has {len(roots)} cylinders without a parent.",
                          "A branch has exactly one root.", "Keep one tree in the file.")
     root = roots[0]
     nodes = np.vstack([table[root, 2:5], table[:, 5:8]]) * scale
     first = _number(path, rows[root].get("start_radius") or rows[root]["radius"]
-                    ) if rows else table[root, 8]
+                    ) if rows else (table[:, 8] if start_radius is None else start_radius)[root]
     radius = np.concatenate([[first], table[:, 8]]) * scale
     hang = np.concatenate([[-1], np.where(parent < 0, 0, parent + 1)])
     fitted = _fitted_columns(path, rows, scale) if rows else {}
