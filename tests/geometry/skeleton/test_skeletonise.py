@@ -39,6 +39,18 @@ def test_generated_truth_is_found_again(view, radius_limit):
     assert result.noise == pytest.approx(0.001, rel=0.25)
 
 
+def test_attraction_may_grow():
+    """As neighbourhoods shrink: other points, and the same axes on a scan from all around."""
+    branch = generate_branch(8, fork_count=3)
+    results = [skeletonise(branch.cloud.points, SkeletonSettings(attraction=attraction),
+                           root=branch.skeleton.nodes[0]) for attraction in ("constant", "growing")]
+    drawn = [result.contraction.drawn for result in results]
+    assert np.abs(drawn[0] - drawn[1]).max() > 1e-5
+    scored = score(branch.skeleton, results[1].skeleton)
+    assert scored["centre_radii"] < 0.25 and scored["radius_error"] < 0.08
+    assert (scored["forks_found"], scored["forks_false"]) == (3, 0)
+
+
 def test_radius_uncertainty_is_about_the_error(forked_branch):
     """The stated standard deviation is of the size of the true error."""
     result = skeletonise(forked_branch.cloud.points, root=forked_branch.skeleton.nodes[0])

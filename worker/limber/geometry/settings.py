@@ -54,13 +54,17 @@ class SkeletonSettings(Settings):
     """How the skeleton is made."""
 
     groups: ClassVar[Groups] = {
-        "shape": ("contraction_points", "gap_factor", "bridge_limit", "prune", "twig_probability",
-            "plants", "radii", "radius_low", "radius_high"),
+        "shape": ("contraction_points", "attraction", "gap_factor", "bridge_limit",
+            "prune", "twig_probability", "plants", "radii", "radius_low", "radius_high"),
     }
-    experts = ("contraction_points", "gap_factor", "bridge_limit", "radius_low", "radius_high")
+    experts = ("contraction_points", "attraction", "gap_factor", "bridge_limit",
+               "radius_low", "radius_high")
 
     contraction_points: int = Field(
         12_000, ge=50, description="Contract at most so many points (thinned evenly).")
+    attraction: Literal["constant", "growing"] = Field(
+        "constant", description="Attraction of the contraction: constant, or growing each "
+        "iteration as neighbourhoods shrink, as the paper's source has it.")
     gap_factor: float = Field(
         3.0, gt=1, description="The paper's gamma: longer than so many median steps is a gap.")
     bridge_limit: float = Field(
