@@ -91,6 +91,7 @@ NOT_RUN_HERE = {
     "record": "it moves a robot", "generate": "it makes scans, no branch",
     "load": "its answer is a table: at a terminal",
     "export": "it writes files for other programs: at a terminal",
+    "export-pull": "it writes files for other programs: at a terminal",
     "scene": "`limber.open_result` draws what it says"}
 """The others, and why."""
 

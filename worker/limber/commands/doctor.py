@@ -27,6 +27,8 @@ PARTS = [
     ("pypcd4", "pypcd4", "PCD scans"),
     ("ezc3d", "ezc3d", "C3D motion capture"),
     ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
+    ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags (pip install 'limber[bags]')"),
+    ("mcap", "mcap", "`limber export-pull` (pip install 'limber[bags]')"),
     ("matplotlib", "matplotlib", "`limber report` (pip install 'limber[report]')"),
     ("jinja2", "jinja2", "`limber report` (pip install 'limber[report]')"),
     ("bpy", "bpy", "`limber scene` without a real Blender (pip install 'limber[blender]')"),

@@ -20,6 +20,22 @@ CAMERA_MOVES_M, CAMERA_TURNS_RAD = 3e-3, 0.005
 """A camera that moves or turns more than that during a pull is not the fixed one expected."""
 
 
+def moved_into(frame_pose: tuple[float, ...], poses: np.ndarray, wrenches: np.ndarray,
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses [n, 6] and wrenches about them [n, 6] in the frame that ``frame_pose`` is in.
+
+    Args:
+        frame_pose: Of the frame that they are given in [m] and rotation vector [rad], shape [6].
+    """
+    turn = Rotation.from_rotvec(np.array(frame_pose[3:]))
+    known = np.isfinite(poses[:, 3:]).all(axis=1)
+    turned = np.full((len(poses), 3), np.nan)
+    turned[known] = (turn * Rotation.from_rotvec(poses[known, 3:])).as_rotvec()
+    matrix = turn.as_matrix().T
+    return (np.hstack([np.array(frame_pose[:3]) + poses[:, :3] @ matrix, turned]),
+            np.hstack([wrenches[:, :3] @ matrix, wrenches[:, 3:] @ matrix]))
+
+
 def copy_clouds(source: Path, folder: Path, settings: Any, progress: Progress = SILENT,
                 ) -> list[str]:
     """Bring PLY files into ``clouds/``, in metres and named by their time stamps.

@@ -14,10 +14,12 @@ from limber.errors import InputError
 from limber.geometry.cloud.apart import read_apart
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
+from limber.recordings.bags.pull import JointPoses, pull_of_bag
+from limber.recordings.bags.reading import is_bag, read_bag
 from limber.recordings.calibration import WITHOUT_GRIPPER
 from limber.recordings.checks import clean
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
-from limber.recordings.frames import copy_clouds, copy_rgbd
+from limber.recordings.frames import copy_clouds, copy_rgbd, moved_into
 from limber.recordings.hung_load import settled, swung
 from limber.recordings.recording import (
     POSE_COLUMNS,
@@ -34,9 +36,10 @@ from limber.recordings.recording import (
 )
 from limber.recordings.registration import Registration, read_nominal, register
 from limber.recordings.settings import ImportSettings
-from limber.recordings.streams import Stream
+from limber.recordings.streams import MAD_TO_SIGMA, Stream
 from limber.recordings.tables import (
     LENGTH_UNITS_M,
+    is_robot_table,
     marker_stream,
     read_table,
     robot_stream,
@@ -62,11 +65,13 @@ class BranchFrame:
 
 
 def import_recording(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                     branch: BranchFrame, progress: Progress = SILENT) -> dict[str, Any]:
+                     branch: BranchFrame, progress: Progress = SILENT, *,
+                     joint_poses: JointPoses | None = None) -> dict[str, Any]:
     """Bring a recording into ``folder`` in the pull format.
 
     Args:
         kind: What SOURCE is, as :func:`kind_of` tells.
+        joint_poses: Where a robot's gripper is by its joint angles, where that is known.
 
     Returns:
         ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
@@ -81,7 +86,8 @@ def import_recording(kind: str, source: Path, folder: Path, name: str, settings:
         return _import_force_table(source, folder, settings, progress)
     if settings.weight is not None or settings.load is not None:
         return _import_load(kind, source, folder, name, settings, branch, progress)
-    return _import_motion(kind, source, folder, name, settings, branch, progress.part(0.1, 1.0))
+    return _import_motion(kind, source, folder, name, settings, branch, joint_poses,
+                          progress.part(0.1, 1.0))
 
 
 def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
@@ -111,6 +117,8 @@ def markers_from_c3d(path: Path) -> tuple[Stream, list[str]]:
 
 def kind_of(source: Path) -> str:
     """Return what a recording is, by its name and content."""
+    if is_bag(source):
+        return "bag"
     if source.is_dir():
         if (source / "pull.toml").exists():
             return "pull"
@@ -120,12 +128,15 @@ def kind_of(source: Path) -> str:
     if source.suffix.lower() == ".c3d":
         return "c3d"
     try:
-        names = [split_title(title).name.lower() for title in read_table(source).titles]
+        titles = read_table(source).titles
+        names = [split_title(title).name.lower() for title in titles]
     except InputError:
         return "markers"
     moved = any(re.search(r"displacement|travel|stroke|deflection", name) for name in names)
     forced = any(re.search(r"force|load", name) for name in names)
-    return "force-displacement" if moved and forced else "markers"
+    if moved and forced:
+        return "force-displacement"
+    return "robot" if is_robot_table([split_title(title) for title in titles]) else "markers"
 
 
 def _import_force_table(source: Path, folder: Path, settings: ImportSettings, progress: Progress,
@@ -148,18 +159,22 @@ def _import_force_table(source: Path, folder: Path, settings: ImportSettings, pr
 
 
 def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                   branch: BranchFrame, progress: Progress) -> dict[str, Any]:
+                   branch: BranchFrame, joint_poses: JointPoses | None, progress: Progress,
+                   ) -> dict[str, Any]:
     if kind == "pull":
         shutil.copytree(source, folder, dirs_exist_ok=True)
         pull = read_pull(folder)
     else:
-        pull = _assembled(kind, source, folder, name, settings, branch, progress)
+        pull = (_of_bag(source, folder, name, settings, branch, joint_poses, progress)
+                if kind == "bag" else
+                _assembled(kind, source, folder, name, settings, branch, progress))
         write_pull(folder, pull)
     cleaned = clean(pull)
     for message in cleaned.warnings:
         progress.warn(message)
     entry = pull.entry
-    if kind != "pull" and settings.time_offset is None and cleaned.observations is not None:
+    told = kind in ("pull", "bag") or settings.time_offset is not None
+    if not told and cleaned.observations is not None:
         entry = _with_offset(cleaned, progress)
         write_entry(folder / "pull.toml", entry)
     seen = cleaned.observations
@@ -367,7 +382,9 @@ def _registered(rest: np.ndarray, labels: list[str], name: str, settings: Import
 def _assembled(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
                branch: BranchFrame, progress: Progress) -> Pull:
     observations, rest, messages = None, None, []
-    if kind in ("markers", "c3d"):
+    if kind == "robot":
+        settings = settings.model_copy(update={"robot": str(source)})
+    elif kind in ("markers", "c3d"):
         stream, labels = _markers(kind, source, settings)
         messages += stream.warnings
         observations = Observations(stream.times, stream.values.reshape(len(stream), -1, 3))
@@ -387,13 +404,55 @@ def _assembled(kind: str, source: Path, folder: Path, name: str, settings: Impor
     messages += robot.warnings
     poses = with_columns(robot, POSE_COLUMNS).values
     wrenches = with_columns(robot, WRENCH_COLUMNS).values
+    if settings.frame_pose is not None:
+        poses, wrenches = moved_into(settings.frame_pose, poses, wrenches)
     grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
              else tuple(float(x) for x in poses[np.isfinite(poses).all(axis=1)][0, :3]))
-    observation = {"rgbd": "depth", "clouds": "clouds"}.get(kind, "markers")
+    observation = {"rgbd": "depth", "clouds": "clouds", "robot": "none"}.get(kind, "markers")
     entry = _entry(observation, source, settings, branch, rest, drive=settings.drive,
                    mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
     _require_on_branch(entry.grasp, name, branch.nodes)
     return Pull(name, entry, robot.times, poses, wrenches, observations, tuple(messages))
+
+
+def _of_bag(source: Path, folder: Path, name: str, settings: ImportSettings, branch: BranchFrame,
+            joint_poses: JointPoses | None, progress: Progress) -> Pull:
+    found = pull_of_bag(read_bag(source), folder, settings, joint_poses, progress)
+    poses, wrenches = found.robot.values[:, :6], found.robot.values[:, 6:]
+    if settings.torque_sigma is None:
+        settings = settings.model_copy(update={"torque_sigma": _torque_noise(wrenches[:, 3:])})
+    seen, rest = found.seen, None
+    if seen is not None:
+        placed = _registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)], name,
+                             settings, branch)
+        used = placed.used if placed else np.flatnonzero(seen.visible[0])
+        if not len(used):
+            raise InputError(f"{name}: no marker is seen in the first frame.",
+                             "Where each is at rest is not known.",
+                             "Record from before the pull, or give --nominal.")
+        positions = seen.positions[:, used]
+        seen = replace(seen, positions=placed.apply(positions) if placed else positions)
+        rest = seen.positions[0]
+        if branch.nodes is not None:
+            _require_near(rest, name, branch.nodes)
+    grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
+             else tuple(float(x) for x in poses[0, :3]))
+    entry = _entry(found.observation, source, settings, branch, rest, drive=settings.drive,
+                   mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
+    _require_on_branch(entry.grasp, name, branch.nodes)
+    return Pull(name, entry, found.robot.times, poses, wrenches, seen, found.warnings)
+
+
+def _torque_noise(torques: np.ndarray) -> float | None:
+    """Standard deviation of measured torques [n, 3] by their steps [N m]; at least 2 % of the peak,
+    which sensors err by. None where none was measured.
+    """
+    peak = float(np.abs(np.nan_to_num(torques)).max(initial=0.0))
+    steps = np.abs(np.diff(torques, axis=0)).ravel()
+    steps = steps[np.isfinite(steps)]
+    if peak < 1e-6 or not len(steps):
+        return None
+    return max(MAD_TO_SIGMA * float(np.median(steps)) / np.sqrt(2.0), 0.02 * peak)
 
 
 def _entry(observation: Any, source: Path, settings: ImportSettings, branch: BranchFrame,

@@ -6,7 +6,8 @@ from pydantic import Field
 
 from limber.settings import Groups, Settings
 
-Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement"]
+Kind = Literal["auto", "pull", "markers", "c3d", "clouds", "rgbd", "force-displacement", "bag",
+               "robot"]
 
 
 class ImportSettings(Settings):
@@ -15,6 +16,8 @@ class ImportSettings(Settings):
     groups: ClassVar[Groups] = {
         "input": ("kind", "robot", "unit", "force_unit", "rate_hz", "nominal", "coordinates",
             "time_offset", "yolo_weights", "yolo_prompt", "yolo_class"),
+        "bags and robot logs": ("cell", "frame_pose", "wrench_topic", "pose_topic",
+            "points_topic", "bag_clock"),
         "grasp and loads": ("grasp_point", "grasp_radius", "grasp_mode", "weight", "load",
             "own_weight"),
         "simulation": ("drive", "motion", "swing_start"),
@@ -69,6 +72,19 @@ class ImportSettings(Settings):
     torque_sigma: float | None = Field(
         None, gt=0, description="Noise of torques about the pose's position [N m]; a clamped "
         "gripper's torque is used only where this is known.")
+    cell: str | None = Field(
+        None, description="Cell file of the robot: its base in the branch's frame, and where its "
+        "joints take the gripper.")
+    frame_pose: tuple[float, float, float, float, float, float] | None = Field(
+        None, description="Pose of the frame that gripper poses are given in, in the branch's: "
+        "[m] and rotation vector [rad]; else the cell's base.")
+    wrench_topic: str | None = Field(None, description="Topic of the wrench, where there are two.")
+    pose_topic: str | None = Field(
+        None, description="Topic of the gripper's pose, or its frame in TF, where there are two.")
+    points_topic: str | None = Field(
+        None, description="Topic of markers, clouds or depth images; none: nothing was seen.")
+    bag_clock: Literal["header", "log"] = Field(
+        "header", description="Time stamps of a bag: those of the messages, or when each came.")
     yolo_weights: str | None = Field(
         None, description="Weights file of a YOLO segmentation model of your own, for masks of "
         "an RGB-D folder's colour images (needs ultralytics).")

@@ -251,6 +251,13 @@ def robot_stream(path: str | Path, force_unit: str | None = None,
                   tuple(warnings))
 
 
+def is_robot_table(titles: list[Title]) -> bool:
+    """Return whether columns tell a gripper's position and force, as a robot's log does."""
+    plain = {title.plain for title in titles}
+    return all(plain & set(_POSE_ALIASES[name]) for name in (*POSE_COLUMNS[:3],
+                                                             *WRENCH_COLUMNS[:3]))
+
+
 def _robot_scale(name: str, title: Title, force_unit: str | None, path: Path) -> float:
     if name.endswith("_rad"):
         return scale_of(title, ANGLE_UNITS_RAD, "rad", path)

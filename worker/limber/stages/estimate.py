@@ -33,7 +33,11 @@ _BASES = ".reduced-*.npz"
 class EstimateOptions(RunOptions):
     """How an estimate is run."""
 
-    groups: ClassVar[Groups] = {"running": ("resume", "follow", "pace")}
+    groups: ClassVar[Groups] = {"input": ("bag",), "running": ("resume", "follow", "pace")}
+
+    bag: Path | None = Field(
+        None, description="Import this recording first (MCAP, rosbag2, RTDE log) as the pull of "
+        "its name, and estimate from it; `limber import-pull` where more has to be said.")
 
     resume: bool = Field(False, json_schema_extra={"switch": True}, description=(
         "Start at the best that a stopped run found; otherwise what it left behind does not "
@@ -217,10 +221,25 @@ def _foretell_others(branch: Branch, names: list[str], subject: Subject, found: 
 def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
+    if options.bag is not None:
+        settings = _with_bag(inputs.branch_folder, options.bag, settings, progress)
     if options.follow:
         return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
     return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,
                     progress=progress)
+
+
+def _with_bag(branch_folder: Path, bag: Path, settings: EstimateSettings, progress: Progress,
+              ) -> EstimateSettings:
+    """Bring a recording in; the estimate's pulls are those asked for and this one."""
+    import re
+
+    from limber.recordings.settings import ImportSettings
+    from limber.stages.import_pull import import_pull
+
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", bag.stem).strip("-.") or "bag"
+    import_pull(branch_folder, bag, name, ImportSettings(), progress=progress.part(0.0, 0.05))
+    return settings.model_copy(update={"pull": tuple(dict.fromkeys((*settings.pull, name)))})
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

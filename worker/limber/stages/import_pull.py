@@ -6,6 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 
 from limber.errors import InputError
@@ -18,7 +19,10 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.recordings.bags.pull import JointPoses
     from limber.recordings.importing import BranchFrame
+
+_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
 class ImportInputs(BranchInputs):
@@ -26,7 +30,8 @@ class ImportInputs(BranchInputs):
 
     groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",)}
 
-    source: Path = argument("Marker CSV, C3D, folder of PLY or RGB-D, force table.")
+    source: Path = argument("Marker CSV, C3D, PLY or RGB-D folder, force table, MCAP, rosbag2, "
+                            "RTDE log.")
     name: str = Field(description="Name of the pull.")
 
 
@@ -46,10 +51,11 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     if not source.exists():
         raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
     kind = kind_of(source) if settings.kind == "auto" else settings.kind
+    settings, joint_poses = _of_cell(settings)
     branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
     key, digests = f"pull:{name}", {"source": _digest(source)}
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
-                          ("yolo", settings.yolo_weights)):
+                          ("yolo", settings.yolo_weights), ("cell", settings.cell)):
         if named and Path(named).is_file():
             digests[key_of] = _digest(Path(named))
     if not force and branch.is_current(key, settings, digests=digests):
@@ -60,9 +66,34 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
             stage.remove(old)
         folder = stage.path(prefix + "pull.toml").parent
         stage.result.update(import_recording(kind, source, folder, name, settings,
-                                             _frame(branch, kind, settings), progress))
+                                             _frame(branch, kind, settings), progress,
+                                             joint_poses=joint_poses))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
+
+
+def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, JointPoses | None]:
+    """The settings with the cell's base, and where its joints take the gripper."""
+    if settings.cell is None:
+        return settings, None
+    from limber.robot.cell import read_cell
+    from limber.robot.kinematics import forward, matrices, pose_vectors
+
+    cell = read_cell(Path(settings.cell))
+    tool = matrices(np.array(cell.tool.grasp_pose))
+
+    def joint_poses(names: tuple[str, ...], angles: np.ndarray) -> np.ndarray:
+        # ROS sends joints in any order, UR's with names like left_shoulder_pan_joint.
+        order = [[k for k, name in enumerate(names) if part in name] for part in _JOINTS]
+        if any(len(found) != 1 for found in order):
+            raise InputError(f"Joints are called {', '.join(names)}.",
+                             f"A UR arm's are {', '.join(_JOINTS)}.",
+                             "Record poses or TF, or rename the joints.")
+        return pose_vectors(forward(cell.arm, angles[:, [found[0] for found in order]]) @ tool)
+
+    if settings.frame_pose is None:
+        settings = settings.model_copy(update={"frame_pose": cell.base.pose})
+    return settings, joint_poses
 
 
 def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:

@@ -4,6 +4,7 @@
 starts. An abort, a hang or a flood of memory ends that process alone.
 """
 
+import importlib
 import os
 import subprocess
 import sys
@@ -25,12 +26,16 @@ _REFUSED = 2
 
 
 def read_apart(kind: str, path: Path) -> dict[str, np.ndarray]:
-    """Return what a reader of ``kind`` (:data:`KINDS`) finds in a file, as arrays.
+    """Return what a reader of ``kind`` finds in a file or folder, as arrays.
+
+    Args:
+        kind: One of :data:`KINDS`, or ``module:function`` of Limber.
 
     Raises:
         InputError: it cannot be read, or takes far more time or memory than its size warrants.
     """
-    size_mb = Path(path).stat().st_size / 1e6
+    parts = Path(path).rglob("*") if Path(path).is_dir() else [Path(path)]
+    size_mb = sum(part.stat().st_size for part in parts if part.is_file()) / 1e6
     with tempfile.TemporaryDirectory(prefix="limber-read-") as folder:
         target = Path(folder, "read.npz")
         command = [sys.executable, "-m", "limber.geometry.cloud.apart", kind,
@@ -108,7 +113,9 @@ KINDS: dict[str, Callable[[Path], dict[str, np.ndarray]]] = {"las": las_arrays, 
 def _main(kind: str, source: str, target: str, parent_id: str) -> int:
     end_by_kernel(int(parent_id))
     try:
-        arrays = KINDS[kind](Path(source))
+        module, _, name = kind.partition(":")
+        reader = getattr(importlib.import_module(module), name) if name else KINDS[kind]
+        arrays = reader(Path(source))
     except Exception as error:  # each package raises its own
         print(f"{type(error).__name__}: {error}".replace("\n", " "), file=sys.stderr)
         return _REFUSED

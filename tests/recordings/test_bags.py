@@ -1,0 +1,271 @@
+"""Bags: written, read back the same; what a stranger's bag lacks is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from limber.errors import InputError
+from limber.geometry.cloud.camera import Camera, read_camera, write_camera
+from limber.perception.observe import read_depth, write_depth
+from limber.progress import SILENT
+from limber.recordings.bags.reading import read_bag
+from limber.recordings.bags.writing import _Messages, write_mcap
+from limber.recordings.recording import read_pull, write_pull
+from limber.recordings.settings import ImportSettings
+from limber.stages.export_pull import export_pull
+from limber.stages.import_pull import import_pull
+
+pytest.importorskip("rosbags")
+
+
+@pytest.fixture
+def mcap(tmp_path, plain_pull):
+    """The hand-made pull as an MCAP file."""
+    write_pull(tmp_path / "spring", plain_pull)
+    write_mcap(tmp_path / "run.mcap", tmp_path / "spring", plain_pull)
+    return tmp_path / "run.mcap"
+
+
+class Written:
+    """Messages into an MCAP file, one by one."""
+
+    def __init__(self, path):
+        from mcap.writer import Writer
+
+        self._stream = open(path, "wb")
+        self._writer, self._channels = Writer(self._stream), {}
+        self._writer.start(profile="ros2", library="test")
+        self.made = _Messages()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._writer.finish()
+        self._stream.close()
+
+    def add(self, topic, kind, message, logged):
+        store = self.made.store
+        if topic not in self._channels:
+            text, _ = store.generate_msgdef(kind, ros_version=2)
+            schema = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+        stamp = round(1e9 * logged)
+        self._writer.add_message(self._channels[topic], stamp,
+                                 bytes(store.serialize_cdr(message, kind)), stamp)
+
+    def wrench(self, topic, seconds, force, frame="branch", stamp=None):
+        made = self.made
+        self.add(topic, "geometry_msgs/msg/WrenchStamped", made.make(
+            "geometry_msgs/msg/WrenchStamped",
+            header=made.header(seconds if stamp is None else stamp, frame),
+            wrench=made.make("geometry_msgs/msg/Wrench", force=made.vector(force),
+                             torque=made.vector(np.zeros(3)))), seconds)
+
+    def pose(self, topic, seconds, position, frame="branch"):
+        made = self.made
+        self.add(topic, "geometry_msgs/msg/PoseStamped", made.make(
+            "geometry_msgs/msg/PoseStamped", header=made.header(seconds, frame),
+            pose=made.make("geometry_msgs/msg/Pose", position=made.vector(position, "Point"),
+                           orientation=made.turn(np.zeros(3)))), seconds)
+
+    def transform(self, seconds, child, pose, parent="branch"):
+        moved = self.made.transform(seconds, child, np.asarray(pose, float))
+        moved.transforms[0].header.frame_id = parent
+        self.add("/tf", "tf2_msgs/msg/TFMessage", moved, seconds)
+
+    def joints(self, seconds, names, angles):
+        self.add("/joint_states", "sensor_msgs/msg/JointState", self.made.make(
+            "sensor_msgs/msg/JointState", header=self.made.header(seconds, ""), name=names,
+            position=np.array(angles, float), velocity=np.zeros(0), effort=np.zeros(0)), seconds)
+
+
+def pulled(bag: Written, *, wrench="/wrench", pose="/pose", shift=0.0):
+    """A spring of 50 N/m pulled out by 0.1 m in 2 s."""
+    for time in np.linspace(1.0, 3.0, 101):
+        way = 0.05 * (time - 1.0)
+        if wrench:
+            bag.wrench(wrench, time, [50.0 * way, 0.0, 0.0], stamp=time + shift)
+        if pose:
+            bag.pose(pose, time, [way, 0.0, 0.5])
+
+
+def test_a_pull_comes_back_as_it_was(mcap, bare_folder, plain_pull):
+    """Poses, wrenches and markers through MCAP; frames need no option."""
+    result = import_pull(bare_folder, mcap, "again", ImportSettings())
+    assert result["kind"] == "bag" and result["point_count"] == 2
+    pull = read_pull(bare_folder / "pulls" / "again")
+    assert np.allclose(pull.times, plain_pull.times, atol=1e-6)
+    assert np.allclose(pull.poses, plain_pull.poses, atol=1e-8)
+    assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-7)
+    assert np.allclose(pull.observations.positions, plain_pull.observations.positions, atol=1e-8)
+    assert np.allclose(pull.observations.times, plain_pull.observations.times, atol=1e-6)
+    export_pull(bare_folder, "again", bare_folder.parent / "out.mcap")
+    assert read_bag(bare_folder.parent / "out.mcap").of("wrench")[0].values.shape == (201, 6)
+
+
+def test_a_rosbag2_folder_is_read_as_well(mcap, tmp_path, bare_folder, plain_pull):
+    """The same messages as ROS 2's own recorder leaves them: a folder with SQLite."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag2 import Writer
+
+    with AnyReader([mcap]) as reader, Writer(tmp_path / "bag2", version=9) as writer:
+        known = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=reader.typestore)
+                 for c in reader.connections}
+        for connection, logged, raw in reader.messages():
+            writer.write(known[connection.topic], logged, raw)
+    import_pull(bare_folder, tmp_path / "bag2", "again", ImportSettings())
+    pull = read_pull(bare_folder / "pulls" / "again")
+    assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-7)
+
+
+def test_depth_images_come_with_their_camera(tmp_path, bare_folder, plain_pull):
+    """In another scale, the same depths; the camera where TF has it."""
+    folder = tmp_path / "depth_pull"
+    pull = replace(plain_pull, observations=None,
+                   entry=plain_pull.entry.model_copy(update={"observation": "depth"}))
+    write_pull(folder, pull)
+    camera = Camera(width=32, height=24, fx=30.0, fy=31.0, cx=15.0, cy=12.0, depth_scale=4000.0,
+                    pose=(0.1, -1.0, 0.3, -1.2, 0.1, 0.2))
+    write_camera(folder / "camera.toml", camera)
+    (folder / "depth").mkdir()
+    depths = np.random.default_rng(1).uniform(0.5, 1.5, (3, 24, 32))
+    for time, depth in zip((0.5, 1.5, 2.5), depths, strict=True):
+        write_depth(folder / "depth" / f"{time:.6f}.png", depth, camera)
+    write_mcap(tmp_path / "run.mcap", folder, pull)
+    import_pull(bare_folder, tmp_path / "run.mcap", "seen", ImportSettings())
+    target = bare_folder / "pulls" / "seen"
+    found = read_camera(target / "camera.toml")
+    assert found.pose == pytest.approx(camera.pose) and found.fy == 31.0
+    files = sorted((target / "depth").glob("*.png"))
+    assert [float(file.stem) for file in files] == pytest.approx([0.5, 1.5, 2.5], abs=1e-6)
+    first = files[0]
+    assert np.allclose(read_depth(first, found), depths[0], atol=1e-3)
+
+
+def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
+    """Gripper in TF, wrench in a sensor's frame turned against it and 50 mm behind it."""
+    turned = Rotation.from_euler("z", 90, degrees=True)
+    with Written(tmp_path / "tf.mcap") as bag:
+        bag.transform(0.0, "sensor", np.r_[-0.05, 0, 0, turned.as_rotvec()], parent="tool0")
+        for time in np.linspace(1.0, 3.0, 51):
+            way = 0.05 * (time - 1.0)
+            bag.transform(time, "tool0", [way, 0, 0.5, 0, 0, 0])
+            # 50 way N along the branch's y is along the sensor's x.
+            bag.wrench("/wrench", time, [50.0 * way, 0.0, 0.0], frame="sensor")
+    import_pull(bare_folder, tmp_path / "tf.mcap", "tf", ImportSettings())
+    pull = read_pull(bare_folder / "pulls" / "tf")
+    way = pull.poses[:, 0]
+    assert np.allclose(pull.poses[:, 2], 0.5) and way[-1] == pytest.approx(0.1)
+    assert np.allclose(pull.wrenches[:, :3], np.outer(50 * way, [0, 1, 0]), atol=1e-9)
+    # 50 mm behind the gripper: a torque about it.
+    assert np.allclose(pull.wrenches[:, 5], -0.05 * 50 * way, atol=1e-9)
+    assert pull.entry.observation == "none"
+
+
+def test_joint_angles_need_the_cell(tmp_path, bare_folder):
+    """In any order, with a robot's own names; the base's pose in the branch's frame is the
+    cell's."""
+    from limber.robot.cell import Cell, write_cell
+    from limber.robot.kinematics import forward, pose_vectors
+
+    names = ["elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
+             "wrist_2_joint", "wrist_3_joint"]
+    with Written(tmp_path / "joints.mcap") as bag:
+        for time in np.linspace(1.0, 3.0, 21):
+            bag.joints(time, names, [1.4, -1.5, 0.1 * time, -1.2, -1.5, 0.2])
+            bag.wrench("/wrench", time, [time - 1, 0, 0])
+    with pytest.raises(InputError, match="--cell"):
+        import_pull(bare_folder, tmp_path / "joints.mcap", "j", ImportSettings())
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.4, 0.2, 0.0, 0, 0, 0)})
+    write_cell(tmp_path / "cell.toml", cell)
+    import_pull(bare_folder, tmp_path / "joints.mcap", "j",
+                ImportSettings(cell=str(tmp_path / "cell.toml")))
+    pull = read_pull(bare_folder / "pulls" / "j")
+    expected = pose_vectors(forward(cell.arm, np.array([0.1, -1.5, 1.4, -1.2, -1.5, 0.2])))
+    assert np.allclose(pull.poses[0, :3], expected[:3] + [0.4, 0.2, 0.0])
+
+
+@pytest.mark.parametrize("made, told", [
+    (lambda bag: pulled(bag, wrench=None), "no wrench.*Its topics: /pose"),
+    (lambda bag: pulled(bag, pose=None), "no pose"),
+    (lambda bag: (pulled(bag), pulled(bag, wrench="/other", pose=None)),
+     "2 topics of wrenchs?.*Two grippers.*--wrench-topic"),
+    (lambda bag: (pulled(bag), pulled(bag, wrench=None, pose="/left")), "--pose-topic"),
+    (lambda bag: pulled(bag, shift=3600.0), "3600 s apart.*--bag-clock log"),
+])
+def test_what_a_bag_lacks_is_said(tmp_path, bare_folder, made, told):
+    with Written(tmp_path / "bad.mcap") as bag:
+        made(bag)
+    with pytest.raises(InputError, match=f"(?s){told}"):
+        import_pull(bare_folder, tmp_path / "bad.mcap", "bad", ImportSettings())
+    assert not (bare_folder / "pulls" / "bad" / "pull.toml").exists()
+
+
+def test_what_was_asked_can_be_answered(tmp_path, bare_folder):
+    with Written(tmp_path / "two.mcap") as bag:
+        pulled(bag, shift=3600.0)
+        pulled(bag, wrench="/other", pose="/left")
+    import_pull(bare_folder, tmp_path / "two.mcap", "two", ImportSettings(
+        wrench_topic="/wrench", pose_topic="/left", bag_clock="log"))
+    pull = read_pull(bare_folder / "pulls" / "two")
+    assert np.allclose(pull.wrenches[:, 0], 50 * pull.poses[:, 0], atol=1e-6)
+
+
+def test_damaged_bags_are_refused_or_read_never_crash(mcap, tmp_path, bare_folder):
+    """Five ways of spoiling bytes: an answer in words each time, in seconds."""
+    whole = mcap.read_bytes()
+    rng = np.random.default_rng(8)
+    answers = []
+    for number in range(5):
+        spoilt = bytearray(whole)
+        if number % 3 == 0:
+            spoilt = spoilt[:int(rng.integers(10, len(whole)))]
+        else:
+            for place in rng.integers(0, len(whole), 1 if number % 3 == 1 else 40):
+                spoilt[place] = int(rng.integers(256))
+        path = tmp_path / f"bad{number}.mcap"
+        path.write_bytes(bytes(spoilt))
+        try:
+            read_bag(path)
+            answers.append("read")
+        except InputError as error:
+            assert len(str(error)) < 1500
+            answers.append("refused")
+    assert "refused" in answers
+
+
+def test_a_robots_log_alone_is_a_pull(tmp_path, bare_folder):
+    """As ur-rtde records it: actual_TCP_pose_0, ..., no markers; a base in another frame."""
+    times = np.linspace(0, 2, 101)
+    rows = np.zeros((101, 13))
+    rows[:, 0], rows[:, 1], rows[:, 3], rows[:, 7] = times, 0.05 * times, 0.5, 2.5 * times
+    header = ",".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6)),
+                       *(f"actual_TCP_force_{k}" for k in range(6))])
+    np.savetxt(tmp_path / "rtde.csv", rows, "%.9g", ",", header=header, comments="")
+    result = import_pull(bare_folder, tmp_path / "rtde.csv", "log", ImportSettings(
+        frame_pose=(0.1, 0, 0, 0, 0, np.pi / 2)))
+    assert result["kind"] == "robot"
+    pull = read_pull(bare_folder / "pulls" / "log")
+    assert np.allclose(pull.poses[-1, :3], [0.1, 0.1, 0.5])
+    assert np.allclose(pull.wrenches[-1, :3], [0, 5.0, 0], atol=1e-9)
+    assert pull.entry.observation == "none"
+
+
+def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
+    """One command imports the bag under a name of its own, and estimates from it."""
+    from limber.estimation.settings import EstimateSettings
+    from limber.stages import estimate as stage
+    from limber.stages.inputs import BranchInputs
+
+    pull = read_pull(branch_folder / "pulls" / "pull-1")
+    write_mcap(tmp_path / "run 7.mcap", branch_folder / "pulls" / "pull-1", pull)
+    monkeypatch.setattr(stage, "estimate", lambda folder, settings, **_: {"used": settings.pull})
+    told = stage.run(BranchInputs(branch_folder=branch_folder), EstimateSettings(),
+                     stage.EstimateOptions(bag=tmp_path / "run 7.mcap"), SILENT)
+    assert told == {"used": ("run-7",)}
+    again = read_pull(branch_folder / "pulls" / "run-7")
+    assert np.allclose(again.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
+    assert np.allclose(again.observations.positions, pull.observations.positions, atol=1e-7)
