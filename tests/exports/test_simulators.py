@@ -9,9 +9,11 @@ from benchmarks.worker_exports import bent_here, bent_in_calculix, bent_in_mujoc
 from limber.exports.abaqus import inp_text
 from limber.exports.mjcf import mjcf_text
 from limber.exports.urdf import urdf_text
+from limber.exports.usd import as_deformable, write_usd
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
-from limber.mechanics.rods import rod_tree
+from limber.mechanics.rods import rod_tree, tip_compliance
 
 LOAD = np.array([0.01, 0.006, 0.0])
 
@@ -82,3 +84,44 @@ def test_calculix_bends_it_as_we_do(small_bench, small):
     ours, theirs = bent_here(model, node, LOAD), bent_in_calculix(model, node, LOAD)
     assert np.linalg.norm(theirs.tip - ours.tip) < 0.01 * np.linalg.norm(ours.tip)
     assert theirs.frequency == pytest.approx(ours.frequency, rel=0.01)
+
+
+def test_usd_holds_a_deformable_body_that_bends_as_we_do(small_bench, small, tmp_path):
+    """Read back by USD: valid, right-handed; its mesh and modulus give our compliance."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    mesh = small_bench.mesh
+    young = np.linspace(3e8, 1e8, mesh.tet_count)
+    model = BranchModel(mesh, young=young, poisson=0.36, density=900.0, gravity=None)
+    node = int(np.linalg.norm(mesh.nodes - small.skeleton.nodes[-1], axis=1).argmin())
+    path = tmp_path / "a.usdc"
+    write_usd(as_deformable(model, node), RayleighDamping(0.1, 2e-3), "b", path)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Z"
+    body, solid = stage.GetDefaultPrim(), UsdGeom.TetMesh.Get(stage, "/Branch/simulation")
+    # Schemas that USD itself does not know stand in the metadata alone.
+    applied = [prim.GetMetadata("apiSchemas").GetAppliedItems()
+               for prim in (body, solid.GetPrim())]
+    assert "OmniPhysicsDeformableBodyAPI" in applied[0]
+    assert {"OmniPhysicsVolumeDeformableSimAPI", "PhysicsCollisionAPI"} <= set(applied[1])
+    points, tets = np.array(solid.GetPointsAttr().Get()), np.array(
+        solid.GetTetVertexIndicesAttr().Get())
+    assert UsdGeom.TetMesh.FindInvertedElements(solid, Usd.TimeCode.Default()) == []
+    assert len(solid.GetSurfaceFaceVertexIndicesAttr().Get()) == len(mesh.surface_faces())
+    own = np.array(solid.GetPrim().GetAttribute("limber:youngsModulus").Get())
+    np.testing.assert_allclose(own, young, rtol=1e-6)
+    wood, _ = UsdShade.MaterialBindingAPI(body).ComputeBoundMaterial("physics")
+    value = {name: wood.GetPrim().GetAttribute(f"omniphysics:{name}").Get()
+             for name in ("youngsModulus", "poissonsRatio", "density")}
+    held = np.array(stage.GetPrimAtPath("/Branch/base").GetAttribute(
+        "omniphysics:vtxIndicesSrc0").Get())
+    read = BranchModel(TetMesh(points.astype(float), tets), young=value["youngsModulus"],
+                       poisson=value["poissonsRatio"], density=value["density"], gravity=None,
+                       fixed=np.isin(np.arange(len(points)), held))
+    assert read.total_mass == pytest.approx(model.total_mass, rel=1e-3)
+    assert body.GetAttribute("omniphysics:mass").Get() == pytest.approx(model.total_mass, rel=1e-5)
+    end = int(np.linalg.norm(points - mesh.nodes[node], axis=1).argmin())
+    assert tip_compliance(read, end) == pytest.approx(tip_compliance(model, node), rel=1e-3)
+    assert bent_here(read, end, 1e-3 * LOAD).frequency == pytest.approx(
+        bent_here(model, node, 1e-3 * LOAD).frequency, rel=0.1)

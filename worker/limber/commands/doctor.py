@@ -31,6 +31,7 @@ PARTS = [
     ("mcap", "mcap", "`limber export-pull` (pip install 'limber[bags]')"),
     ("matplotlib", "matplotlib", "`limber report` (pip install 'limber[report]')"),
     ("jinja2", "jinja2", "`limber report` (pip install 'limber[report]')"),
+    ("pxr", "usd-core", "`limber export` to USD (pip install 'limber[usd]')"),
     ("bpy", "bpy", "`limber scene` without a real Blender (pip install 'limber[blender]')"),
     ("ultralytics", "ultralytics", "masks by a YOLO model of your own (optional)"),
 ]

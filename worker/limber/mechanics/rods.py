@@ -98,15 +98,20 @@ def matched(tree: RodTree, model: BranchModel, tip: int) -> tuple[RodTree, float
         compliance += (ways / tree.stiffness[link][:, None]).T @ ways
         link = int(tree.parent[link])
     bare = model.with_parameters(gravity=(0.0, 0.0, 0.0))
+    factor = float(np.trace(compliance)) / tip_compliance(bare, tip)
+    return replace(tree, stiffness=tree.stiffness * factor), factor
+
+
+def tip_compliance(model: BranchModel, tip: int) -> float:
+    """Return how far node ``tip`` goes along a small force on it [m/N], summed over three axes."""
     still = np.zeros_like(model.mesh.nodes)
-    tangent = bare.equations(()).tangent(bare, still)
-    ours = 0.0
+    tangent = model.equations(()).tangent(model, still)
+    compliance = 0.0
     for axis in range(3):
         load = still.copy()
         load[tip, axis] = 1.0
-        ours += float(tangent.solve(load)[tip, axis])
-    factor = float(np.trace(compliance)) / ours
-    return replace(tree, stiffness=tree.stiffness * factor), factor
+        compliance += float(tangent.solve(load)[tip, axis])
+    return compliance
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ What is written goes by OUTPUT's suffix:
 \b
   .xml    MuJoCo (MJCF): rigid links on springs, at rest as scanned
   .urdf   the same links; springs as Gazebo reads them
+  .usd    USD (.usda: as text): a deformable body of linear tetrahedra with one modulus
   .inp    Abaqus, CalculiX: the quadratic tetrahedra, held base, a static and a frequency step
   .mat    cylinder model of TreeQSM, which SmartQSM shares
   .csv    cylinder model: --columns rtwig or simpleforest
@@ -31,9 +32,12 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.geometry.skeleton.skeleton import Skeleton
     from limber.mechanics.materials import RayleighDamping
+    from limber.mechanics.model import BranchModel
 
 _RODS, _ELEMENTS, _CYLINDERS = (".xml", ".urdf"), (".inp",), (".mat", ".csv", ".mtg", ".swc")
+_SCENES = (".usd", ".usda", ".usdc")
 
 
 class ExportInputs(BranchInputs):
@@ -65,21 +69,24 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
     Returns:
         ``output``, ``format``, and what it holds: ``link_count``, ``mass_kg`` and
         ``stiffness_factor``, by which the links' springs were scaled to bend as the mesh does; or
-        ``tet_count``, ``node_count`` and ``tip_node``; or ``cylinder_count``.
+        ``tet_count``, ``node_count`` and ``tip_node``; or those and ``young_pa``, the one modulus
+        that makes the tip as compliant as our mesh; or ``cylinder_count``.
 
     Raises:
         InputError: no such format, or it cannot be written. BranchFolderError: the folder lacks
-            mesh or skeleton.
+            mesh or skeleton. MissingDependencyError: USD is not installed.
     """
     branch, suffix = Branch.open(folder), output.suffix.lower()
     if suffix in _RODS:
         text, told = _rods(branch, suffix, settings, progress)
     elif suffix in _ELEMENTS:
         text, told = _elements(branch, settings, progress)
+    elif suffix in _SCENES:
+        text, told = _scene(branch, output, progress)
     elif suffix in _CYLINDERS:
         text, told = _cylinders(branch, output, settings)
     else:
-        known = " ".join((*_RODS, *_ELEMENTS, *_CYLINDERS))
+        known = " ".join((*_RODS, *_SCENES, *_ELEMENTS, *_CYLINDERS))
         raise InputError(f"{output} has a suffix that is not known.", f"Known are: {known}.",
                          "Name the file so.")
     _written(output, text)
@@ -98,8 +105,8 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
     path = skeleton.main_path()
     spacing = float(skeleton.arc_length[path[-1]]) / settings.links
     tip = skeleton.nodes[path[-1]]
-    node = int(np.linalg.norm(loaded.mesh.nodes - tip, axis=1).argmin())
-    tree, factor = matched(rod_tree(loaded.model, skeleton, spacing), loaded.model, node)
+    tree, factor = matched(rod_tree(loaded.model, skeleton, spacing), loaded.model,
+                           _tip(loaded.model, skeleton))
     damping = _damping(branch, progress)
     if suffix == ".urdf":
         text = urdf_text(tree, damping, branch.name)
@@ -134,15 +141,42 @@ def _elements(branch: Branch, settings: ExportSettings, progress: Progress,
     from limber.stages.loading import load_branch, load_skeleton
 
     model = load_branch(branch, gravity=False, progress=progress).model
-    skeleton = load_skeleton(branch)
-    end = skeleton.nodes[skeleton.main_path()[-1]]
-    tip = int(np.linalg.norm(model.mesh.nodes - end, axis=1).argmin())
+    tip = _tip(model, load_skeleton(branch))
     if model.point_masses:
         progress.warn("What hangs on the branch (twigs, leaves, targets) is not in an .inp file.")
     load = None if settings.load is None else np.array(settings.load)
     text = inp_text(model, branch.name, tip, load)
     return text, {"tet_count": model.mesh.tet_count, "node_count": model.mesh.node_count,
                   "tip_node": tip + 1}
+
+
+def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dict[str, Any]]:
+    import tempfile
+
+    from limber.exports.usd import as_deformable, write_usd
+    from limber.optional import require_extra
+    from limber.stages.loading import load_branch, load_skeleton
+
+    require_extra("usd", ("pxr",), "USD")
+    model = load_branch(branch, gravity=False, progress=progress).model
+    if model.point_masses:
+        progress.warn("What hangs on the branch (twigs, leaves, targets) is not in a USD file.")
+    tip = _tip(model, load_skeleton(branch))
+    made = as_deformable(model, tip)
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, f"branch{output.suffix.lower()}")
+        write_usd(made, _damping(branch, progress), branch.name, path)
+        content = path.read_bytes()
+    mesh = made.model.mesh
+    end = int(np.linalg.norm(mesh.nodes - model.mesh.nodes[tip], axis=1).argmin())
+    return content, {"tet_count": mesh.tet_count, "node_count": mesh.node_count, "tip_node": end,
+                     "young_pa": made.young}
+
+
+def _tip(model: BranchModel, skeleton: Skeleton) -> int:
+    """The node at the end of the main path."""
+    end = skeleton.nodes[skeleton.main_path()[-1]]
+    return int(np.linalg.norm(model.mesh.nodes - end, axis=1).argmin())
 
 
 def _cylinders(branch: Branch, output: Path, settings: ExportSettings,
@@ -171,7 +205,7 @@ def _cylinders(branch: Branch, output: Path, settings: ExportSettings,
     return None, told
 
 
-def _written(output: Path, text: str | None) -> None:
+def _written(output: Path, text: str | bytes | None) -> None:
     from limber.files import write_atomically
 
     if text is None:
