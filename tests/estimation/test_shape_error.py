@@ -13,8 +13,9 @@ from limber.estimation.fit import _tell_largest_part
 from limber.estimation.forward.watched import WatchedForward
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
-from limber.estimation.preparation import Subject, forwards_of, parameter_space
+from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.subject import Subject
 from limber.mechanics.added import HungTwig
 from limber.mechanics.model import BranchModel
 from limber.progress import Progress

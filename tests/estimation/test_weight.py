@@ -10,8 +10,9 @@ from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace
-from limber.estimation.preparation import forwards_of, subject_of
+from limber.estimation.preparation import forwards_of
 from limber.estimation.settings import EstimateSettings, VirtualPullSettings
+from limber.estimation.subject import subject_of
 from limber.estimation.virtual_pull import TrueBranch, simulate_pull
 from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark

@@ -29,9 +29,9 @@ from limber.estimation.online.filter import OnlineFrame
 from limber.estimation.online.follow import begin
 from limber.estimation.optimise import gauss_newton, nelder_mead
 from limber.estimation.parameters import Values
-from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import scaled_start
+from limber.estimation.subject import Subject
 from limber.estimation.virtual_pull import (
     VirtualPullSettings,
     simulate_pull,

@@ -29,8 +29,9 @@ from limber.estimation.field_form import open_field
 from limber.estimation.fit import Estimate, fit_pulls, judge_model, require_result
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
-from limber.estimation.preparation import Subject, forwards_of, parameter_space
+from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.subject import Subject
 from limber.geometry.skeleton.control_points import control_points
 from limber.mechanics.model import BranchModel
 from limber.mechanics.young_field import young_weights

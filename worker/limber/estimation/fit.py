@@ -34,15 +34,11 @@ from limber.estimation.nuisances import in_words, told
 from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.parameters import Values
-from limber.estimation.preparation import (
-    Subject,
-    forwards_of,
-    parameter_space,
-    require_scale_in_principle,
-)
+from limber.estimation.preparation import forwards_of, parameter_space, require_scale_in_principle
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import led_start, scaled_start
+from limber.estimation.subject import Subject
 from limber.progress import SILENT, Progress
 from limber.recordings.checks import force_unit_suspicion
 from limber.recordings.grasping import grasp_on

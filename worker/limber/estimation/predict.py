@@ -8,8 +8,8 @@ import numpy as np
 from limber.errors import InputError, WorkError
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.preparation import Subject
 from limber.estimation.settings import PredictSettings
+from limber.estimation.subject import Subject
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
 from limber.recordings.recording import PullEntry

@@ -9,8 +9,8 @@ from limber.estimation.doubt.model_error import total_interval
 from limber.estimation.doubt.uncertainty import outliers
 from limber.estimation.fit import Estimate
 from limber.estimation.objective import Evaluation, Objective
-from limber.estimation.preparation import Subject
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.subject import Subject
 from limber.recordings.recording import Pull
 
 

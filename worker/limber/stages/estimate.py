@@ -21,7 +21,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.estimation.fit import Estimate
-    from limber.estimation.preparation import Subject
+    from limber.estimation.subject import Subject
 
 
 EVALUATIONS = ".estimate-evaluations.jsonl"

@@ -14,8 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from limber.alignment import Alignment
 from limber.constants import FOUND_SKELETON, UNIT_METRES
 from limber.errors import InputError
-from limber.estimation.preparation import Subject, observed, subject_of
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.subject import Subject, observed, subject_of
 from limber.geometry.skeleton.files import read_cylinders, read_skeleton, read_swc
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh

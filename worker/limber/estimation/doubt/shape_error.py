@@ -12,7 +12,7 @@ from scipy import stats
 from limber.estimation.doubt.path_error import WIDEST
 from limber.estimation.doubt.shape_slopes import hung_slopes, shape_slopes, taken_up
 from limber.estimation.objective import Evaluation, Objective
-from limber.estimation.preparation import Subject
+from limber.estimation.subject import Subject
 from limber.geometry.likely_shapes import likely_skeletons, reshaped
 from limber.mechanics.added import HungTwig
 from limber.progress import SILENT, Progress

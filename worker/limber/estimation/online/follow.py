@@ -16,9 +16,10 @@ from limber.estimation.online.exact import Beside, FullBranch, Here
 from limber.estimation.online.filter import OnlineEstimator, OnlineFrame, OnlineState
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import ParameterSpace, Values
-from limber.estimation.preparation import Subject, forwards_of
+from limber.estimation.preparation import forwards_of
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import scaled_start
+from limber.estimation.subject import Subject
 from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, build_reduced
 from limber.mechanics.reduced.training import TrainingSettings
 from limber.progress import SILENT, Progress
