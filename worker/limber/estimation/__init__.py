@@ -19,12 +19,12 @@ _PLACES = {
     "EvaluationLog": "evaluations",
     "OnlineEstimator": "online.filter",
     "PredictSettings": "settings",
-    "Subject": "preparation",
+    "Subject": "subject",
     "VirtualPullSettings": "settings",
     "fit_branch": "fit",
     "predict_rest": "predict",
     "simulate_pull": "virtual_pull",
-    "subject_of": "preparation",
+    "subject_of": "subject",
     "true_branch": "virtual_pull",
 }
 
