@@ -39,3 +39,38 @@ def test_a_load_is_needed_and_lies_on_the_branch(tip):
                             (LoadSettings(fruit=((9.0, 0.0, 0.0, 1.0),)), "off the branch")):
         with pytest.raises(InputError, match=words):
             load(EXAMPLE, settings)
+
+
+def test_gusts_bend_it_further_than_an_even_wind(tmp_path):
+    """Their peak is the rest under so many times the mean load; a record of even wind adds none."""
+    even = load(EXAMPLE, LoadSettings(wind=(6.0, 0.0, 0.0)))
+    found = load(EXAMPLE, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.3))
+    gusts = found["gusts"]
+    assert even["gusts"] is None and gusts["factor"] > 1 + 3 * 2 * 0.3
+    assert gusts["mean_tip_displacement_m"] == pytest.approx(even["tip_displacement_m"])
+    assert found["wind_force_n"] == pytest.approx(gusts["factor"] * even["wind_force_n"])
+    assert found["greatest_strain"] > even["greatest_strain"] and 0 < gusts["damping"] < 1
+    record = tmp_path / "wind.csv"
+    record.write_text("time_s,speed_m_s\n" + "".join(f"{k / 10},6\n" for k in range(100)))
+    still = load(EXAMPLE, LoadSettings(wind=(1.0, 0.0, 0.0), gust_record=record))
+    assert still["gusts"]["factor"] == pytest.approx(1.0)
+    assert still["tip_displacement_m"] == pytest.approx(even["tip_displacement_m"])
+
+
+@pytest.mark.parametrize(("content", "settings", "told"), [
+    ("", {"gust": 0.2}, "without wind"),
+    ("", {"wind": (0.0, 0.0, 0.0), "gust": 0.2}, "without wind"),
+    ("time_s,speed_m_s\n0,1\n", {"wind": (1.0, 0.0, 0.0)}, "at least 16"),
+    ("t,v\n0,1\n", {"wind": (1.0, 0.0, 0.0)}, "no column time_s"),
+    ("time_s,speed_m_s\n" + "0,1\n" * 20, {"wind": (1.0, 0.0, 0.0)}, "ascending"),
+    ("time_s,speed_m_s\n" + "".join(f"{k},-1\n" for k in range(20)), {"wind": (1.0, 0.0, 0.0)},
+     "along --wind"),
+    ("time_s,speed_m_s\n" + "".join(f"{k},1\n" for k in range(40)) + "1e12,1\n",
+     {"wind": (1.0, 0.0, 0.0)},
+     "gaps"),
+])
+def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
+    record = tmp_path / "wind.csv"
+    record.write_text(content)
+    with pytest.raises(InputError, match=told):
+        load(EXAMPLE, LoadSettings(**settings, **({"gust_record": record} if content else {})))

@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added import PointMass
+from limber.mechanics.gusts import Swaying, swaying
+from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.result import StaticResult
@@ -84,11 +87,13 @@ class LoadedOutdoors:
         middle = (start + end) / 2
         self._masses = (*loads.fruit, *_snow(model, middle, end - start, radius, loads.snow))
         self.added_mass = sum(one.mass for one in self._masses)
-        self._forces = np.zeros_like(model.mesh.nodes)
+        self._wind = np.zeros_like(model.mesh.nodes)
+        self._loads, self._cylinders = loads, (middle, end - start, radius)
         if np.any(loads.wind):
             pushes = wind_forces(end - start, radius, np.array(loads.wind), loads.drag)
-            self._forces += (point_operator(model.mesh, middle).T @ pushes.ravel()).reshape(-1, 3)
-        self.wind_force = self._forces.sum(axis=0)
+            self._wind += (point_operator(model.mesh, middle).T @ pushes.ravel()).reshape(-1, 3)
+        self._forces = self._wind.copy()
+        self.wind_force = self._wind.sum(axis=0)
         self._model = self._cut(model)
         # The scan's shape carries the weight of what is cut off: without it, it springs up.
         lost = model.mass_load - self._model.mass_load
@@ -102,6 +107,21 @@ class LoadedOutdoors:
         other._model = self._model.with_young(self._model.young * factor)
         other._plain = self._plain.with_young(self._plain.young * factor)
         return other
+
+    def with_gusts(self, factor: float) -> "LoadedOutdoors":
+        """Return the same loads with a wind that pushes ``factor`` times as hard."""
+        other = copy.copy(self)
+        other._forces = self._forces + (factor - 1) * self._wind
+        other._wind = factor * self._wind
+        other.wind_force = factor * self.wind_force
+        return other
+
+    def sways(self, result: StaticResult, tip: int, damping: RayleighDamping) -> Swaying:
+        """Return how node ``tip`` answers when the wind grows and shrinks about a state."""
+        middle, ways, radius = self._cylinders
+        at = point_operator(self._plain.mesh, middle)
+        air = at.T @ _air_damping(ways, radius, np.array(self._loads.wind), self._loads.drag) @ at
+        return swaying(self._model_under(1.0), result.displacement, self._wind, tip, damping, air)
 
     def rest(self, share: float = 1.0, start: np.ndarray | None = None) -> StaticResult:
         """Return where it comes to rest under ``share`` of all loads."""
@@ -166,6 +186,19 @@ def wind_forces(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: fl
     across = wind - (tangent @ wind)[:, None] * tangent
     speed = np.linalg.norm(across, axis=1)
     return (0.5 * AIR_DENSITY * drag * 2 * radius * length * speed)[:, None] * across
+
+
+def _air_damping(ways: np.ndarray, radius: np.ndarray, wind: np.ndarray, drag: float,
+                 ) -> sp.spmatrix:
+    """Return by how much the drag on cylinders changes with the wind [N s/m], block diagonal."""
+    length = np.linalg.norm(ways, axis=1)
+    tangent = ways / np.maximum(length, 1e-300)[:, None]
+    across = wind - (tangent @ wind)[:, None] * tangent
+    speed = np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None, None]
+    plane = np.eye(3) - tangent[:, :, None] * tangent[:, None, :]
+    blocks = (0.5 * AIR_DENSITY * drag * 2 * radius * length)[:, None, None] * (
+        speed * plane + across[:, :, None] * across[:, None, :] / speed)
+    return sp.block_diag(list(blocks), format="csr")
 
 
 def _snow(model: BranchModel, middle: np.ndarray, ways: np.ndarray, radius: np.ndarray,

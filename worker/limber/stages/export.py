@@ -33,7 +33,6 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.geometry.skeleton.skeleton import Skeleton
-    from limber.mechanics.materials import RayleighDamping
     from limber.mechanics.model import BranchModel
 
 _RODS, _ELEMENTS, _CYLINDERS = (".xml", ".urdf"), (".inp",), (".mat", ".csv", ".mtg", ".swc")
@@ -98,7 +97,7 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
     from limber.exports.mjcf import mjcf_text
     from limber.exports.urdf import urdf_text
     from limber.mechanics.rods import matched, rod_tree
-    from limber.stages.loading import load_branch, load_skeleton, load_targets
+    from limber.stages.loading import known_damping, load_branch, load_skeleton, load_targets
 
     skeleton = load_skeleton(branch)
     loaded = load_branch(branch, gravity=settings.gravity, progress=progress)
@@ -107,7 +106,7 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
     tip = skeleton.nodes[path[-1]]
     tree, factor = matched(rod_tree(loaded.model, skeleton, spacing), loaded.model,
                            _tip(loaded.model, skeleton))
-    damping = _damping(branch, progress)
+    damping = known_damping(branch, progress)
     if suffix == ".urdf":
         text = urdf_text(tree, damping, branch.name)
     else:
@@ -119,20 +118,6 @@ def _rods(branch: Branch, suffix: str, settings: ExportSettings, progress: Progr
     return text, {"link_count": tree.count, "mass_kg": float(tree.mass.sum()),
                   "stiffness_factor": factor,
                   "damping_stiffness_s": damping.stiffness}
-
-
-def _damping(branch: Branch, progress: Progress) -> RayleighDamping:
-    """What the last swing told, else what simulations take."""
-    from limber.mechanics.materials import RayleighDamping
-    from limber.mechanics.model import DEFAULT_DAMPING
-
-    swing = branch.manifest.stages.get("swing")
-    known = swing.result if swing else {}
-    values = [known.get(name) for name in ("damping_mass_per_s", "damping_stiffness_s")]
-    if all(isinstance(value, int | float) and value >= 0 for value in values):
-        return RayleighDamping(*map(float, values))
-    progress.warn("No swing has told the damping; that of simulations is written.")
-    return DEFAULT_DAMPING
 
 
 def _elements(branch: Branch, settings: ExportSettings, progress: Progress,
@@ -155,7 +140,7 @@ def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dic
 
     from limber.exports.usd import as_deformable, write_usd
     from limber.optional import require_extra
-    from limber.stages.loading import load_branch, load_skeleton
+    from limber.stages.loading import known_damping, load_branch, load_skeleton
 
     require_extra("usd", ("pxr",), "USD")
     model = load_branch(branch, gravity=False, progress=progress).model
@@ -165,7 +150,7 @@ def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dic
     made = as_deformable(model, tip)
     with tempfile.TemporaryDirectory() as place:
         path = Path(place, f"branch{output.suffix.lower()}")
-        write_usd(made, _damping(branch, progress), branch.name, path)
+        write_usd(made, known_damping(branch, progress), branch.name, path)
         content = path.read_bytes()
     mesh = made.model.mesh
     end = int(np.linalg.norm(mesh.nodes - model.mesh.nodes[tip], axis=1).argmin())

@@ -1,4 +1,4 @@
-"""What wind, snow, fruit or a pruning cut does to the branch: sag, strain, frequencies."""
+"""What wind and gusts, snow, fruit or a pruning cut do to the branch: sag, strain, frequencies."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from pydantic import Field
 
 from limber.errors import InputError, WorkError
 from limber.progress import SILENT, Progress
+from limber.reading import read_columns
 from limber.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, NoOptions
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from limber.mechanics.materials import RayleighDamping
     from limber.mechanics.outdoors import Bent, LoadedOutdoors
+    from limber.mechanics.statics.result import StaticResult
 
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
+_LEAST_RECORD, _MOST_STEPS = 16, 2e6
 
 
 class LoadSettings(Settings):
@@ -27,6 +31,7 @@ class LoadSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "loads": ("wind", "drag", "snow", "fruit", "cut"),
+        "gusts": ("gust", "gust_length", "gust_time", "gust_record"),
         "limits": ("strain_limit", "limit_load", "most")}
 
     wind: tuple[float, float, float] | None = Field(
@@ -34,6 +39,18 @@ class LoadSettings(Settings):
         json_schema_extra={"metavar": "X Y Z"})
     drag: float = Field(1.1, gt=0, le=5, description="Drag coefficient of a round branch across "
                         "the wind; leaves are not in it.")
+    gust: float | None = Field(
+        None, gt=0, le=1, description="Gusts: standard deviation of the wind's speed over its "
+        "mean, 0.1 over water to 0.4 in a crown. What follows is then that of the peak, by "
+        "spectrum and peak factor of EN 1991-1-4, annex B.")
+    gust_length: float = Field(
+        27.0, gt=0, le=1000, description="Length of the gusts [m]; that of EN 1991-1-4 2 m above "
+        "open land. Among trees it is about their height.")
+    gust_time: float = Field(600.0, ge=10, le=1e5, description="Time in which that peak is "
+                             "expected [s].")
+    gust_record: Path | None = Field(
+        None, description="Gusts as recorded: a CSV file with time_s and speed_m_s along --wind, "
+        "whose length counts no more.")
     snow: float = Field(0.0, ge=0, le=1000, description="Snow on the branch's shadow as seen "
                         "from above [kg/m^2].")
     fruit: tuple[_Fruit, ...] = Field(
@@ -58,31 +75,44 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
         the main path; ``frequencies_hz`` and ``first_frequency_interval_hz``,
         ``frequencies_before_hz``; ``wind_force_n``, ``added_mass_kg``, ``cut_mass_kg``; with
         ``limit_load`` ``bears_times`` and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``).
-        Intervals are None where nothing has told how sure the moduli are.
+        Intervals are None where nothing has told how sure the moduli are. With gusts all of it
+        is of their peak, and ``gusts`` has ``factor`` (peak load over mean load), ``deviation``,
+        ``peak_factor``, ``crossing_hz``, ``dynamic`` (over a branch that follows at once),
+        ``damping`` of the first mode, ``mean_tip_displacement_m`` and ``mean_speed_m_s``.
 
     Raises:
-        InputError: no load, or one off the branch. WorkError: it finds no rest under it.
+        InputError: no load, one off the branch, or gusts without wind. WorkError: it finds no
+            rest under it.
     """
     from limber.mechanics.added import PointMass
     from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
     from limber.mechanics.vibration import lowest_modes
-    from limber.stages.loading import load_branch, load_skeleton
+    from limber.stages.loading import known_damping, load_branch, load_skeleton
 
+    record = _record(settings)
     if not (settings.wind or settings.snow or settings.fruit or settings.cut):
         raise InputError("No load is given.", "Its own weight has bent the scanned branch already.",
                          "Give --wind, --snow, --fruit or --cut.")
     if any(not one[3] > 0 for one in settings.fruit):
         raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
+    wind = settings.wind or (0.0, 0.0, 0.0)
+    if record is not None:
+        wind = tuple(map(float, _mean_speed(record) * np.array(wind) / np.linalg.norm(wind)))
     branch = Branch.open(folder)
     skeleton = load_skeleton(branch)
     hanging = load_branch(branch, progress=progress).model
     _require_near(hanging.mesh.nodes, [one[:3] for one in settings.fruit])
-    loads = Outdoors(settings.wind or (0.0, 0.0, 0.0), settings.drag, settings.snow, tuple(
+    loads = Outdoors(wind, settings.drag, settings.snow, tuple(
         PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
     outdoors = LoadedOutdoors(hanging, skeleton, loads)
+    tip = _tip(outdoors, hanging.mesh.nodes)
+    gusts: dict[str, Any] | None = None
+    if record is not None or settings.gust is not None:
+        progress(0.1, "gusts")
+        gusts = _gusts(outdoors, settings, record, tip, known_damping(branch, progress))
+        outdoors = outdoors.with_gusts(gusts["factor"])
     progress(0.2, "rest under the loads")
     bent = _at_rest(outdoors)
-    tip = _tip(outdoors, hanging.mesh.nodes)
     down = hanging.gravity / max(float(np.linalg.norm(hanging.gravity)), 1e-300)
     moved = bent.displacement[tip]
     progress(0.5, "interval")
@@ -95,7 +125,8 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
         "along": outdoors.along(bent.strains), "frequencies_hz": bent.frequencies,
         "frequencies_before_hz": lowest_modes(hanging, len(bent.frequencies)).frequencies,
         "wind_force_n": outdoors.wind_force, "cut_mass_kg": outdoors.cut_mass,
-        "added_mass_kg": outdoors.added_mass, "young_deviation": spread, **intervals}
+        "added_mass_kg": outdoors.added_mass, "young_deviation": spread, "gusts": gusts,
+        **intervals}
     if settings.limit_load:
         progress(0.7, "limit load")
         result |= _limit(outdoors, settings, progress.part(0.7, 1.0))
@@ -103,12 +134,70 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
 
 
 def _at_rest(outdoors: LoadedOutdoors) -> Bent:
+    return outdoors.bent(_rest(outdoors))
+
+
+def _rest(outdoors: LoadedOutdoors) -> StaticResult:
     found = outdoors.rest()
     if not found.converged:
         raise WorkError(f"The branch finds no rest under these loads ({found.message}).",
                         f"It followed {100 * found.reached:.0f} % of them.",
                         "They may be more than it can carry: see --limit-load with smaller ones.")
-    return outdoors.bent(found)
+    return found
+
+
+def _record(settings: LoadSettings) -> tuple[np.ndarray, np.ndarray] | None:
+    """Times [s] and speeds [m/s] of the recorded wind, if there is one."""
+    if (settings.gust is not None or settings.gust_record is not None) and not (
+            settings.wind and np.any(settings.wind)):
+        raise InputError("Gusts without wind.", "They are of a wind that has a direction.",
+                         "Give --wind X Y Z.")
+    if settings.gust_record is None:
+        return None
+    if settings.gust is not None:
+        raise InputError("Both --gust and --gust-record are given.", "The record has the gusts.",
+                         "Leave one out.")
+    columns = read_columns(settings.gust_record, ("time_s", "speed_m_s"), "a record of the wind")
+    times, speeds = columns["time_s"], columns["speed_m_s"]
+    if len(times) < _LEAST_RECORD or not (np.diff(times) > 0).all() or not speeds.mean() > 0:
+        raise InputError(
+            f"{settings.gust_record} is no record of a wind.", "It has at least "
+            f"{_LEAST_RECORD} rows, ascending times, and a wind that blows along --wind on "
+            "average.", "Give another one.")
+    if (times[-1] - times[0]) / np.median(np.diff(times)) > _MOST_STEPS:
+        raise InputError(f"{settings.gust_record} has gaps that are far longer than its steps.",
+                         "It is taken in even steps.", "Give a part of it without gaps.")
+    return times, speeds
+
+
+def _mean_speed(record: tuple[np.ndarray, np.ndarray]) -> float:
+    """The even wind [m/s] that pushes as hard as the recorded one does on average."""
+    push = float((record[1] * np.abs(record[1])).mean())
+    if not push > 0:
+        raise InputError("The recorded wind pushes against --wind on average.", "",
+                         "Turn --wind round.")
+    return float(np.sqrt(push))
+
+
+def _gusts(outdoors: LoadedOutdoors, settings: LoadSettings,
+           record: tuple[np.ndarray, np.ndarray] | None, tip: int, damping: RayleighDamping,
+           ) -> dict[str, Any]:
+    """What gusts make of the mean load, by how the tip sways."""
+    from limber.mechanics.gusts import recorded, turbulent
+
+    mean = _rest(outdoors)
+    sway = outdoors.sways(mean, tip, damping)
+    if record is not None:
+        speed = float(record[1].mean())
+        found = recorded(sway, *record)
+    else:
+        speed = float(np.linalg.norm(settings.wind))
+        found = turbulent(sway, speed, settings.gust, settings.gust_length, settings.gust_time)
+    return {"factor": found.factor, "deviation": found.deviation,
+            "peak_factor": found.peak_factor, "crossing_hz": found.crossing,
+            "dynamic": found.dynamic, "damping": float(sway.damping[0]),
+            "first_frequency_hz": float(sway.frequencies[0]), "mean_speed_m_s": speed,
+            "mean_tip_displacement_m": mean.displacement[tip]}
 
 
 def _tip(outdoors: LoadedOutdoors, nodes: np.ndarray) -> int:

@@ -21,7 +21,8 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added import HungTwig, PointMass
 from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
-from limber.mechanics.model import BranchModel
+from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
 from limber.reading import read_json_as
@@ -157,6 +158,17 @@ def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SI
     model = load_model(branch, gravity=branch.gravity if gravity else None, **overrides)
     loaded = hang(model, load_targets(branch), progress=progress)
     return replace(loaded, grasp_point=load_grasp_point(branch))
+
+
+def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDamping:
+    """Return the damping that the last swing told, else what simulations take, with a warning."""
+    swing = branch.manifest.stages.get("swing")
+    known = swing.result if swing else {}
+    values = [known.get(name) for name in ("damping_mass_per_s", "damping_stiffness_s")]
+    if all(isinstance(value, int | float) and value >= 0 for value in values):
+        return RayleighDamping(*map(float, values))
+    progress.warn("No swing has told the damping; that of simulations is taken.")
+    return DEFAULT_DAMPING
 
 
 def load_model(branch: Branch, **overrides: object) -> BranchModel:
