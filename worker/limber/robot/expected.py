@@ -67,6 +67,13 @@ class Predicted:
     stiffness: np.ndarray
     young_covariance: np.ndarray
 
+    @classmethod
+    def of_forces(cls, poses: np.ndarray, forces: np.ndarray) -> "Predicted":
+        """Return forces [n, 3] at poses [n, 6] of which nothing else is known."""
+        count = len(poses)
+        return cls(poses, np.hstack([forces, np.zeros((count, 3))]), np.zeros((count, 6, 6)),
+                   np.zeros((count, 3, 3)))
+
     def felt(self, cell: Cell, rest_pose: np.ndarray) -> ExpectedWrench:
         """Return what a cell's gripper will feel, which gives way a little itself.
 

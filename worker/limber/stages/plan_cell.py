@@ -19,6 +19,7 @@ from limber.robot.arms import arm_named
 from limber.robot.belonging import check_branch
 from limber.robot.cell import BoxEntry, Cell, read_cell
 from limber.robot.execution import robot_motion
+from limber.robot.expected import Predicted
 from limber.robot.kinematics import inverse, inverted, matrices
 from limber.store import Branch
 
@@ -124,8 +125,8 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
             meets an obstacle; says where.
     """
     there = np.array(motion.phases) != "return"
-    found = robot_motion(cell, motion.poses[there], motion.forces[there], axis,
-                         speed=speed)
+    predicted = Predicted.of_forces(motion.poses[there], motion.forces[there])
+    found = robot_motion(cell, predicted, axis, speed=speed)
     base = matrices(np.array(cell.base.pose))
     tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
     flange = base @ matrices(np.vstack([found.approach.poses, found.path.poses])) @ tool
