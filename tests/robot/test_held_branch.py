@@ -90,7 +90,8 @@ def test_a_solution_leads_along_the_bend_of_the_branch(setting, beam):
         place[:3, 3] = middle + 0.25 * np.array([0, np.sin(angle), np.cos(angle) - 1])
         return place
 
-    tried = solver.grasp(middle)["solution"].bends
+    solver.grasp(middle)
+    tried = solver.tried()
     before, at = solver.solve(frame(0.004)), solver.solve(frame(0.010))
     true = solver.solve(frame(0.018)).wrench
     errors = []

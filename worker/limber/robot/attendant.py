@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from limber.robot.link import RobotLink
 
 AfterStop = Literal["ask", "hold", "retreat"]
-_GRIP_SECONDS = 1.0  # that a gripper on a digital output is given to close or open
 
 
 def require_confirmation(name: str, typed: str | None) -> None:
@@ -45,6 +44,6 @@ def grip(cell: Cell, link: RobotLink, *, close: bool) -> None:
     """Close or open the gripper; one without a wire by the person at the terminal."""
     if cell.tool.gripper == "digital_output":
         link.gripper(close)
-        time.sleep(_GRIP_SECONDS)
+        time.sleep(cell.tool.grip_seconds)
     elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
         input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")

@@ -87,6 +87,8 @@ class ToolEntry(_Entry):
     compliance_m_per_n: float = Field(
         5e-5, ge=0, le=1e-2, description="What arm, fingers and bark give way by.")
     gripper: Literal["none", "digital_output", "by_hand"] = "by_hand"
+    grip_seconds: float = Field(
+        1.0, gt=0, le=30, description="Given to the gripper to close or open.")
     close_output: int = Field(0, ge=0, le=7, description="Digital output that closes it.")
 
     _near = field_validator("grasp_pose", "centre_of_mass_m")(_in_metres)

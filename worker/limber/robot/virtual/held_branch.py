@@ -206,7 +206,10 @@ class HeldBranch:
                 self._solution, self._age, self.state = answer["solution"], 0.0, "held"
                 self._jump, self._largest_jump = np.zeros(6), 0.0
                 self._twist, self._last_patch = np.zeros(6), rest
-                self._taken, self._tried = answer["solution"].seconds, answer["solution"].bends
+                self._taken, self._tried = answer["solution"].seconds, ()
+                self._pipe.send(("try", None))
+                self._busy = True
+                return
         if not self._busy and not self._asked:
             self._pipe.send(("grasp", tuple(self._closed_at[:3, 3])))
             self._busy = self._asked = True
@@ -259,8 +262,14 @@ class HeldBranch:
 
     def _exchange(self, patch: np.ndarray) -> None:
         if self._busy and self._pipe.poll():
-            before, found = self._solution, self._pipe.recv()[1]
-            self._busy, self._age = False, 0.0
+            kind, found = self._pipe.recv()
+            self._busy = False
+            if kind == "tried":
+                self._tried = found
+                if self._solution is not None:
+                    self._solution.bends = found
+                return
+            before, self._age = self._solution, 0.0
             self._taken = self._asked_age
             if before is not None:
                 # Where it hardly moved, what was known before still holds.
@@ -332,6 +341,8 @@ def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
             kind, content = pipe.recv()
             if kind == "grasp":
                 pipe.send(("grasped", solver.grasp(np.array(content))))
+            elif kind == "try":
+                pipe.send(("tried", solver.tried()))
             else:
                 pipe.send(("solved", solver.solve(content)))
     except (EOFError, OSError):
@@ -385,13 +396,14 @@ class _Solver:
             return {"error": error.seen}
         frame = np.eye(4)
         frame[:3, 3] = self._grasp.centre
-        solution = self.solve(frame)
-        solution.bends = self._tried(solution)
-        return {"centre": self._grasp.centre, "solution": solution}
+        return {"centre": self._grasp.centre, "solution": self.solve(frame)}
 
-    def _tried(self, solution: Solution) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    def tried(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         """How the stiffness changes both ways across the branch, turned as it turns by itself."""
-        stiffness, state = solution.stiffness, self._state
+        solution, state = self._last, self._state
+        if solution is None:
+            return ()
+        stiffness = solution.stiffness
         axes = np.linalg.eigh(stiffness[:3, :3] + stiffness[:3, :3].T)[1]
         bends: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
         for way in _TRIED_WAY * axes.T[:2]:
