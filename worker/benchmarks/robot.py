@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from benchmarks.robot_branches import followed_paths, lost_branches
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
     FAULTS,
@@ -31,20 +32,21 @@ from limber.robot.trajectory import Trajectory, along, densely
 _ADDRESS = "127.0.0.71"
 
 
-def rows(quick: bool, progress: Progress, _out: Path | None) -> list[Row]:
-    """Measure; ``quick`` does each fault once and streams for 20 s instead of 10 minutes."""
-    seed = int(np.random.SeedSequence().entropy % 2**31)
-    print(f"seed {seed}")
+def rows(quick: bool, progress: Progress, _out: Path | None, seed: int = 0) -> list[Row]:
+    """Measure; ``quick`` does each fault once, takes one branch and streams for 10 s."""
     table = [*_kinematics(seed)]
     progress(0.05, "stop times")
     for model in ("ur5", "ur5e"):
-        table += _stop_time(model, seed, 5 if quick else 20)
+        table += _stop_time(model, seed, 3 if quick else 20)
     progress(0.15, "path")
     table.append(_path(seed))
     progress(0.2, "faults")
-    table.append(_faults(seed, 1 if quick else 20, progress.part(0.2, 0.9)))
+    table.append(_faults(seed, 1 if quick else 20, progress.part(0.2, 0.75)))
+    progress(0.75, "branches")
+    table += followed_paths(seed, 1 if quick else 10, _ADDRESS)
+    table.append(lost_branches(seed, 1 if quick else 10, _ADDRESS))
     progress(0.9, "stream")
-    table.append(_stream(seed, 20.0 if quick else 600.0))
+    table.append(_stream(seed, 10.0 if quick else 600.0))
     return table
 
 

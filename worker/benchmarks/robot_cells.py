@@ -21,7 +21,7 @@ GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 
 
 def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: float = 0.92,
-                back: float = 0.0, **limits: float) -> Cell:
+                back: float = 0.0, grip_seconds: float = 1.0, **limits: float) -> Cell:
     """Return a cell in which the home pose has the gripper at a place of the branch.
 
     It stands ``back`` [m] before it, against its way of approach.
@@ -37,7 +37,8 @@ def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: 
         branch=branch.uuid, base={"pose": tuple(map(float, base)), "position_sigma_m": 1e-3,
               "rotation_sigma_rad": 2e-3},
         robot={"model": model, "address": address},
-        tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output"},
+        tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output",
+              "grip_seconds": grip_seconds},
         sensor={"kind": "controller" if model.endswith("e") else "ft300"},
         limits={"soft_force_n": 30.0, "hard_force_n": 40.0, "hard_torque_nm": 8.0, **limits})
 

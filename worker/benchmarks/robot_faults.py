@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from limber.robot.expected import ExpectedWrench
 from limber.robot.link import RobotLink
 from limber.robot.trajectory import Trajectory, along, densely
 from limber.robot.virtual.launch import VirtualRobot
+from limber.robot.virtual.server import SCRIPT_PORT
 
 STILL_M_S = 1e-4
 _BEFORE_FAULT_SECONDS = 0.8
@@ -59,9 +61,17 @@ FAULTS: dict[str, Fault] = {
     "add-on closed": lambda robot, link: link.abandon(),
     "200 ms cable delay": _asked("delay", value=0.2),
     "keep-alive starved": lambda robot, link: os.kill(link.process.pid, signal.SIGSTOP),
+    "two clients": lambda robot, link: _another_program(robot.address),
     "drift of 4 N": _asked("added_wrench", wrench=[0, 0, 4.2, 0, 0, 0]),
 }
 ENDS_ROBOT = ("controller killed",)
+
+
+def _another_program(address: str) -> None:
+    """Send a program to the controller, as a second client does: it takes the first's place."""
+    with socket.create_connection((address, SCRIPT_PORT), 2.0) as other:
+        other.sendall(b"def another():\n  sync()\nend\n")
+        time.sleep(0.1)
 
 
 def cell_for(address: str, model: str = "ur5e") -> Cell:

@@ -1,0 +1,175 @@
+"""The virtual robot with random branches in its gripper: forces as predicted, slip, break.
+
+Young's modulus is known here, so that what differs is mesh, grasp, arm and sensor alone; what an
+estimate adds is measured by the closed loop (:mod:`limber.commands.demo_robot`).
+"""
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from benchmarks.table import Row
+from limber.errors import LimberError, SafetyStop
+from limber.estimation.virtual_pull import VirtualPullSettings
+from limber.geometry.generated import generate_branch
+from limber.geometry.tets.marks import base_nodes
+from limber.geometry.tets.tetrahedra import MeshSettings, mesh_branch
+from limber.mechanics import solve_static
+from limber.mechanics.young_field import young_weights
+from limber.robot.cell import ApproachEntry
+from limber.robot.execution import across
+from limber.robot.virtual.launch import VirtualRobot
+from limber.stages.execute import ExecuteOptions, ExecuteSettings, execute
+from limber.stages.loading import load_grasp_model, load_skeleton
+from limber.stages.virtual_pull import load_truth
+from limber.store import Branch
+
+FRACTION = 0.85
+# So short that a solution of the virtual branch takes tens of milliseconds: over one that takes
+# half a second its force is led on too far, and it is not the prediction that is measured.
+_LENGTH_M = 0.4
+_PEAK_N, _TRAVEL_M = 6.0, 0.04
+
+
+def random_branch(folder: Path, seed: int) -> tuple[Branch, tuple[float, ...]]:
+    """Return a folder with a generated branch's axes, a coarse mesh with its moduli, and a path;
+    and those moduli at the control points [Pa].
+
+    The moduli are scaled so that 6 N across it move the grasp by about 40 mm.
+    """
+    made = generate_branch(seed, length=_LENGTH_M, fork_count=0)
+    branch = Branch.create(folder)
+    mesh = mesh_branch(made.skeleton, MeshSettings(mesher="sweep")).mesh
+    place = made.skeleton.point_at(FRACTION)
+    mesh = mesh.with_data(point_data={
+        "fixed": base_nodes(mesh, made.skeleton),
+        "grasp": (np.linalg.norm(mesh.nodes - place, axis=1) < 0.012).astype(int)})
+    with branch.stage("reconstruct") as stage:
+        made.skeleton.write_swc(stage.path("skeleton.swc"))
+        _write_mesh(stage.path("mesh.vtu"), mesh, np.full(mesh.tet_count, 1e9))
+    truth = load_truth(branch, VirtualPullSettings())
+    shares = young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float)
+    with branch.stage("estimate") as stage:
+        _write_mesh(stage.path("mesh.vtu"), mesh, shares)
+    model = load_grasp_model(branch, gravity=True)
+    push = sideways(branch, FRACTION)
+    soft = solve_static(model.model, grasp=model.grasp, grasp_force=1e-3 * push, start=model.rest)
+    moved = np.linalg.norm(model.pose(soft.require().displacement)[:3] - model.rest_position)
+    factor = _PEAK_N * moved / 1e-3 / _TRAVEL_M
+    with branch.stage("estimate") as stage:
+        _write_mesh(stage.path("mesh.vtu"), mesh, factor * shares)
+    _plan_sideways(branch, push)
+    return branch, tuple(map(float, factor * np.asarray(truth.young, float)))
+
+
+def _write_mesh(path: Path, mesh, young: np.ndarray) -> None:
+    count = mesh.tet_count
+    mesh.with_data(cell_data={"young": young, "poisson": np.full(count, 0.35),
+                              "density": np.full(count, 900.0)}).write(path)
+
+
+def _plan_sideways(branch: Branch, push: np.ndarray) -> None:
+    """Write the way on which a growing force across it takes the branch: it stretches nothing."""
+    model = load_grasp_model(branch, gravity=True)
+    state, rows = model.rest, []
+    for number, part in enumerate(np.linspace(0, _PEAK_N, 9)):
+        state = solve_static(model.model, grasp=model.grasp, grasp_force=part * push,
+                             start=state).require()
+        rows.append(np.r_[number, model.pose(state.displacement), 0, part, 0])
+    lines = ["s_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,energy_j,force_n,strain",
+             *(",".join(f"{x:.9g}" for x in row) for row in rows)]
+    with branch.stage("plan:path") as stage:
+        stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def followed_paths(seed: int, count: int, address: str) -> list[Row]:
+    """Follow a path with each of ``count`` branches: force as predicted, where the arm went."""
+    within, errors, ways, stopped = [], [], [], []
+    for number in range(count):
+        with tempfile.TemporaryDirectory() as place:
+            try:
+                result, state = _executed(Path(place), seed + number, address)
+            except LimberError as error:
+                stopped.append(f"seed {seed + number}: {error}")
+                continue
+        within.append(result["force_within_share"])
+        errors.append(result["force_error_of_peak"])
+        ways.append(result["path_error_m"])
+        print(f"seed {seed + number}: within {within[-1]:.3f}, 95 % of the path below "
+              f"{100 * errors[-1]:.1f} % of {result['predicted_peak_force_n']:.1f} N, the virtual "
+              f"branch's extrapolation off by {state:.2f} N at most")
+    for line in stopped:
+        print(line)
+    if not within:
+        return [Row("predicted against measured force along the path", "95 % of it",
+                    "no run reached its end", False)]
+    return [
+        Row(f"force within 5 % of the peak or the interval, {count} branches, least share of a "
+            "path", "95 %", f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f}); "
+            f"{len(stopped)} stopped", min(within) >= 0.95 and not stopped),
+        Row("difference of the force, 95 % of a path below, worst branch", "reported",
+            f"{100 * max(errors):.1f} % of the peak", None),
+        Row("following a branch's path: distance from it, worst", "1 mm",
+            f"{1000 * max(ways):.2f} mm", max(ways) < 1e-3)]
+
+
+def _executed(folder: Path, seed: int, address: str,
+              fault: Callable[[VirtualRobot], None] | None = None) -> tuple[dict, float]:
+    """Execute the path armed; with ``fault`` done to the robot while it goes back."""
+    branch, young = random_branch(folder / "random.branch", seed)
+    cell = standing_at(branch, address, fraction=FRACTION, back=ApproachEntry().distance_m,
+                       grip_seconds=4.0)
+    skeleton = load_skeleton(branch)
+    axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
+    settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
+    path = cell_file(cell, folder)
+    with robot_holding(branch, cell, folder, seed=seed, young=young) as robot:
+        largest = [0.0]
+        ended = threading.Event()
+        watcher = threading.Thread(target=_watch, args=(robot, largest, ended, fault))
+        watcher.start()
+        try:
+            result = execute(branch.folder, "path", path, settings,
+                             ExecuteOptions(arm=True, confirm="path", after_stop="hold"))
+        finally:
+            ended.set()
+            watcher.join()
+    return result, largest[0]
+
+
+def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event,
+           fault: Callable[[VirtualRobot], None] | None) -> None:
+    """Note how far the virtual branch was off; do the fault once the force is up."""
+    while not ended.wait(0.2):
+        state = robot.state
+        largest[0] = max(largest[0], state.get("extrapolation_error_n", 0.0))
+        if fault is not None and np.linalg.norm(state.get("true_wrench", [0.0])[:3]) > 4.0:
+            fault(robot)
+            fault = None
+
+
+def lost_branches(seed: int, runs: int, address: str) -> Row:
+    """The branch slips in the grip, or breaks, while it is led: the arm stands and says so."""
+    told, failed = [], []
+    for number in range(runs):
+        for name, fault in (("slips", lambda robot: robot.ask("slip", part=0.95)),
+                            ("breaks", lambda robot: robot.ask("break"))):
+            with tempfile.TemporaryDirectory() as place:
+                began = time.monotonic()
+                try:
+                    _executed(Path(place), seed + number, address, fault)
+                    failed.append(f"{name}, seed {seed + number}: it went on")
+                except SafetyStop as stop:
+                    told.append(str(stop))
+                except LimberError as error:
+                    failed.append(f"{name}, seed {seed + number}: {error}")
+                print(f"branch {name}: {time.monotonic() - began:.0f} s in all")
+    for line in (*failed, *told[:2]):
+        print(line)
+    return Row(f"branch slips, branch breaks while it is led, {runs} runs each: stop and report",
+               "every one", f"{len(told)} of {2 * runs}", not failed)
