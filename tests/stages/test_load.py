@@ -1,5 +1,6 @@
 """`limber load` on the example branch."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -74,3 +75,27 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
     record.write_text(content)
     with pytest.raises(InputError, match=told):
         load(EXAMPLE, LoadSettings(**settings, **({"gust_record": record} if content else {})))
+
+
+def test_a_kept_load_stands_in_report_and_scene(tmp_path):
+    """Its table and picture on the page, its frames in the scene; a damaged file is named."""
+    from limber.report.loads import read_load
+    from limber.report.page import draw_page
+    from limber.scene.data import scene_data
+
+    folder = Path(shutil.copytree(EXAMPLE, tmp_path / "a.branch"))
+    result = load(folder, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.2, name="gale"))
+    branch = Branch.open(folder, verify=True)
+    assert branch.manifest.stages["load:gale"].result["sag_m"] == result["sag_m"]
+    section = next(one for one in draw_page(branch)[1] if one.title == "Load: gale")
+    told = dict(row[:2] for row in section.tables[0][1])
+    assert told["peak of the gusts over the mean load"] == f"{result['gusts']['factor']:.2f}"
+    assert len(section.pictures) == 1 and not section.text
+    data = scene_data(branch, motion="load-gale")
+    assert data.info["frames"]["name"] == "load-gale" and "frame_scalar:strain" in data.arrays
+    assert len(data.arrays["frame_strain"]) == 2
+    (folder / "loads" / "gale.json").write_text('{"sag_m": 1e999}')
+    with pytest.raises(InputError, match=r"gale\.json"):
+        read_load(folder / "loads" / "gale.json")
+    with pytest.raises(ValueError, match="pattern"):
+        LoadSettings(name="../out")

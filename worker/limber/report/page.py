@@ -16,12 +16,13 @@ from limber.estimation.estimate_file import read_estimate
 from limber.geometry.skeleton import qsm
 from limber.geometry.skeleton.doubts import Doubt, doubtful_parts
 from limber.geometry.skeleton.qsm import Caliper
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.frames import read_frames_file
 from limber.optional import require_extra
 from limber.planning.field.energy_field import EnergyField
 from limber.progress import SILENT, Progress
 from limber.reading import read_arrays, read_json
-from limber.report import figures
+from limber.report import figures, loads
 from limber.report.tables import (
     caliper_rows,
     cause_rows,
@@ -85,8 +86,8 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
     page = [*_held_back(branch), _summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
         _scan, partial(_cylinders, calipers=calipers), _mesh, *_pulls(branch), _estimate,
-        *([_swing] if branch.has("swing.json") else []), *_simulations(branch), _energy,
-        *_plans(branch), _provenance]
+        *([_swing] if branch.has("swing.json") else []), *_simulations(branch), *_loads(branch),
+        _energy, *_plans(branch), _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
@@ -293,6 +294,26 @@ def _simulation(branch: Branch, key: str) -> Section:
         f"{entry.result['frame_count']} frames. At the end the tip has moved by "
         f"{1e3 * tip:.1f} mm and the branch holds {entry.result['energy_j']:.4g} J; smallest "
         f"det F {min(frames['min_det_f']):.3f}.")
+    return section
+
+
+def _loads(branch: Branch) -> list[Callable[[Branch], Section]]:
+    names = [name.removesuffix(".json") for name in branch.names("loads") if name.endswith(".json")]
+    return [lambda opened, name=name: _load(opened, name) for name in names]
+
+
+def _load(branch: Branch, name: str) -> Section:
+    section = Section(f"Load: {name}", tables=[
+        ("", loads.load_rows(loads.read_load(branch.path(f"loads/{name}.json"))))])
+    frames = f"frames/load-{name}.pc2"
+    if branch.has(frames) and branch.has(f"frames/load-{name}.npz"):
+        try:
+            section.draw(loads.bent_branch(TetMesh.read(branch.path("mesh.vtu")),
+                                           branch.path(frames)),
+                         "The branch as scanned (grey) and at rest under the loads, from the "
+                         "front and from the side.")
+        except InputError as error:
+            section.text.append(f"It cannot be drawn: {error}")
     return section
 
 

@@ -18,6 +18,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.mechanics.materials import RayleighDamping
+    from limber.mechanics.model import BranchModel
     from limber.mechanics.outdoors import Bent, LoadedOutdoors
     from limber.mechanics.statics.result import StaticResult
 
@@ -32,7 +33,8 @@ class LoadSettings(Settings):
     groups: ClassVar[Groups] = {
         "loads": ("wind", "drag", "snow", "fruit", "cut"),
         "gusts": ("gust", "gust_length", "gust_time", "gust_record"),
-        "limits": ("strain_limit", "limit_load", "most")}
+        "limits": ("strain_limit", "limit_load", "most"),
+        "output": ("name",)}
 
     wind: tuple[float, float, float] | None = Field(
         None, description="Velocity of the wind, branch frame [m/s].",
@@ -64,10 +66,16 @@ class LoadSettings(Settings):
     limit_load: bool = Field(
         False, description="Also find how many times these loads the branch bears.")
     most: float = Field(50.0, gt=1, le=1e4, description="Largest number of times that is tried.")
+    name: str | None = Field(
+        None, pattern=r"^[\w-]+$", max_length=60, description="Keep it in the branch folder under "
+        "this name: report and scene then show the branch as it comes to rest.")
 
 
 def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -> dict[str, Any]:
-    """Bring the branch to rest under loads; writes nothing.
+    """Bring the branch to rest under loads.
+
+    With a name it writes ``loads/NAME.json``, and ``frames/load-NAME.pc2``, ``.json`` and ``.npz``:
+    the branch as scanned, and at rest under the loads. Else it writes nothing.
 
     Returns:
         ``tip_displacement_m`` [3] and ``sag_m`` (its way along gravity) with ``sag_interval_m``;
@@ -130,7 +138,36 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
     if settings.limit_load:
         progress(0.7, "limit load")
         result |= _limit(outdoors, settings, progress.part(0.7, 1.0))
+    if settings.name is not None:
+        _keep(branch, settings, hanging, bent, result)
     return result
+
+
+def _keep(branch: Branch, settings: LoadSettings, hanging: BranchModel, bent: Bent,
+          result: dict[str, Any]) -> None:
+    """Write the result, and the branch before and under the loads as frames."""
+    import json
+
+    from limber.mechanics.frames import surface_fields, surface_nodes, write_pc2
+    from limber.mechanics.strain import strain_state
+    from limber.plain import plain
+
+    nodes, name = surface_nodes(hanging.mesh), f"frames/load-{settings.name}"
+    ways = np.stack([np.zeros_like(bent.displacement), bent.displacement])
+    states = [strain_state(hanging, way) for way in ways]
+    reads = [file for file in ("mesh.vtu", "skeleton.swc", "point_masses.json", "targets.json",
+                               "estimate.json", "swing.json") if branch.has(file)]
+    with branch.stage(f"load:{settings.name}", settings, reads=reads) as stage:
+        stage.path(f"loads/{settings.name}.json").write_text(
+            json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_pc2(stage.path(f"{name}.pc2"), hanging.mesh.nodes[nodes] + ways[:, nodes])
+        np.savez_compressed(stage.path(f"{name}.npz"), **surface_fields(hanging.mesh, states))
+        stage.path(f"{name}.json").write_text(json.dumps({
+            "frame_count": len(ways), "rate": 1.0,
+            "largest_principal_strains": [float(state.principal_strain[:, -1].max())
+                                          for state in states]}), encoding="utf-8")
+        stage.result.update({key: value for key, value in plain(result).items()
+                             if key != "along"})
 
 
 def _at_rest(outdoors: LoadedOutdoors) -> Bent:
@@ -282,5 +319,7 @@ def run(inputs: BranchInputs, settings: LoadSettings, _options: NoOptions,
 
 
 STAGE = StageDescription(
-    "load", 45, run, BranchInputs, LoadSettings, NoOptions, reads=("mesh.vtu", "skeleton.swc"),
+    "load", 45, run, BranchInputs, LoadSettings, NoOptions, key="load:{name}",
+    reads=("mesh.vtu", "skeleton.swc"),
+    writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
     tables=_tables)
