@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.subjects.paper_branches import measured
 
+from limber.errors import WorkError
 from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
 from limber.estimation.doubt.path_error import led_by_path, path_error
 from limber.estimation.fit import fit_pulls
@@ -118,6 +119,15 @@ def test_a_path_is_watched_where_its_frame_may_be_off(small_pull):
     assert not is_watched(entry, frames, SETTINGS.model_copy(update={"drive": "pose"}))
     blind = replace(frames, wrenches=np.full_like(frames.wrenches, np.nan))
     assert not is_watched(entry, blind, SETTINGS)
+
+
+def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small_pull, monkeypatch):
+    """Where no equilibrium is found the sensor's zero is named, not the grasp point alone."""
+    pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"calibration": None}))
+    objective = objective_of(small_bench, pull)
+    monkeypatch.setattr(Objective, "evaluate", lambda *_, **__: None)
+    with pytest.raises(WorkError, match=r"zero known to 1 N that drifts by 1 N.*Tare the sensor"):
+        fit_pulls(objective, objective.space.base, SETTINGS.model_copy(update={"young": 1e7}))
 
 
 def test_calibration_survives_a_pull_file(tmp_path, small_pull):

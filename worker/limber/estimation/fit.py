@@ -40,6 +40,7 @@ from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import led_start, scaled_start
 from limber.estimation.subject import Subject
 from limber.progress import SILENT, Progress
+from limber.recordings.calibration import calibration_of
 from limber.recordings.checks import force_unit_suspicion
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import GraspEntry, Pull
@@ -270,9 +271,24 @@ def _evaluated(objective: Objective, values: Values) -> Evaluation:
         found = objective.evaluate(objective.space.pack(scaled), jacobian=True)
         if found is not None:
             return found
-    raise WorkError("The simulation finds no equilibrium for any Young's modulus tried.",
-                    "The recorded poses or forces are out of this branch's reach.",
-                    "Check the grasp point, the frame of reference and the units.")
+    raise _without_equilibrium(objective)
+
+
+def _without_equilibrium(objective: Objective) -> WorkError:
+    seen = "The simulation finds no equilibrium for any Young's modulus tried."
+    by_force = [forward for forward in objective.forwards if forward.watches_pose]
+    if not by_force:
+        return WorkError(seen, "The recorded poses or forces are out of this branch's reach.",
+                         "Check the grasp point, the frame of reference and the units.")
+    known = calibration_of(by_force[0].entry)
+    peak = np.nanmax(np.linalg.norm(by_force[0].frames.wrenches[:, :3], axis=1))
+    return WorkError(
+        seen, f"The measured force drives it: {peak:.2g} N at most, with a zero known to "
+        f"{known.force_bias_sigma_n:g} N that drifts by {known.force_drift_sigma_n:g} N. So far "
+        "off, it may fold a branch up that is soft at its end.",
+        "Tare the sensor before the pull and say so ([calibration] in pull.toml), pull farther, or "
+        "let a gripper whose frame is known well lead it (--drive pose). Else check the grasp "
+        "point, the frame of reference and the units.")
 
 
 def _fitted(objective: Objective, start: np.ndarray, settings: EstimateSettings,
