@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from limber.errors import InputError, NoPathError, SafetyStop
 from limber.mechanics.status import Status
+from limber.robot.belonging import check_plan
 from limber.robot.calibration import fit_base
 from limber.robot.cell import Cell
 from limber.robot.execution import across, followed, robot_motion
@@ -217,9 +218,27 @@ def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):
         path = cell_file(cell.model_copy(update=changes), tmp_path)
         with pytest.raises(InputError, match=told):
             execute(planned_folder, "path", path, ExecuteSettings(), ExecuteOptions())
+    unweighed = cell.model_copy(update={"tool": cell.tool.model_copy(update={"mass_kg": None})})
+    with pytest.raises(InputError, match="payload is not set"):
+        execute(planned_folder, "path", cell_file(unweighed, tmp_path), ExecuteSettings(),
+                ExecuteOptions(arm=True, confirm="path"))
     path = cell_file(cell, tmp_path)
     with pytest.raises(InputError, match="Nobody confirmed"):
         execute(planned_folder, "path", path, ExecuteSettings(), ExecuteOptions(arm=True))
+
+
+@pytest.mark.parametrize("changes, told", [
+    ({"model": "ur10e"}, "made for a ur10e"), ({"branch": "other"}, "cell of branch other"),
+    ({"base_pose": (0.602, 0.1, 0, 0, 0, 1.2)}, "2.0 mm and 0.00 degrees"),
+    ({"base_pose": (0.6, 0.1, 0, 0, 0, 1.21)}, "0.57 degrees")])
+def test_a_plan_for_another_robot_branch_or_base_is_refused(changes, told):
+    base = (0.6, 0.1, 0, 0, 0, 1.2)
+    cell = Cell(branch="this", robot={"model": "ur5e"}, base={"pose": base})
+    made_for = {"model": "ur5e", "branch": "this", "base_pose": base}
+    assert check_plan(made_for, cell) is None
+    assert "no robot's cell" in check_plan(None, cell)
+    with pytest.raises(InputError, match=told):
+        check_plan(made_for | changes, cell)
 
 
 def armed(planned_folder, tmp_path, address, *, unexpected: float):

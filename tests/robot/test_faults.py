@@ -154,6 +154,13 @@ def test_the_wrong_robot_is_refused(moving_robot):
             RobotLink(cell).close()
 
 
+def test_another_version_than_the_calibrated_one_is_refused(moving_robot):
+    cell = cell_for(moving_robot.address)
+    other = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": "5.4.1"})})
+    with pytest.raises(InputError, match=r"calibrated with 5\.4\.1"):
+        RobotLink(other).close()
+
+
 def test_nobody_at_the_address_is_told_soon():
     begin = time.monotonic()
     with pytest.raises(WorkError, match="No robot answers"):

@@ -37,7 +37,7 @@ def standing_at(branch: Branch, address: str, *, model: str = "ur5e", fraction: 
         branch=branch.uuid, base={"pose": tuple(map(float, base)), "position_sigma_m": 1e-3,
               "rotation_sigma_rad": 2e-3},
         robot={"model": model, "address": address},
-        tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output",
+        tool={"grasp_pose": GRASP_POSE, "gripper": "digital_output", "mass_kg": 0.0,
               "grip_seconds": grip_seconds},
         sensor={"kind": "controller" if model.endswith("e") else "ft300"},
         limits={"soft_force_n": 30.0, "hard_force_n": 40.0, "hard_torque_nm": 8.0, **limits})

@@ -46,7 +46,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
         tool = cell.tool if cell else None
         controller = Controller(
             model, joints=np.array(joints) if joints else None, seed=seed, load=load,
-            mass=tool.mass_kg if tool else 0.0,
+            mass=(tool.mass_kg or 0.0) if tool else 0.0,
             centre=tool.centre_of_mass_m if tool else (0.0, 0.0, 0.0),
             ft300=cell.sensor.kind == "ft300" if cell else not model.endswith("e"))
         controller.gripper_output = tool.close_output if tool else 0

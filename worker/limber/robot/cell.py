@@ -81,7 +81,8 @@ class ToolEntry(_Entry):
     """The gripper: where it holds, what it weighs, its shape."""
 
     grasp_pose: Pose = Field((0.0,) * 6, description="Frame of the grasp in the flange's.")
-    mass_kg: float = Field(0.0, ge=0, le=20)
+    mass_kg: float | None = Field(
+        None, ge=0, le=20, description="Payload, 0 for a bare flange; unstated, nothing moves.")
     centre_of_mass_m: Vector = Field((0.0, 0.0, 0.0), description="In the frame of the flange.")
     parts: tuple[CapsuleEntry, ...] = ()
     compliance_m_per_n: float = Field(
@@ -231,7 +232,7 @@ class Cell(_Entry):
 
     @model_validator(mode="after")
     def _carries_its_tool(self) -> "Cell":
-        if self.tool.mass_kg > self.arm.payload:
+        if (self.tool.mass_kg or 0.0) > self.arm.payload:
             raise ValueError(f"tool.mass_kg is {self.tool.mass_kg:g}, and a {self.arm.name} "
                              f"carries {self.arm.payload:g}")
         return self

@@ -129,6 +129,12 @@ class Driver:
             raise InputError(f"The controller is version {version}, the cell says {arm.name}.",
                              "They are of different series, with different arms.",
                              "Correct robot.model in the cell file.")
+        calibrated = self.cell.robot.version
+        if calibrated and calibrated.split(".")[:2] != version.split(".")[:2]:
+            raise InputError(f"The controller is version {version}, the cell was calibrated with "
+                             f"{calibrated}.", "Another version may have other settings of tool, "
+                             "kinematics and safety.", "Calibrate again, or, having compared them, "
+                             "correct robot.version in the cell file.")
         facts = {"address": self.cell.robot.address, "version": version,
                  "model": self._dashboard.ask("get robot model"),
                  "serial": self._dashboard.ask("get serial number"),
@@ -169,7 +175,7 @@ class Driver:
             # Made now: later the watchdog would not wait for it.
             self._io = RTDEIOInterface(address)
         self._require(control.setTcp(list(self.cell.tool.grasp_pose)), "set its tool")
-        self._require(control.setPayload(self.cell.tool.mass_kg,
+        self._require(control.setPayload(self.cell.tool.mass_kg or 0.0,
                                          list(self.cell.tool.centre_of_mass_m)), "set its payload")
         self._require(control.setWatchdog(WATCHDOG_HZ), "start its watchdog")
         return control

@@ -252,7 +252,7 @@ class WrenchChain:
         if not self._own_weight:
             return np.zeros(6)
         tool = self.cell.tool
-        return weight_wrench(tool.mass_kg, np.array(tool.centre_of_mass_m), flange[:3, :3])
+        return weight_wrench(tool.mass_kg or 0.0, np.array(tool.centre_of_mass_m), flange[:3, :3])
 
 
 def parsed_message(message: str) -> np.ndarray | None:

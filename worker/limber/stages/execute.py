@@ -92,7 +92,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         NoPathError: the arm cannot follow the path; says where and why.
         SafetyStop: it was stopped; the log is in the folder all the same.
     """
-    from limber.robot.belonging import check_branch
+    from limber.robot.belonging import check_branch, check_plan, require_payload
     from limber.robot.cell import read_cell
 
     branch, cell = Branch.open(folder), read_cell(cell_file)
@@ -100,6 +100,10 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         progress.warn(warning)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
+    if warning := check_plan(_made_for(branch, name), cell):
+        progress.warn(warning)
+    if options.arm:
+        require_payload(cell)
     progress(0.02, "forces along the path")
     predicted, axis = _predicted(branch, name, settings, progress)
     progress(0.4, "inverse kinematics")
@@ -115,6 +119,15 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
                          "peak_force_n": None, "path_error_m": None}
     require_confirmation(name, options.confirm)
     return _armed(branch, cell, name, settings, options, motion, result, progress)
+
+
+def _made_for(branch: Branch, name: str) -> dict[str, Any] | None:
+    """The robot that a plan's file names; None for one that was made for none."""
+    from limber.planning.plan_file import read_plan_summary
+
+    file = f"plans/{name}.json"
+    found = read_plan_summary(branch.path(file)).get("robot") if branch.has(file) else None
+    return found if isinstance(found, dict) else None
 
 
 def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: Progress,

@@ -142,7 +142,8 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
                 f"({', '.join(f'{x:.3f}' for x in where)}) m.",
                 "Paths are checked against obstacles, and not yet led around them.",
                 "Choose another goal, or a workspace that keeps clear of it.")
-    return {"model": cell.arm.name, "gripper_rotation": found.rotation,
+    return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
+            "gripper_rotation": found.rotation,
             "duration_s": found.approach.duration + found.path.duration,
             "singularity_distance": found.joints.singularity,
             "joint_limit_margin_rad": found.joints.limit_margin}

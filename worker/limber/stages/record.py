@@ -85,7 +85,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         InputError: cell and branch do not belong together, or nobody confirmed.
         SafetyStop: the guard stopped it; what was recorded is in the folder all the same.
     """
-    from limber.robot.belonging import check_branch
+    from limber.robot.belonging import check_branch, require_payload
     from limber.robot.cell import read_cell
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
@@ -102,6 +102,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     if f"pulls/{name}/robot.csv" in branch.streams():
         raise InputError(f"A recording {name} was cut off.", "It would be lost.",
                          "Take it over with --recover, or give another --name.")
+    require_payload(cell)
     require_confirmation(name, options.confirm)
     with branch.writing(f"the recording {name}"):
         ended = _recorded(branch, cell, name, settings, options, progress)

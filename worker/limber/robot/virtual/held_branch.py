@@ -22,9 +22,9 @@ from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
 
 _BLEND_SECONDS = 0.05
 _LEAD = 1.5  # times what a solution takes: the middle of when it is used
-_LONGEST_LEAD = 0.3  # s
-_LEAST_WAY = 3e-4  # m between two solutions whose tangents are compared
-_FARTHEST = 4.0  # times such a way that its change of the tangent is believed
+_LONGEST_LEAD = 0.5  # s
+_LEAST_WAY = 2e-3  # m between two solutions whose tangents are compared
+_FARTHEST = 0.03  # m over which such a change of the tangent is led on
 _TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
 
 
@@ -111,7 +111,9 @@ class Solution:
         """Return the stiffness that leads over ``change`` [6]: with half of how it changes."""
         stiffness, left = self.stiffness, change[:3]
         for way, bend in self.bends:
-            part = float(np.clip(left @ way / (way @ way), -_FARTHEST, _FARTHEST))
+            square = float(way @ way)
+            most = _FARTHEST / np.sqrt(square)
+            part = float(np.clip(left @ way / square, -most, most))
             stiffness = stiffness + 0.5 * part * bend
             left = left - part * way
         return stiffness
