@@ -85,7 +85,9 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     assert float(rows[0]["virtual-pull:pull-2.peak_force_n"]) > 0
     assert float(rows[1]["virtual-pull:pull-2.memory_mb"]) > 10
     page = (orchard / "results/jobs.html").read_text()
-    assert "2 done" in page and page.count("<svg class=sketch viewBox") == 2
+    assert "2 done" in page and page.count("<svg class=sketch viewBox") == 4
+    assert page.count("MPa (bright)</p>") == 2, "the example's modulus varies along it"
+    assert "href=" not in page, "no branch has a report"
 
 
 def test_a_killed_batch_goes_on(orchard, monkeypatch):

@@ -3,12 +3,14 @@
 import csv
 import html
 import io
+import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
-
-import numpy as np
+from urllib.parse import quote
 
 from limber.batch.job_file import BranchJob, JobFile
+from limber.batch.pictures import pictures
 from limber.batch.records import (
     DONE,
     FAILED,
@@ -20,14 +22,11 @@ from limber.batch.records import (
     path_of_page,
     path_of_table,
 )
-from limber.errors import LimberError
 from limber.files import write_atomically
-from limber.geometry.skeleton.files import read_swc
 from limber.version import VERSION
 
 _COLORS = {DONE: "#2d7a3a", KEPT: "#6c9a74", FAILED: "#b3261e", RUNNING: "#1f5fa8",
            WAITING: "#888888"}
-_SKETCH_PIXELS = 120
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
@@ -86,7 +85,7 @@ def _cell(value: Any) -> Any:
 
 
 def write_page(jobs: JobFile, records: Records) -> None:
-    """Write the page: how many are done, what failed and why, time, memory, a sketch of each."""
+    """Write the page: how many are done, what failed and why, time, memory, pictures of each."""
     write_atomically(path_of_page(jobs), "\n".join(_page(jobs, records)) + "\n")
 
 
@@ -109,12 +108,12 @@ def _page(jobs: JobFile, records: Records) -> Iterator[str]:
         yield "</table>"
     yield "<h2>Branches</h2>"
     for branch in jobs.branches:
-        yield from _branch(branch, records)
+        yield from _branch(branch, records, path_of_page(jobs))
 
 
-def _branch(branch: BranchJob, records: Records) -> Iterator[str]:
+def _branch(branch: BranchJob, records: Records, page: Path) -> Iterator[str]:
     swept = ", ".join(f"{key} = {value}" for key, value in branch.sweep.items())
-    yield f"<section>{_sketch(branch)}<div><h3>{html.escape(branch.name)}</h3>"
+    yield f"<section>{pictures(branch.folder)}<div><h3>{_title(branch, page)}</h3>"
     if swept:
         yield f"<p>{html.escape(swept)}</p>"
     yield "<table><tr><th>stage<th>status<th>time [s]<th>memory [MB]<th></tr>"
@@ -127,6 +126,19 @@ def _branch(branch: BranchJob, records: Records) -> Iterator[str]:
     yield "</table></div></section>"
 
 
+def _title(branch: BranchJob, page: Path) -> str:
+    """The branch's name, leading to its own report where it has one."""
+    name, report = html.escape(branch.name), branch.folder / "report.html"
+    if not report.is_file():
+        return name
+    try:
+        way = Path(os.path.relpath(report.resolve(), page.resolve().parent)).as_posix()
+    except ValueError:
+        # On another drive (Windows): no way leads there from here.
+        return name
+    return f"<a href='{html.escape(quote(way))}'>{name}</a>"
+
+
 def _told(record: Record) -> str:
     return " ".join(filter(None, (record.error, *record.warnings)))
 
@@ -135,27 +147,9 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def _sketch(branch: BranchJob) -> str:
-    """Return the skeleton, seen from the front, as a drawing; nothing where there is none."""
-    path = branch.folder / "skeleton.swc"
-    try:
-        skeleton = read_swc(path)
-    except (OSError, LimberError):
-        return "<svg class=sketch></svg>"
-    flat = skeleton.nodes[:, [0, 2]]
-    low, size = flat.min(axis=0), max(np.ptp(flat, axis=0).max(), 1e-9)
-    place = (flat - low) / size * (_SKETCH_PIXELS - 12) + 6
-    place[:, 1] = _SKETCH_PIXELS - place[:, 1]
-    width = np.maximum(2 * skeleton.radius / size * _SKETCH_PIXELS, 0.7)
-    lines = "".join(
-        f"<line x1='{place[a, 0]:.1f}' y1='{place[a, 1]:.1f}' x2='{place[b, 0]:.1f}' "
-        f"y2='{place[b, 1]:.1f}' stroke-width='{width[b]:.1f}'/>"
-        for b, a in enumerate(skeleton.parent) if a >= 0)
-    return (f"<svg class=sketch viewBox='0 0 {_SKETCH_PIXELS} {_SKETCH_PIXELS}' stroke='#5a4632' "
-            f"stroke-linecap='round'>{lines}</svg>")
-
-
 _STYLE = ("body{font:15px/1.45 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
           "table{border-collapse:collapse}td,th{padding:.15em .7em .15em 0;text-align:left;"
           "vertical-align:top}section{display:flex;gap:1.5em;border-top:1px solid #ddd;"
-          "padding:.8em 0}h3{margin:.1em 0 .4em}.sketch{width:120px;height:120px;flex:none}")
+          "padding:.8em 0}h3{margin:.1em 0 .4em}.pictures{width:310px;flex:none}"
+          ".sketch{max-width:150px;margin-right:6px}.range{color:#666;margin:.1em 0;"
+          "font-size:.85em}")

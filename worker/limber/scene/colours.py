@@ -45,6 +45,14 @@ def colours_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
     return np.column_stack([*channels, np.ones_like(place)])
 
 
+def css_colours(values: np.ndarray, scale: dict[str, Any]) -> list[str]:
+    """Return the colours of values by a scale, as style sheets and SVG write them."""
+    linear = colours_of(values, scale)[:, :3]
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in
+            np.round(255 * srgb).astype(int).tolist()]
+
+
 def linear_of(srgb: np.ndarray) -> np.ndarray:
     """Return linear values of sRGB ones between 0 and 1, as Blender wants colours."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
