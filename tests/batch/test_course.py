@@ -86,7 +86,6 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     assert float(rows[1]["virtual-pull:pull-2.memory_mb"]) > 10
     page = (orchard / "results/jobs.html").read_text()
     assert "2 done" in page and page.count("<svg class=sketch viewBox") == 4
-    assert page.count("MPa (bright)</p>") == 2, "the example's modulus varies along it"
     assert "href=" not in page, "no branch has a report"
 
 
@@ -139,3 +138,17 @@ def test_text_of_files_is_no_page_and_no_formula(orchard, capsys):
 def test_numbers_of_a_result():
     assert numbers_of({"a": 1, "b": True, "c": [1.5, 2], "d": "x", "e": None, "f": [[1]],
                        "g": list(range(99))}) == {"a": 1, "c_1": 1.5, "c_2": 2}
+
+
+def test_pictures_of_a_branch(tmp_path, branch_template):
+    """Two sides; coloured where the modulus varies, brown where it does not, none without axes."""
+    from limber.batch.pictures import pictures
+
+    example = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+    shown = pictures(example)
+    assert shown.count("<svg") == 2 and "MPa (bright)</p>" in shown
+    assert shown.count("<line") == 2 * (len(
+        [line for line in (example / "skeleton.swc").read_text().splitlines()
+         if line and not line.startswith("#")]) - 1)
+    assert "(bright)" not in pictures(branch_template) and "<line" in pictures(branch_template)
+    assert pictures(tmp_path) == "<div class=pictures></div>"

@@ -1,4 +1,4 @@
-"""The worker's table: mutated files, start-up times, exports bent in other programs.
+"""The worker's table: mutated files, start-up times, exports bent in other programs, ringing.
 
 Times are those of this computer under its load at the moment.
 """
@@ -14,6 +14,7 @@ from benchmarks.worker_batches import killed, memory, on_dask, speed_up
 from benchmarks.worker_exports import rows as exported
 from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_readers import READERS
+from benchmarks.worker_ringing import rows as rung
 from limber.progress import Progress
 
 TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
@@ -22,7 +23,8 @@ TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
     """Measure; ``quick`` takes a tenth of the files, branches and jobs."""
     table = _start_up()
-    table += exported([seed + k for k in range(2 if quick else 5)], progress.part(0.02, 0.1))
+    table += exported([seed + k for k in range(2 if quick else 5)], progress.part(0.02, 0.08))
+    table += rung(10 if quick else 100, seed, progress.part(0.08, 0.1))
     progress(0.1, "mutated files")
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         keep = (out or Path(place)) / "harmful"

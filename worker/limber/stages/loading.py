@@ -162,8 +162,9 @@ def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SI
 
 def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDamping:
     """Return the damping that the last swing told, else what simulations take, with a warning."""
-    swing = branch.manifest.stages.get("swing")
-    known = swing.result if swing else {}
+    swings = [branch.manifest.stages[key] for key in ("swing", "vibration")
+              if key in branch.manifest.stages]
+    known = max(swings, key=lambda entry: entry.finished).result if swings else {}
     values = [known.get(name) for name in ("damping_mass_per_s", "damping_stiffness_s")]
     if all(isinstance(value, int | float) and value >= 0 for value in values):
         return RayleighDamping(*map(float, values))

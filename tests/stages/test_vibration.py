@@ -1,0 +1,71 @@
+"""`limber vibration` on the example branch: the modulus comes back from what it would ring like."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.mechanics.vibration import lowest_modes
+from limber.stages.loading import load_branch, load_mesh
+from limber.stages.vibration import VibrationSettings, vibration
+from limber.store import Branch
+
+EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
+
+
+@pytest.fixture
+def branch(tmp_path) -> Branch:
+    return Branch.open(Path(shutil.copytree(EXAMPLE, tmp_path / "a.branch")))
+
+
+def written(path: Path, frequency: float, damping: float = 0.03) -> Path:
+    times = np.arange(0.0, 10.0, 0.01)
+    omega = 2 * np.pi * frequency
+    way = 9.81 * np.exp(-damping * omega * times) * np.cos(omega * np.sqrt(1 - damping**2) * times)
+    way += 0.05 * np.random.default_rng(2).standard_normal(len(times))
+    path.write_text("time_s,a_x\n" + "".join(f"{t:.3f},{a:.5f}\n" for t, a in
+                                             zip(times, way, strict=True)))
+    return path
+
+
+def test_a_stiffer_branch_rings_faster(branch, tmp_path):
+    """A record of the branch with 1.5 times its modulus gives that factor, and keeps it."""
+    model = load_branch(branch).model
+    before = float(load_mesh(branch).cell_data["young"].mean())
+    wanted = float(lowest_modes(model.with_young(1.5 * model.young), 1).frequencies[0])
+    record = written(tmp_path / "ring.csv", wanted)
+    told = vibration(branch.folder, record, VibrationSettings())
+    assert told["young_factor"] == pytest.approx(1.5, rel=0.01)
+    low, high = told["young_interval_pa"]
+    assert low < told["young_pa"] < high
+    assert told["young_pa"] == pytest.approx(1.5 * before, rel=0.01)
+    assert told["damping_ratios"][0] == pytest.approx(0.03, rel=0.05)
+    now = Branch.open(branch.folder, verify=True)
+    assert load_mesh(now).cell_data["young"].mean() == pytest.approx(told["young_pa"])
+    assert vibration(branch.folder, record, VibrationSettings()) == told, "kept"
+
+
+def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
+    """The same record with a mass at the tip means stiffer wood."""
+    tip = load_mesh(branch).nodes[load_mesh(branch).nodes[:, 2].argmax()]
+    record = written(tmp_path / "ring.csv", 2.5)
+    plain = vibration(branch.folder, record, VibrationSettings())["young_pa"]
+    heavy = vibration(branch.folder, record, VibrationSettings(sensor=(*tip, 0.005)))["young_pa"]
+    assert heavy > 1.1 * plain
+
+
+@pytest.mark.parametrize(("content", "told"), [
+    ("time_s\n0\n1\n", "no column of readings"),
+    ("time_s,a\n1,1\n0,2\n", "ascend"),
+    ("t,a\n1,1\n", "no column time_s"),
+    ("time_s,a\n" + "".join(f"{k},{k % 2}\n" for k in range(9)), "At least 32"),
+])
+def test_a_record_that_cannot_be_used(branch, tmp_path, content, told):
+    path = tmp_path / "ring.csv"
+    path.write_text(content)
+    before = (branch.folder / "branch.json").read_bytes()
+    with pytest.raises(InputError, match=told):
+        vibration(branch.folder, path, VibrationSettings())
+    assert (branch.folder / "branch.json").read_bytes() == before

@@ -1,0 +1,81 @@
+"""Young's modulus from how generated branches ring, against what they were made of."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.table import Row
+from limber.estimation.ringing import identify
+from limber.geometry.generated import generate_branch
+from limber.geometry.reconstruct import mesh_skeleton
+from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.mechanics.model import BranchModel
+from limber.mechanics.vibration import Modes, lowest_modes
+from limber.progress import Progress
+from limber.stages.vibration import VibrationSettings, young_of
+
+_DENSITY, _POISSON, _YOUNG = 800.0, 0.35, 1e9
+_EACH = 10
+"""Trials a geometry."""
+_FINER = 0.7
+"""Spacing of the truth's mesh over that of the estimate's."""
+_NOISE = 0.05
+"""Of the record's largest reading."""
+_PERIODS, _READINGS = 25, 40
+"""Of the record; readings a period."""
+
+
+def rows(count: int, seed: int, progress: Progress) -> list[Row]:
+    """Branches with drawn modulus, density and radii, plucked, recorded with noise, estimated."""
+    rng = np.random.default_rng([seed, 77])
+    settings = VibrationSettings()
+    covered, errors, frequencies = 0, [], []
+    for number in range(count):
+        progress(number / count, "ringing branches")
+        if number % _EACH == 0:
+            skeleton = generate_branch(int(rng.integers(1, 10**6))).skeleton
+            assumed = _model(skeleton, progress, 1.0, _YOUNG, _DENSITY)
+        true = float(_YOUNG * np.exp(rng.normal(0, 0.5)))
+        real = replace(skeleton, radius=skeleton.radius * np.exp(
+            settings.radius_sigma * rng.normal()))
+        branch = _model(real, progress, _FINER, true,
+                        _DENSITY * float(np.exp(settings.density_sigma * rng.normal())))
+        modes = lowest_modes(branch, 3)
+        node = int(np.linalg.norm(branch.mesh.nodes
+                                  - skeleton.nodes[skeleton.main_path()[-1]], axis=1).argmin())
+        seen = identify(*_record(modes, node, rng))
+        told = young_of(assumed, seen, settings)
+        away = float(np.log(told["young_factor"] * _YOUNG / true))
+        covered += abs(away) < 1.96 * told["deviation"]
+        errors.append(abs(away))
+        frequencies.append(abs(seen.frequencies[0] / modes.frequencies[0] - 1))
+    share = covered / count
+    return [Row(f"modulus of {count} generated branches from a noisy swing: covered by the 95 % "
+                "interval", "88 to 99 %", f"{100 * share:.0f} %; error "
+                f"{100 * np.median(errors):.1f} % (median), of the first frequency "
+                f"{100 * np.median(frequencies):.2f} % (worst {100 * max(frequencies):.1f} %)",
+                bool(0.88 <= share <= 0.99) if count >= 100 else None)]
+
+
+def _model(skeleton: Skeleton, progress: Progress, spacing: float, young: float, density: float,
+           ) -> BranchModel:
+    plain = ReconstructSettings()
+    mesh = mesh_skeleton(skeleton, plain.model_copy(
+        update={"mesh_spacing": spacing * plain.mesh_spacing}), progress).mesh
+    return BranchModel(mesh, young=young, poisson=_POISSON, density=density).as_scanned()
+
+
+def _record(modes: Modes, node: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Times and two channels: a pluck of the tip, seen there as way or as acceleration."""
+    frequencies = modes.frequencies
+    times = np.arange(0, _PERIODS / frequencies[0], 1 / (_READINGS * frequencies[0]))
+    pluck = rng.normal(size=3)
+    order = 2 if rng.random() < 0.5 else 0
+    found = np.zeros((len(times), 2))
+    for frequency, shape in zip(frequencies, modes.shapes, strict=True):
+        omega, ratio = 2 * np.pi * frequency, rng.uniform(0.01, 0.04)
+        size = shape[node] * (shape[node] @ pluck) * omega**order / omega**2
+        found += (np.exp(-ratio * omega * times) * np.cos(omega * np.sqrt(1 - ratio**2) * times)
+                  )[:, None] * size[:2]
+    return times, found + _NOISE * np.abs(found).max() * rng.standard_normal(found.shape)
