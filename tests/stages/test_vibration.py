@@ -8,6 +8,7 @@ import pytest
 
 from limber.errors import InputError
 from limber.mechanics.vibration import lowest_modes
+from limber.report.ringing import vibration_rows
 from limber.stages.loading import load_branch, load_mesh
 from limber.stages.vibration import VibrationSettings, vibration
 from limber.store import Branch
@@ -45,6 +46,12 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
     now = Branch.open(branch.folder, verify=True)
     assert load_mesh(now).cell_data["young"].mean() == pytest.approx(told["young_pa"])
     assert vibration(branch.folder, record, VibrationSettings()) == told, "kept"
+    modulus, vibrations = vibration_rows(now.path("vibration.json"))
+    assert modulus[1][1] == f"{told['young_pa'] / 1e6:.4g}" and len(vibrations) == 1 + len(
+        told["frequencies_hz"])
+    now.path("vibration.json").write_text('{"young_pa": -1}')
+    with pytest.raises(InputError, match=r"vibration\.json"):
+        vibration_rows(now.path("vibration.json"))
 
 
 def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):

@@ -23,6 +23,7 @@ from limber.planning.field.energy_field import EnergyField
 from limber.progress import SILENT, Progress
 from limber.reading import read_arrays, read_json
 from limber.report import figures, loads
+from limber.report.ringing import vibration_rows
 from limber.report.tables import (
     caliper_rows,
     cause_rows,
@@ -86,8 +87,9 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
     page = [*_held_back(branch), _summary(branch, picture)]
     builders: list[Callable[[Branch], Section]] = [
         _scan, partial(_cylinders, calipers=calipers), _mesh, *_pulls(branch), _estimate,
-        *([_swing] if branch.has("swing.json") else []), *_simulations(branch), *_loads(branch),
-        _energy, *_plans(branch), _provenance]
+        *([_swing] if branch.has("swing.json") else []),
+        *([_vibration] if branch.has("vibration.json") else []), *_simulations(branch),
+        *_loads(branch), _energy, *_plans(branch), _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
@@ -270,6 +272,11 @@ def _swing(branch: Branch) -> Section:
     section.draw(estimate_figures.swing_over_time(swing),
                  "The marker that swings most, along its way: seen (dots) and simulated.")
     return section
+
+
+def _vibration(branch: Branch) -> Section:
+    modulus, vibrations = vibration_rows(branch.path("vibration.json"))
+    return Section("Ringing", tables=[("", modulus), ("Vibrations of the record", vibrations)])
 
 
 def _simulations(branch: Branch) -> list[Callable[[Branch], Section]]:
