@@ -1,15 +1,19 @@
 """The branch in the virtual gripper: its stiffness by differences, its force by statics."""
 
 import json
+import zlib
 
 import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
 
+from limber.geometry.cloud.camera import Camera, depth_to_cloud
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.sensitivities import grasp_slopes
 from limber.robot.kinematics import inverted, matrices
 from limber.robot.virtual.controller import Controller
+from limber.robot.virtual.depth_camera import scanned, views_around
 from limber.robot.virtual.held_branch import (
     BranchSetting,
     HeldBranch,
@@ -156,6 +160,45 @@ def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
     assert held.wrench(moved, 0.002) == pytest.approx(np.zeros(6))
 
 
+def test_the_camera_sees_the_bent_branch(held, beam):
+    """Between solutions it takes a picture: at rest the beam's own surface, then one moved."""
+    flange = Controller("ur5e").flange
+    middle = np.r_[beam.nodes[:, :2].mean(axis=0), 0.16]
+    camera = Camera(width=120, height=160, fx=200.0, fy=200.0, cx=60.0, cy=80.0).looking(
+        eye=middle + [0.5, 0.0, 0.0], target=middle)
+
+    def picture(at) -> np.ndarray:
+        held.look(camera.model_dump())
+        for _ in range(200):
+            held.wrench(at, 0.002)
+            if held.picture is not None:
+                break
+            held._pipe.poll(0.05)
+        steps = np.frombuffer(zlib.decompress(held.picture), "<u2").reshape(160, 120)
+        return steps / camera.depth_scale
+
+    still = depth_to_cloud(camera, picture(flange), None).points
+    # The near side of a beam of 10 mm; few pixels fly off.
+    off = np.abs(still[:, 0] - beam.nodes[:, 0].max())
+    assert len(still) > 300 and np.median(off) < 1e-3
+    assert closed(held, flange) == "held"
+    moved = flange.copy()
+    for part in np.linspace(0, 0.03, 40):
+        moved[1, 3] = flange[1, 3] + part
+        held.wrench(moved, 0.002)
+        held._pipe.poll(0.05)
+    bent = depth_to_cloud(camera, picture(moved), None).points
+    top = bent[bent[:, 2] > 0.29]
+    assert np.median(top[:, 1]) - middle[1] == pytest.approx(0.03, abs=6e-3)
+
+
+def test_views_stand_around_and_look_at_the_middle():
+    middle = np.array([0.1, -0.2, 0.4])
+    for camera in views_around(middle, 0.6, 6):
+        assert np.linalg.norm(camera.origin - middle) == pytest.approx(0.6)
+        assert camera.to_camera(middle[None])[0] == pytest.approx([0, 0, 0.6], abs=1e-12)
+
+
 def test_sliding_in_the_grip_lets_the_force_fall(held):
     flange = Controller("ur5e").flange
     held.wrench(flange, 0.002)
@@ -228,6 +271,13 @@ def test_the_real_client_feels_the_branch(setting, tmp_path, worker_address):
             time.sleep(0.2)
             assert robot.state["branch"] == "free"
             assert np.linalg.norm(receive.getActualTCPForce()[:3]) < 1.5
+            # Seen from four sides over its own port: points of the beam's surface, all around.
+            data = TetMesh.read(setting.mesh)
+            middle = data.nodes.mean(axis=0)
+            points = scanned(worker_address, views_around(middle, 0.5, 4))
+            off = np.abs(points[:, :2] - middle[:2]).max(axis=1) - 0.005
+            assert len(points) > 3000 and np.median(np.abs(off)) < 1.5e-3
+            assert np.ptp(points[:, 2]) == pytest.approx(np.ptp(data.nodes[:, 2]), abs=0.02)
         finally:
             io.disconnect()
             control.disconnect()

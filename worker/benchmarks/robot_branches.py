@@ -120,7 +120,11 @@ def followed_paths(seed: int, count: int, address: str) -> list[Row]:
 
 def _executed(folder: Path, seed: int, address: str,
               fault: Callable[[VirtualRobot], None] | None = None) -> tuple[dict, float]:
-    """Execute the path armed; with ``fault`` done to the robot while it goes back."""
+    """Execute the path armed; with ``fault`` done to the robot once the force is up.
+
+    Returns:
+        What `execute` told, and by how much the virtual branch's force was led on wrongly [N].
+    """
     branch, young = random_branch(folder / "random.branch", seed)
     cell = standing_at(branch, address, fraction=FRACTION, back=ApproachEntry().distance_m,
                        grip_seconds=4.0)
@@ -153,12 +157,18 @@ def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event,
             fault = None
 
 
-def lost_branches(seed: int, runs: int, address: str) -> Row:
+FAULTS_OF_BRANCHES: tuple[tuple[str, Callable[[VirtualRobot], None]], ...] = (
+    ("slips", lambda robot: robot.ask("slip", part=0.95) and None),
+    ("breaks", lambda robot: robot.ask("break") and None))
+
+
+def lost_branches(seed: int, runs: int, address: str,
+                  faults: tuple[tuple[str, Callable[[VirtualRobot], None]], ...],
+                  ) -> Row:
     """The branch slips in the grip, or breaks, while it is led: the arm stands and says so."""
     told, failed = [], []
     for number in range(runs):
-        for name, fault in (("slips", lambda robot: robot.ask("slip", part=0.95)),
-                            ("breaks", lambda robot: robot.ask("break"))):
+        for name, fault in faults:
             with tempfile.TemporaryDirectory() as place:
                 began = time.monotonic()
                 try:
@@ -172,5 +182,6 @@ def lost_branches(seed: int, runs: int, address: str) -> Row:
                 print(f"branch {name}: {time.monotonic() - began:.0f} s in all")
     for line in (*failed, *told[:2]):
         print(line)
-    return Row(f"branch slips, branch breaks while it is led, {runs} runs each: stop and report",
-               "every one", f"{len(told)} of {2 * runs}", not failed)
+    names = ", ".join(f"branch {name}" for name, _ in faults)
+    return Row(f"{names} while it is led, {runs} runs each: stop for the lost force, and a report",
+               "every one", f"{len(told)} of {len(faults) * runs}", not failed)

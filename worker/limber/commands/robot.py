@@ -155,5 +155,28 @@ def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
     return np.array(touched), version
 
 
+@stage_command("scan")
+@click.option("--address", default="127.0.0.1", show_default=True, help="Of the virtual robot.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True,
+              help="PLY file to write.")
+@click.option("--middle", type=float, nargs=3, required=True, metavar="X Y Z",
+              help="What the cameras look at, branch frame [m].")
+@click.option("--distance", default=0.6, show_default=True, help="Of the cameras [m].")
+@click.option("--views", default=8, show_default=True, help="Number of places around it.")
+def scan(run: Run, address: str, output: Path, middle: tuple[float, float, float],
+         distance: float, views: int) -> dict[str, Any]:
+    """Scan the branch of `limber virtual-robot` with its depth camera, from all around.
+
+    Real cameras are not driven from here: record a cloud with their own program.
+    """
+    from limber.geometry.cloud.cloud import Cloud
+    from limber.robot.virtual.depth_camera import scanned, views_around
+
+    points = scanned(address, views_around(np.array(middle), distance, views))
+    Cloud(points, {}).write_ply(output)
+    return {"cloud": str(output), "point_count": len(points), "view_count": views}
+
+
+command.add_command(scan)
 command.add_command(check)
 command.add_command(calibrate)

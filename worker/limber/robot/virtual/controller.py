@@ -78,6 +78,15 @@ class Load(Protocol):
         """Return where the points are that a tracker sees [m]."""
         ...
 
+    @property
+    def picture(self) -> bytes | None:
+        """The depth image that was asked for, once it is there."""
+        ...
+
+    def look(self, camera: dict[str, Any]) -> None:
+        """Ask for a depth image."""
+        ...
+
     def report(self) -> dict[str, Any]:
         """Return the state of what is held, as plain data."""
         ...
@@ -107,6 +116,11 @@ class Nothing:
 
     def seen(self) -> list[list[float]]:
         return []
+
+    picture = None
+
+    def look(self, camera: dict[str, Any]) -> None:
+        """Nothing is seen."""
 
     def report(self) -> dict[str, Any]:
         return {"branch": "none"}

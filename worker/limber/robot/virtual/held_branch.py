@@ -9,6 +9,7 @@ tangent alone would be newtons off. How long a solution takes, and by how much t
 when one came, is part of the robot's state.
 """
 
+import zlib
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -150,6 +151,9 @@ class HeldBranch:
         self._tried: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
         self._twist, self._last_patch = np.zeros(6), np.eye(4)
         self._gripper = self._closed_at = np.eye(4)
+        self._view: dict[str, Any] | None = None
+        self._is_looking = False
+        self.picture: bytes | None = None
 
     @property
     def points(self) -> np.ndarray:
@@ -163,7 +167,8 @@ class HeldBranch:
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
         """Return what the branch exerts on the flange, flange frame, shape [6]."""
         self._gripper = self._base @ flange @ self._tool
-        if self.state == "closing":
+        self._take_picture()
+        if self.state == "closing" and not self._is_looking:
             self._close_jaws()
         if self.state != "held":
             return np.zeros(6)
@@ -171,7 +176,8 @@ class HeldBranch:
         self._asked_age += seconds
         patch = self._gripper @ self._offset
         self._follow_twist(patch, seconds)
-        self._exchange(patch)
+        if not self._is_looking:
+            self._exchange(patch)
         solution = self._solution
         if solution is None:
             return np.zeros(6)
@@ -243,6 +249,26 @@ class HeldBranch:
         """Return where the seen points are [m]."""
         return self.points.tolist()
 
+    def look(self, camera: dict[str, Any]) -> None:
+        """Ask for a depth image; it is in ``picture`` when the solver has found time for it.
+
+        Args:
+            camera: Content of a :class:`~limber.geometry.cloud.camera.Camera`.
+        """
+        self._view, self.picture = camera, None
+
+    def _take_picture(self) -> None:
+        if self._is_looking and self._pipe.poll():
+            self.picture = self._pipe.recv()[1]
+            self._is_looking = self._busy = False
+        elif self._busy and self.state not in ("held", "closing") and self._pipe.poll():
+            # A solution for a branch that has been let go.
+            self._pipe.recv()
+            self._busy = False
+        if self._view is not None and not self._busy:
+            self._pipe.send(("look", (self._view, self._solution is not None)))
+            self._view, self._is_looking, self._busy = None, True, True
+
     def report(self) -> dict[str, Any]:
         """Return its state as plain data."""
         solution = self._solution
@@ -282,7 +308,8 @@ class HeldBranch:
                 self._jump += jump
                 self._largest_jump = max(self._largest_jump, float(np.linalg.norm(jump[:3])))
             self._solution = found
-        if not self._busy:
+        # A picture that is asked for has the next turn.
+        if not self._busy and self._view is None:
             ahead = self._ahead(patch)
             if self._solution is not None:
                 force = self._extrapolated(self._solution, ahead)[:3]
@@ -343,6 +370,8 @@ def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
             kind, content = pipe.recv()
             if kind == "grasp":
                 pipe.send(("grasped", solver.grasp(np.array(content))))
+            elif kind == "look":
+                pipe.send(("seen", solver.look(*content)))
             elif kind == "try":
                 pipe.send(("tried", solver.tried()))
             else:
@@ -371,6 +400,8 @@ class _Solver:
         self._grasp = None
         self._state = np.zeros_like(mesh.nodes)
         self._last: Solution | None = None
+        self._faces: np.ndarray | None = None
+        self._rng = np.random.default_rng(0)
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -386,6 +417,23 @@ class _Solver:
         if self._operator is None:
             return self._points
         return self._points + (self._operator @ self._state.ravel()).reshape(-1, 3)
+
+    def look(self, camera: dict[str, Any], is_held: bool) -> bytes:
+        """Return what a depth camera sees of the branch, with its noise: 16 bits a pixel, packed.
+
+        Unheld the branch is at rest.
+        """
+        from limber.geometry.cloud.camera import Camera
+        from limber.perception.simulated_camera import render_depth, with_noise
+
+        made = Camera.model_validate(camera)
+        mesh = self._model.mesh
+        if self._faces is None:
+            self._faces = mesh.surface_faces()
+        moved = self._state if is_held else np.zeros_like(self._state)
+        depth = with_noise(made, render_depth(made, mesh.nodes + moved, self._faces), self._rng)
+        steps = np.clip(np.round(depth * made.depth_scale), 0, 65535).astype("<u2")
+        return zlib.compress(steps.tobytes(), 1)
 
     def grasp(self, position: np.ndarray) -> dict[str, Any]:
         from limber.mechanics.grasp import Grasp

@@ -1,4 +1,4 @@
-"""The virtual controller's ports: RTDE, scripts, dashboard, FT300, simulated markers.
+"""The virtual controller's ports: RTDE, scripts, dashboard, FT300, simulated markers and camera.
 
 One asyncio loop steps the controller by the wall clock and serves all connections. It waits by
 ``select``, whose time-out has microseconds; ``epoll`` would round every 2 ms step up by one.
@@ -13,8 +13,10 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from limber.errors import InputError, WorkError
+from limber.geometry.cloud.camera import Camera
 from limber.robot import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import GREETING, answer
@@ -22,6 +24,8 @@ from limber.robot.virtual.dashboard import GREETING, answer
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT, FT300_PORT = 30004, 30003, 29999, 63351
 MARKER_PORT = 63400
 """Simulated tracking of points on the branch: JSON lines, 30 a second."""
+CAMERA_PORT = 63401
+"""Simulated depth camera: an image for each camera that is sent."""
 
 _MARKER_SECONDS = 1 / 30
 _MARKER_SIGMA_M = 0.5e-3
@@ -53,6 +57,7 @@ class Server:
         self._writers: set[asyncio.StreamWriter] = set()
         self._streams: list[_RtdeConnection] = []
         self.owners: dict[str, object] = {}
+        self._one_picture = asyncio.Lock()
 
     async def open(self) -> None:
         """Open the ports.
@@ -67,6 +72,7 @@ class Server:
             ports[FT300_PORT] = self._serve_ft300
         if self.controller.load.seen():
             ports[MARKER_PORT] = self._serve_markers
+            ports[CAMERA_PORT] = self._serve_camera
         try:
             for port, serve in ports.items():
                 self._servers.append(await asyncio.start_server(
@@ -200,6 +206,24 @@ class Server:
                 self.send(writer, f"{line}\n".encode())
                 last = seen_at
             await asyncio.sleep(_MARKER_SECONDS)
+
+
+    async def _serve_camera(self, reader: asyncio.StreamReader,
+                            writer: asyncio.StreamWriter) -> None:
+        """Each line asks with a camera's content; the answer is a line and a packed image."""
+        while line := await reader.readline():
+            try:
+                asked = Camera.model_validate_json(line)
+            except ValidationError as error:
+                self.send(writer, json.dumps({"error": str(error)[:300]}).encode() + b"\n")
+                continue
+            async with self._one_picture:
+                self.controller.load.look(asked.model_dump())
+                while self.controller.load.picture is None:
+                    await asyncio.sleep(0.01)
+                picture = self.controller.load.picture
+            told = {"t_s": self.controller.clock, "bytes": len(picture)}
+            self.send(writer, json.dumps(told).encode() + b"\n" + picture)
 
 
 class _RtdeConnection:

@@ -1,0 +1,101 @@
+"""The virtual robot's depth camera, asked over its port, and a scan of the branch with it."""
+
+import json
+import socket
+import zlib
+
+import numpy as np
+
+from limber.errors import InputError, WorkError
+from limber.geometry.cloud.camera import D455, Camera, depth_to_cloud
+from limber.robot.virtual.server import CAMERA_PORT
+
+_SECONDS = 30.0
+_LARGEST_STEP_M = 0.01
+"""Between neighbouring pixels of one surface; more is a silhouette, where pixels fly."""
+
+
+class VirtualCamera:
+    """A depth camera that may stand anywhere; a context manager.
+
+    Raises:
+        WorkError: nothing answers at the port.
+    """
+
+    def __init__(self, address: str):
+        try:
+            self._socket = socket.create_connection((address, CAMERA_PORT), _SECONDS)
+        except OSError as error:
+            raise WorkError(f"No camera answers at {address} port {CAMERA_PORT} ({error}).",
+                            "Only the virtual robot with a branch has one.",
+                            "Start `limber virtual-robot` with the branch's folder.") from error
+        self._stream = self._socket.makefile("rb")
+
+    def __enter__(self) -> "VirtualCamera":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._stream.close()
+        self._socket.close()
+
+    def depth(self, camera: Camera) -> np.ndarray:
+        """Return what a camera sees: depth [m], 0 where nothing is, shape [height, width].
+
+        Raises:
+            WorkError: the robot is gone.
+        """
+        try:
+            self._socket.sendall(camera.model_dump_json().encode() + b"\n")
+            told = json.loads(self._stream.readline() or b"{}")
+            packed = self._stream.read(told.get("bytes", 0))
+        except (OSError, ValueError) as error:
+            raise WorkError(f"The virtual camera is gone ({error}).") from error
+        if "error" in told or not packed:
+            raise WorkError(f"The virtual camera gave no image: {told.get('error', 'it is gone')}.")
+        steps = np.frombuffer(zlib.decompress(packed), "<u2")
+        return steps.reshape(camera.height, camera.width) / camera.depth_scale
+
+
+def views_around(middle: np.ndarray, distance: float, count: int,
+                 camera: Camera = D455) -> list[Camera]:
+    """Return cameras all around a place [3], ``distance`` [m] from it, by turns a little above and
+    below.
+    """
+    if count < 1 or not distance > 0:
+        raise InputError(f"{count} views from {distance:g} m.", "A scan has one or more, from "
+                         "outside of the branch.", "Ask for 8 from 0.6 m.")
+    found = []
+    for number in range(count):
+        turn, tilt = 2 * np.pi * number / count, 0.35 * (-1) ** number
+        way = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+        found.append(camera.looking(eye=middle + distance * way, target=middle))
+    return found
+
+
+def scanned(address: str, cameras: list[Camera]) -> np.ndarray:
+    """Return the points [m, 3] that cameras see together, silhouettes left out.
+
+    Raises:
+        WorkError: there is no camera, or none of them sees anything.
+    """
+    parts = []
+    with VirtualCamera(address) as eye:
+        for camera in cameras:
+            depth = eye.depth(camera)
+            parts.append(depth_to_cloud(camera, depth, _inner(depth)).points)
+    points = np.concatenate(parts)
+    if not len(points):
+        raise WorkError(f"{len(cameras)} views show nothing.", "The cameras look past the branch.",
+                        "Give another middle or distance.")
+    return points
+
+
+def _inner(depth: np.ndarray) -> np.ndarray:
+    """Pixels whose four neighbours lie on the same surface, shape [height, width]."""
+    kept = depth > 0
+    for axis in (0, 1):
+        for shift in (1, -1):
+            beside = np.roll(depth, shift, axis)
+            kept &= (beside > 0) & (np.abs(beside - depth) < _LARGEST_STEP_M)
+    kept[[0, -1]] = kept[:, [0, -1]] = False
+    return kept
