@@ -258,6 +258,27 @@ def _read_calipers(_template: Path, path: Path) -> Any:
     return read_calipers(path)
 
 
+def _decay(name: str, column: str, _template: Path, folder: Path) -> list[Path]:
+    path, times = folder / name, np.arange(0, 4, 0.02)
+    values = 3 + np.exp(-0.5 * times) * np.cos(15 * times)
+    path.write_text(f"time_s,{column}\n" + "".join(
+        f"{at:.3f},{value:.4f}\n" for at, value in zip(times, values, strict=True)))
+    return [path]
+
+
+def _ring(_template: Path, path: Path) -> Any:
+    from limber.estimation.ringing import identify, read_record
+
+    return identify(*read_record(path))
+
+
+def _wind(_template: Path, path: Path) -> Any:
+    from limber.mechanics.gusts import Swaying, recorded
+    from limber.stages.load import read_wind
+
+    return recorded(Swaying(np.ones(1), np.full(1, 0.05), np.ones(1)), *read_wind(path))
+
+
 def _edits(_template: Path, folder: Path) -> list[Path]:
     path = folder / "edits.json"
     path.write_text(json.dumps([{"do": "radius", "at": [0, 0, 0.2], "radius": 0.01},
@@ -532,6 +553,8 @@ READERS: dict[str, Reader] = {
     "calipers CSV": Reader("text", _calipers, _read_calipers),
     "MAT": Reader("binary", partial(_cylinder_models, ".mat"), _skeleton),
     "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), _skeleton),
+    "ring CSV": Reader("text", partial(_decay, "ring.csv", "a_m_s2"), _ring),
+    "wind CSV": Reader("text", partial(_decay, "wind.csv", "speed_m_s"), _wind),
     "MTG": Reader("text", partial(_cylinder_models, ".mtg"), _skeleton),
     "add-on clouds": Reader("binary", lambda template, folder: [
         *_ply(template, folder), *_texts(template, folder)],

@@ -8,14 +8,17 @@ counts as so many fewer readings.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from limber.errors import InputError
+from limber.reading import read_columns
 
 _MOST_MODES = 4
 _LEAST_READINGS = 32
+_MOST_STEPS = 2e6
 _LEAST_TURNS = 3.0
 _PERIODS = 60
 """So many of the first are used: what comes later is noise, or somebody at the branch."""
@@ -47,6 +50,23 @@ class Ringing:
     left_over: float
     start: float
     duration: float
+
+
+def read_record(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a record: times [s], shape [n], and its columns of readings, shape [n, c].
+
+    Raises:
+        InputError: it cannot be read, has no readings, or its times do not ascend in even steps.
+    """
+    columns = read_columns(path, ("time_s",), "a record of vibrations")
+    times = columns.pop("time_s")
+    if not columns or len(times) < 2 or not (np.diff(times) > 0).all():
+        raise InputError(f"{path} has no column of readings beside time_s, or its times do not "
+                         "ascend.", "A record has both.", "Correct the file.")
+    if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
+        raise InputError(f"{path} has gaps that are far longer than its steps.",
+                         "It is taken in even steps.", "Give a part of it without gaps.")
+    return times, np.stack(list(columns.values()), axis=1)
 
 
 def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None) -> Ringing:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
-_LEAST_RECORD, _MOST_STEPS = 16, 2e6
+_LEAST_RECORD, _MOST_STEPS, _FASTEST = 16, 2e6, 150.0
 
 
 class LoadSettings(Settings):
@@ -194,15 +194,25 @@ def _record(settings: LoadSettings) -> tuple[np.ndarray, np.ndarray] | None:
     if settings.gust is not None:
         raise InputError("Both --gust and --gust-record are given.", "The record has the gusts.",
                          "Leave one out.")
-    columns = read_columns(settings.gust_record, ("time_s", "speed_m_s"), "a record of the wind")
+    return read_wind(settings.gust_record)
+
+
+def read_wind(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a recorded wind: times [s] and speeds [m/s], shape [n] each.
+
+    Raises:
+        InputError: it cannot be read, is too short, or does not blow forward on average.
+    """
+    columns = read_columns(path, ("time_s", "speed_m_s"), "a record of the wind")
     times, speeds = columns["time_s"], columns["speed_m_s"]
-    if len(times) < _LEAST_RECORD or not (np.diff(times) > 0).all() or not speeds.mean() > 0:
+    if len(times) < _LEAST_RECORD or not (np.diff(times) > 0).all() or not speeds.mean() > 0 or (
+            not np.abs(speeds).max() < _FASTEST):
         raise InputError(
-            f"{settings.gust_record} is no record of a wind.", "It has at least "
-            f"{_LEAST_RECORD} rows, ascending times, and a wind that blows along --wind on "
-            "average.", "Give another one.")
-    if (times[-1] - times[0]) / np.median(np.diff(times)) > _MOST_STEPS:
-        raise InputError(f"{settings.gust_record} has gaps that are far longer than its steps.",
+            f"{path} is no record of a wind.", f"It has at least {_LEAST_RECORD} rows, ascending "
+            f"times, and a wind under {_FASTEST:g} m/s that blows along --wind on average.",
+            "Give another one.")
+    if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
+        raise InputError(f"{path} has gaps that are far longer than its steps.",
                          "It is taken in even steps.", "Give a part of it without gaps.")
     return times, speeds
 

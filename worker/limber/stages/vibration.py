@@ -75,22 +75,17 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
         InputError: the record cannot be read, or does not ring. WorkError: no modulus has such a
             frequency.
     """
-    from limber.estimation.ringing import identify
-    from limber.reading import read_columns
+    from limber.estimation.ringing import identify, read_record
     from limber.stages.loading import load_branch, load_mesh
 
-    columns = read_columns(record, ("time_s",), "a record of vibrations")
-    times = columns.pop("time_s")
-    if not columns or not (np.diff(times) > 0).all():
-        raise InputError(f"{record} has no column of readings beside time_s, or its times do not "
-                         "ascend.", "A record has both.", "Correct the file.")
+    times, channels = read_record(record)
     branch = Branch.open(branch_folder)
     with branch.writing("limber vibration"):
         mesh = load_mesh(branch)
         digests = {"record": file_digest(record), "mesh geometry": mesh.geometry_digest()}
         if not force and branch.is_current("vibration", settings, digests=digests):
             return branch.manifest.stages["vibration"].result
-        seen = identify(times, np.stack(list(columns.values()), axis=1), settings.start)
+        seen = identify(times, channels, settings.start)
         progress(0.3, "modulus of that frequency")
         model = load_branch(branch, progress=progress).model
         told = young_of(_with_sensor(model, settings), seen, settings)
