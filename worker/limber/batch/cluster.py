@@ -150,7 +150,7 @@ class Cluster:
             n_workers=self._wanted, threads_per_worker=1, processes=True, memory_limit=0,
             host=_LOOPBACK, protocol="tls://", security=Security.temporary(),
             dashboard_address=f"{_LOOPBACK}:0", worker_dashboard_address=f"{_LOOPBACK}:0",
-            scheduler_kwargs={"dashboard": False}, env={CORES: str(cores)}, silence_logs="ERROR")
+            scheduler_kwargs={"dashboard": False}, env={CORES: str(cores)}, silence_logs="CRITICAL")
 
     def _queue(self, kind: str, jobs: JobFile) -> Any:
         import dask
