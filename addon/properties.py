@@ -165,9 +165,15 @@ def outcome_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> dict[str, A
 
 def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dict[str, Any],
                  ) -> None:
-    """Keep what the user shall still read when the message is gone."""
-    kept = {name: outcome[name] for name in ("status", "error", "warnings", "seconds")
-            if name in outcome}
+    """Keep what the user shall still read when the message is gone.
+
+    Where the branch folder keeps no result (of loads, of an export), that too.
+    """
+    common = ("status", "error", "warnings", "seconds")
+    kept = {name: outcome[name] for name in common if name in outcome}
+    if not stage.key:
+        kept["result"] = {name: value for name, value in outcome.items()
+                          if name not in (*common, "command")}
     group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})
 
 

@@ -8,10 +8,14 @@ from dataclasses import dataclass
 
 FROM_SCENE = frozenset({"branch_folder", "output", "data", "render"})
 """Inputs that the add-on gives itself: no panel asks for them."""
+SHOWN_FILES = {"export": frozenset({"output"}), "skeleton": frozenset({"output"})}
+"""Of those, what a stage does ask for: a file that is for other programs."""
 NOT_FROM_HERE = {"execute": frozenset({"arm", "confirm", "after_stop"})}
 """What the add-on never sets: a robot is set in motion at a terminal, by who stands beside it."""
 WAYS = frozenset({"move"})
 """Vectors in metres that say how far, not where: the 3D cursor does not give them."""
+PLACES = {"fruit": (0.1,), "cut": ()}
+"""Lists of places on the branch, and what stands behind a place: the mass [kg] of a fruit."""
 
 
 class StepState(enum.Enum):
@@ -68,10 +72,12 @@ STEPS = (
          others=(StageView("mesh", "Mesh a Closed Surface"),),
          hint="Made together with the skeleton"),
     Step("material", "Material", StageView("reconstruct", "", ("material",)),
-         others=(StageView("simulate", "Simulate a Motion"),),
+         others=(StageView("simulate", "Simulate a Motion"),
+                 StageView("load", "Wind, Snow, Fruit, Cuts")),
          scene_operator=("limber.color_by", "Show Young's Modulus")),
     Step("pulls", "Pulls", StageView("import-pull", "Import Pull"),
-         others=(StageView("virtual-pull", "Simulate a Pull"),)),
+         others=(StageView("virtual-pull", "Simulate a Pull"),
+                 StageView("export-pull", "Export a Pull"))),
     Step("estimate", "Estimate", StageView("estimate", "Estimate"),
          others=(StageView("swing", "Fit a Free Swing"),
                 StageView("predict", "Predict Another Load"))),
@@ -82,18 +88,22 @@ STEPS = (
         "output", "weights and limits", "solver", "running"))),
     Step("robot", "Robot", StageView("execute", "Check With Robot"),
          hint="A dry run: a robot is armed at a terminal"),
-    Step("report", "Report", StageView("report", "Write Report")),
+    Step("report", "Report", StageView("report", "Write Report"),
+         others=(StageView("export", "Export for Other Programs"),)),
 )
 
 RUN = tuple(dict.fromkeys(view.stage for step in STEPS for view in (step.view, *step.others)))
 """The stages that the add-on can run."""
 NOT_RUN_HERE = {
     "record": "it moves a robot", "generate": "it makes scans, no branch",
-    "load": "its answer is a table: at a terminal",
-    "export": "it writes files for other programs: at a terminal",
-    "export-pull": "it writes files for other programs: at a terminal",
     "scene": "`limber.open_result` draws what it says"}
 """The others, and why."""
+
+
+def hidden_fields(stage: str) -> frozenset[str]:
+    """Return the fields of a stage that no panel asks for."""
+    return (FROM_SCENE - SHOWN_FILES.get(stage, frozenset())) | NOT_FROM_HERE.get(
+        stage, frozenset())
 
 
 def button_of(stage: str) -> str:

@@ -8,7 +8,7 @@ import bpy
 from .. import branch_folder, jobs, properties
 from ..branch_folder import BranchRecord, StageRecord
 from ..stages import Field, Stage, stages
-from ..steps import FROM_SCENE, NOT_FROM_HERE, STEPS, WAYS, StageView, Step, StepState, button_of
+from ..steps import PLACES, STEPS, WAYS, StageView, Step, StepState, button_of, hidden_fields
 from ..steps import next_step as step_after
 from .results import draw_results
 from .sidebar import SidebarPanel
@@ -104,7 +104,7 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
     """Draw what must be given, the button, the state, and what came out."""
     stage = stages()[view.stage]
     required = [field.name for field in stage.fields.values()
-                if field.is_required and field.name not in FROM_SCENE]
+                if field.is_required and field.name not in hidden_fields(view.stage)]
     if view.stage != "reconstruct":
         # Its scan is the first step's.
         _draw_fields(layout, context, view, names=required)
@@ -121,8 +121,7 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
         _draw_text(layout, outcome["error"], "ERROR")
     for warning in outcome.get("warnings", []):
         _draw_text(layout, warning, "INFO")
-    if entry is not None:
-        draw_results(layout, view.stage, entry.result)
+    draw_results(layout, view.stage, outcome.get("result", {}) if entry is None else entry.result)
 
 
 def _draw_scene_button(layout: bpy.types.UILayout, context: bpy.types.Context, step: Step) -> None:
@@ -146,7 +145,7 @@ def _draw_origin(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 
 def _draw_groups(layout: bpy.types.UILayout, context: bpy.types.Context, view: StageView) -> None:
     stage = stages()[view.stage]
-    hidden = FROM_SCENE | NOT_FROM_HERE.get(view.stage, frozenset())
+    hidden = hidden_fields(view.stage)
     for title, fields in stage.groups().items():
         shown = [field for field in fields if field.name not in hidden and not field.is_required
                  and (context.scene.limber.show_expert or not field.is_expert)
@@ -170,8 +169,9 @@ def _draw_fields(layout: bpy.types.UILayout, context: bpy.types.Context, view: S
 def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: Stage,
                 field: Field) -> None:
     group = properties.group_of(context.scene, stage)
-    has_place = (field.kind == "vector" and field.length == 3 and field.unit == "m"
-                 and "branch_folder" in stage.fields and field.name not in WAYS)
+    has_place = "branch_folder" in stage.fields and (field.name in PLACES or (
+        field.kind == "vector" and field.length == 3 and field.unit == "m"
+        and field.name not in WAYS))
     if not (field.is_optional and properties.has_switch(field)) and not has_place:
         layout.prop(group, field.name)
         return

@@ -107,11 +107,12 @@ def test_every_panel_is_in_the_tab(bpy, panels):
 @pytest.mark.parametrize(("name", "operators"), [
     ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct", "limber.skeleton"]),
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
-    ("material", ["limber.color_by", "limber.simulate"]),
+    ("material", ["limber.color_by", "limber.simulate", "limber.load"]),
     ("pulls", ["limber.import_pull", "limber.virtual_pull"]),
     ("estimate", ["limber.estimate", "limber.swing", "limber.predict"]),
     ("goal", ["limber.energy", "limber.target"]), ("plan", ["limber.plan"]),
-    ("robot", ["limber.execute"]), ("report", ["limber.report", "limber.open_report"])])
+    ("robot", ["limber.execute"]),
+    ("report", ["limber.report", "limber.open_report", "limber.export"])])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, operators):
     """Its stages' buttons in order, and every setting of the schema that is not for experts."""
     stages = importlib.import_module("limber_addon.stages").stages()
@@ -122,7 +123,7 @@ def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, opera
     step = _step(bpy, name).step
     for view in (step.view, *step.others):
         for field in stages[view.stage].fields.values():
-            hidden = steps.FROM_SCENE | steps.NOT_FROM_HERE.get(view.stage, frozenset())
+            hidden = steps.hidden_fields(view.stage)
             wanted = view.groups is None and not field.is_expert and field.name not in hidden
             assert not wanted or field.name in drawn.names("prop"), (view.stage, field.name)
     assert "arm" not in drawn.names("prop"), "no button moves a robot"

@@ -109,3 +109,22 @@ def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
     assert skeletons.nodes_of(skeleton()).marks.sum() == 1
     bpy.ops.limber.edit_node(action="NONE", node=1)
     assert skeletons.nodes_of(skeleton()).marks.sum() == 0
+
+
+def test_loads_and_exports_have_a_button(bpy, opened, tmp_path):
+    """A fruit and a cut at the 3D cursor: the answer stays with the button. A file is written."""
+    folder, _ = opened
+    axes = read_skeleton(folder / "skeleton.csv")
+    properties = importlib.import_module("limber_addon.properties")
+    stages = importlib.import_module("limber_addon.stages").stages()
+    for field, node in (("cut", _tip(folder)), ("fruit", 40), ("fruit", 60)):
+        bpy.context.scene.cursor.location = axes.nodes[node]
+        assert bpy.ops.limber.from_cursor(stage="load", field=field) == {"FINISHED"}
+    assert bpy.context.scene.limber.load.fruit.count(";") == 1
+    assert bpy.ops.limber.load() == {"FINISHED"}
+    kept = properties.outcome_of(bpy.context.scene, stages["load"], str(folder))
+    assert kept["result"]["added_mass_kg"] == pytest.approx(0.2)
+    assert kept["result"]["cut_mass_kg"] > 0 and kept["result"]["sag_m"] > 0
+    out = tmp_path / "twig.xml"
+    assert bpy.ops.limber.export(output=str(out)) == {"FINISHED"}
+    assert "<mujoco" in out.read_text()
