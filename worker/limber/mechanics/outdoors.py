@@ -101,6 +101,12 @@ class LoadedOutdoors:
             self._forces -= lost[:, None] * model.gravity
         self.cut_mass = float(lost.sum())
 
+    @property
+    def dead_forces(self) -> np.ndarray:
+        """All of it as forces on the nodes that keep their direction [N], shape [node_count, 3]."""
+        added = self._model_under(1.0).mass_load - self._model.mass_load
+        return self._forces + added[:, None] * self._plain.gravity
+
     def with_young(self, factor: float) -> "LoadedOutdoors":
         """Return the same loads on a branch whose moduli are ``factor`` times as large."""
         other = copy.copy(self)

@@ -10,6 +10,7 @@ import numpy as np
 from limber.errors import InputError
 from limber.mechanics.dynamics.simulate import NewmarkSettings
 from limber.mechanics.grasp import pose_between
+from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
 from limber.mechanics.reduced.dynamics import ReducedStepper
 from limber.mechanics.reduced.model import ReducedModel
 from limber.mechanics.reduced.state import ReducedState, ReducedStaticSettings
@@ -124,6 +125,12 @@ class Answering:
         """Hang other forces on the branch."""
         self.held.set_loads(loads)
         self._choose()
+
+    def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
+        """Let weather act and cut twigs off; see :meth:`.HeldBranch.set_outdoors`."""
+        made = self.held.set_outdoors(loads)
+        self._choose()
+        return made
 
     def set_dynamics(self, on: bool) -> None:
         """Let the branch move in time, or answer with equilibria."""

@@ -127,6 +127,13 @@ class InteractiveSession:
         before; return the reply."""
         return self.request("loads", loads=list(loads))
 
+    def set_outdoors(self, **loads: Any) -> dict[str, Any]:
+        """Let wind (``wind_m_s``), ``snow_kg_m2`` and ``fruit`` act, and cut at ``cuts``.
+
+        They take the place of those before; see `limber.session.worker` for their form.
+        """
+        return self.request("outdoors", **loads)
+
     def set_dynamics(self, on: bool) -> dict[str, Any]:
         """Let the branch move in time, or answer with equilibria; return the reply."""
         return self.request("dynamics", on=on)

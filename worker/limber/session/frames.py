@@ -48,7 +48,7 @@ SLOTS = 3
 NUMBERS = ("id", "status", "is_trusted", "is_converged", "is_reached", "is_reduced", "energy_j",
            "force_x_n", "force_y_n", "force_z_n", "torque_x_nm", "torque_y_nm", "torque_z_nm",
            "delay_s", "kinetic_energy_j", "time_s", "greatest_strain", "strain_x_m", "strain_y_m",
-           "strain_z_m", "min_det_f", "gravity_on")
+           "strain_z_m", "min_det_f", "gravity_on", "sag_m")
 _NUMBER_COUNT = 32
 _GRASP_COLUMNS = 13
 _HEADER = 128
@@ -107,6 +107,7 @@ class Frame:
             where, on the branch as it is bent.
         min_det_f: Smallest volume relative to that at rest; at 0 the branch is torn inside out.
         gravity_on: Whether the branch bears its weight.
+        sag: How far what moved most along gravity has come down [m].
         grasps: All that is held.
         targets: Positions of the targets [m], shape [t, 3].
     """
@@ -130,6 +131,7 @@ class Frame:
     strain_place: np.ndarray
     min_det_f: float
     gravity_on: bool
+    sag: float
     grasps: tuple[HeldAt, ...] = ()
     targets: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
@@ -310,4 +312,4 @@ def _frame(sequence: int, numbers: np.ndarray, grasps: np.ndarray, targets: np.n
         bool(v["is_reduced"]), bool(v["is_trusted"]), bool(v["is_converged"]),
         bool(v["is_reached"]), v["energy_j"], v["kinetic_energy_j"], numbers[7:10],
         numbers[10:13], v["delay_s"], v["time_s"], v["greatest_strain"], numbers[17:20],
-        v["min_det_f"], bool(v["gravity_on"]), held, targets)
+        v["min_det_f"], bool(v["gravity_on"]), v["sag_m"], held, targets)

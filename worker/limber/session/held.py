@@ -10,9 +10,11 @@ from typing import Literal
 import numpy as np
 
 from limber.errors import InputError
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.grasp import RADIAN, Grasp, pose_between
 from limber.mechanics.loaded import LoadedBranch
 from limber.mechanics.model import BranchModel
+from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
 from limber.mechanics.reduced.model import as_control_points
 from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.strain import carried_strain
@@ -65,10 +67,11 @@ class HeldBranch:
 
     Args:
         loaded: The branch as it hangs, with its targets.
+        skeleton: Its axes, for wind, snow and cuts.
     """
 
-    def __init__(self, loaded: LoadedBranch):
-        self.loaded = loaded
+    def __init__(self, loaded: LoadedBranch, skeleton: Skeleton | None = None):
+        self.loaded, self._skeleton = loaded, skeleton
         self.model = model = loaded.model
         self.displacement = np.zeros_like(model.mesh.nodes)
         self.weights, self.young = as_control_points(model)
@@ -78,6 +81,8 @@ class HeldBranch:
         self.grasps: dict[int, Held] = {}
         self.gravity_on = model.hanging is not None
         self._hung: np.ndarray | None = None
+        self._weather: np.ndarray | None = None
+        self._is_gone = np.zeros(len(model.mesh.tets), bool)
         self._count = 0
         self._last: Answer | None = None
         self._strains = _AtVertices(model, self.surface)
@@ -178,14 +183,44 @@ class HeldBranch:
             forces[np.linalg.norm(self.model.mesh.nodes - place, axis=1).argmin()] += load.force_n
         self._hung = forces if loads else None
 
+    def set_outdoors(self, loads: Outdoors) -> LoadedOutdoors:
+        """Let wind, snow and fruit act, and cut off what lies beyond places, instead of before.
+
+        What is cut off keeps its shape and hangs on without weight: only what is left counts.
+
+        Raises:
+            InputError: a place is off the branch, or its axes are not known.
+        """
+        if self._skeleton is None:
+            raise InputError("The branch has no axes.", "Wind, snow and cuts go by them.",
+                             "Make it from a scan (limber reconstruct).")
+        made = LoadedOutdoors(self.model, self._skeleton, loads)
+        forces = made.dead_forces
+        self._weather = forces if forces.any() else None
+        self._is_gone = made.is_gone
+        return made
+
+    def vertices_gone(self) -> np.ndarray:
+        """Return the surface's vertices that are cut off, numbers [k]."""
+        kept = np.unique(self.model.mesh.tets[~self._is_gone])
+        return np.flatnonzero(~np.isin(self.surface, kept))
+
     @property
     def loads(self) -> np.ndarray | None:
         """Forces on the nodes besides what the hanging branch carries [N], None where there are
         none, shape [node_count, 3]."""
-        if self.gravity_on or self.model.hanging is None:
-            return self._hung
-        lifted = -self.model.mass_load[:, None] * self.model.gravity
-        return lifted if self._hung is None else lifted + self._hung
+        acting = [forces for forces in (self._hung, self._weather) if forces is not None]
+        if not self.gravity_on and self.model.hanging is not None:
+            acting.append(-self.model.mass_load[:, None] * self.model.gravity)
+        return sum(acting) if acting else None
+
+    def sag(self, answer: Answer) -> float:
+        """Return how far what moved most along gravity has come down [m], of what is left."""
+        size = float(np.linalg.norm(self.model.gravity))
+        down = self.model.gravity / size if size else np.array([0.0, 0.0, -1.0])
+        left = np.unique(self.model.mesh.tets[~self._is_gone])
+        moved = answer.displacement[left] @ down
+        return float(moved[np.abs(moved).argmax()])
 
     def way(self, number: int) -> float:
         """Return how far a grasp is from where it is wanted [m]; turns count as lengths."""
@@ -239,6 +274,7 @@ class HeldBranch:
     def strain(self, answer: Answer) -> tuple[np.ndarray, float, np.ndarray]:
         """Return strain about the vertices [v], the largest of all, and where it is [m]."""
         strains = self.model.largest_principal_strains(answer.displacement, self._carried)
+        strains[self._is_gone] = 0.0
         worst = int(strains.argmax())
         corners = self.model.mesh.tets[worst, :4]
         place = (self.model.mesh.nodes[corners] + answer.displacement[corners]).mean(axis=0)

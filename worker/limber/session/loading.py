@@ -7,7 +7,7 @@ from limber.mechanics.reduced.training import TrainingSettings
 from limber.progress import SILENT, Progress
 from limber.session.held import HeldBranch
 from limber.session.settings import SessionSettings
-from limber.stages.loading import load_branch
+from limber.stages.loading import load_branch, load_skeleton
 from limber.store import Branch
 
 
@@ -25,4 +25,6 @@ def load_held(folder: Path, settings: SessionSettings,
     Raises:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
     """
-    return HeldBranch(load_branch(Branch.open(folder), gravity=settings.gravity, progress=progress))
+    branch = Branch.open(folder)
+    axes = load_skeleton(branch) if branch.has("skeleton.swc") else None
+    return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes)

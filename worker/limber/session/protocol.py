@@ -116,6 +116,26 @@ class Loads(_Command):
     loads: list[Load] = Field(max_length=1000)
 
 
+class Fruit(BaseModel):
+    """A mass [kg] that hangs at a place [m] of the branch as it was scanned."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    point: _Vector
+    mass_kg: float = Field(gt=0, le=1000)
+
+
+class Weather(_Command):
+    """Wind, snow, fruit and pruning cuts, instead of those before; see `limber load`."""
+
+    command: Literal["outdoors"]
+    wind_m_s: tuple[_Component, _Component, _Component] = (0.0, 0.0, 0.0)
+    drag: float = Field(1.1, gt=0, le=5)
+    snow_kg_m2: float = Field(0.0, ge=0, le=1000)
+    fruit: list[Fruit] = Field([], max_length=1000)
+    cuts: list[_Vector] = Field([], max_length=1000)
+
+
 class Status(_Command):
     """Ask for grasps, gravity and who answers."""
 
@@ -128,7 +148,8 @@ class Close(_Command):
     command: Literal["close"]
 
 
-Command = (Hello | Grab | Release | Move | Gravity | Dynamics | Young | Loads | Status | Close)
+Command = (Hello | Grab | Release | Move | Gravity | Dynamics | Young | Loads | Weather | Status
+           | Close)
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="command")])
 
 

@@ -19,6 +19,10 @@ Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each 
   replace each other. It has no reply but its frame.
 - ``{"command": "loads", "loads": [{"vertex": 17, "force_n": [0, 0, -1]}]}``: forces that hang on
   the branch, instead of those before.
+- ``{"command": "outdoors", "wind_m_s": [4, 0, 0], "snow_kg_m2": 0, "drag": 1.1, "fruit": [{"point":
+  [x, y, z], "mass_kg": 0.2}], "cuts": [[x, y, z]]}``: wind, snow, fruit and cuts, instead of those
+  before; places are on the branch as it was scanned [m]. The reply says ``added_mass_kg``,
+  ``cut_mass_kg``, ``wind_force_n`` and ``gone``, the vertices that are cut off.
 - ``{"command": "gravity", "on": false}``: let the branch bear its weight, or not. It hangs where it
   was scanned; without weight it rises from there.
 - ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points; the
@@ -66,6 +70,8 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError, LimberError
+from limber.mechanics.added import PointMass
+from limber.mechanics.outdoors import Outdoors
 from limber.mechanics.reduced.strain import compile_kernels
 from limber.progress import Progress
 from limber.session import protocol
@@ -181,6 +187,10 @@ class Session:
                 answering.set_young(np.array(young))
             case protocol.Loads(loads=loads):
                 answering.set_loads(loads)
+            case protocol.Weather():
+                made = answering.set_outdoors(_outdoors(command))
+                return {"added_mass_kg": made.added_mass, "cut_mass_kg": made.cut_mass,
+                        "wind_force_n": made.wind_force, "gone": self.held.vertices_gone()}
             case protocol.Dynamics(on=on):
                 answering.set_dynamics(on)
             case protocol.Status():
@@ -221,7 +231,7 @@ class Session:
             is_converged=answer.is_converged, is_reached=answer.is_reached,
             is_reduced=answer.is_reduced, energy_j=answer.energy,
             kinetic_energy_j=answer.kinetic_energy, time_s=answer.time,
-            greatest_strain=greatest, gravity_on=held.gravity_on,
+            greatest_strain=greatest, sag_m=held.sag(answer), gravity_on=held.gravity_on,
             min_det_f=held.model.internal(answer.displacement).min_det_f,
             delay_s=time.monotonic() - asked_at, **numbers)
 
@@ -239,6 +249,11 @@ class Session:
                    "goal": held.goal} for number, held in self.held.grasps.items()]
         return {"grasps": grasps, "gravity_on": self.held.gravity_on, "young_pa": self.held.young,
                 "dynamics_on": self.answering.is_moving, "learning": self.answering.is_learning}
+
+
+def _outdoors(command: protocol.Weather) -> Outdoors:
+    return Outdoors(command.wind_m_s, command.drag, command.snow_kg_m2, tuple(
+        PointMass(one.point, one.mass_kg) for one in command.fruit), tuple(command.cuts))
 
 
 def _steady() -> None:

@@ -1,0 +1,71 @@
+"""Weather and cuts in a session: as `limber load` has them, on the branch that is held."""
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.mechanics.added import PointMass
+from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
+from limber.session import protocol
+from limber.session.held import HeldBranch
+from limber.session.loading import load_held
+from limber.session.settings import SessionSettings
+from limber.stages.loading import load_branch
+from limber.store import Branch
+
+AXIS = Skeleton.from_edges(np.column_stack([np.zeros((21, 2)), np.linspace(0, 0.2, 21)]),
+                           np.arange(-1, 20), np.linspace(0.004, 0.003, 21))
+
+
+@pytest.fixture()
+def held(branch_folder) -> HeldBranch:
+    return HeldBranch(load_branch(Branch.open(branch_folder)), AXIS)
+
+
+@pytest.mark.parametrize(("loads", "share"), [
+    (Outdoors(wind=(6.0, 0.0, 0.0)), 1e-5),
+    (Outdoors(fruit=(PointMass((0.0, 0.0, 0.19), 0.02),)), 1e-5),
+    # Of a cut the session keeps the stress that the whole weight had left: a second-order part.
+    (Outdoors(wind=(3.0, 1.0, 0.0), snow=5.0, cuts=((0.0, 0.0, 0.12),)), 0.03)])
+def test_the_branch_rests_where_load_says(held, loads, share):
+    """The full model with the same masses, winds and cuts comes to rest at the same place."""
+    held.set_outdoors(loads)
+    answer = held.solve()
+    model = held.loaded.model
+    other = LoadedOutdoors(model, AXIS, loads)
+    result = other.rest()
+    kept = np.unique(model.mesh.tets[~other.is_gone])
+    size = np.abs(result.displacement[kept]).max()
+    assert size > 1e-6
+    np.testing.assert_allclose(answer.displacement[kept], result.displacement[kept],
+                               atol=share * size)
+    _, greatest, _ = held.strain(answer)
+    assert greatest == pytest.approx(other.greatest_strain(result), rel=0.03)
+    down = -result.displacement[kept, 2]
+    assert held.sag(answer) == pytest.approx(down[np.abs(down).argmax()], rel=0.03)
+
+
+def test_what_is_cut_off_is_told_and_comes_back(held):
+    held.set_outdoors(Outdoors(cuts=((0.0, 0.0, 0.12),)))
+    gone = held.vertices_gone()
+    heights = held.model.mesh.nodes[held.surface][:, 2]
+    assert heights[gone].min() > 0.11 and set(np.flatnonzero(heights > 0.13)) <= set(gone)
+    held.set_outdoors(Outdoors())
+    assert held.loads is None and not len(held.vertices_gone())
+
+
+def test_without_axes_it_is_said(branch_folder):
+    with pytest.raises(InputError, match="no axes"):
+        load_held(branch_folder, SessionSettings()).set_outdoors(Outdoors(wind=(1.0, 0.0, 0.0)))
+
+
+def test_the_command_is_checked():
+    read = protocol.parse_command(
+        b'{"command": "outdoors", "id": 3, "wind_m_s": [1, 0, 0], '
+        b'"fruit": [{"point": [0, 0, 0.1], "mass_kg": 0.2}], "cuts": [[0, 0, 0.15]]}')
+    assert read.fruit[0].mass_kg == 0.2 and read.cuts == [(0.0, 0.0, 0.15)]
+    for wrong in (b'{"command": "outdoors", "fruit": [{"point": [0, 0, 0.1], "mass_kg": 0}]}',
+                  b'{"command": "outdoors", "wind_m_s": [1, 0]}'):
+        with pytest.raises(protocol.NotUnderstood):
+            protocol.parse_command(wrong)
