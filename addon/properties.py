@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 
 from . import compat
-from .stages import Field, Stage, stages
+from .stages import Field, SettingError, Stage, rows_of, stages
 
 OPEN = "use_"
 """Before the name of a field that may be left open: whether it is given."""
@@ -16,12 +16,29 @@ _LARGEST_INTEGER = 2**31 - 1
 _registered: list[type] = []
 
 
+def _set_fruit_mass(settings: bpy.types.PropertyGroup, _context) -> None:
+    """Give every fruit that hangs the mass of the slider."""
+    field = stages()["load"].fields["fruit"]
+    try:
+        rows = rows_of(field, settings.load.fruit)
+    except SettingError:
+        # Half typed by hand: it stays.
+        return
+    settings.load.fruit = field.shown([[*row[:3], settings.fruit_mass] for row in rows])
+
+
 class LimberSettings(bpy.types.PropertyGroup):
     """Choices of one scene; the settings of each stage stand below its name."""
 
     branch_folder: bpy.props.StringProperty(
         name="Branch folder", subtype="DIR_PATH", options=compat.PATH_OPTIONS,
         description="NAME.branch: where the worker keeps everything about one branch")
+    live_weight: bpy.props.BoolProperty(
+        name="Own weight", default=True,
+        description="While the branch is held: it bears its weight, and was scanned so")
+    fruit_mass: bpy.props.FloatProperty(
+        name="Mass of each fruit [kg]", default=0.1, min=0.0, soft_max=1.0, max=1000.0, precision=3,
+        description="Of the fruit that hang on the branch", update=_set_fruit_mass)
     show_expert: bpy.props.BoolProperty(
         name="Expert settings", description="Show also the settings that few need")
 

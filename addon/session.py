@@ -24,7 +24,9 @@ PROTOCOL = 2
 _MAGIC = b"LIMBPOS2"
 _HEADER_BYTES = 128
 _NUMBERS = ("id", "status", "is_trusted", "is_converged", "is_reached", "is_reduced", "energy_j",
-            "force_x_n", "force_y_n", "force_z_n")
+            "force_x_n", "force_y_n", "force_z_n", "torque_x_nm", "torque_y_nm", "torque_z_nm",
+            "delay_s", "kinetic_energy_j", "time_s", "greatest_strain", "strain_x_m", "strain_y_m",
+            "strain_z_m", "min_det_f", "gravity_on", "sag_m")
 _WHO = {1: "learning", 2: "reduced", 3: "full", 4: "untrusted"}
 _GRASP_COLUMNS = 13
 
@@ -39,6 +41,8 @@ class HeldFrame:
         who: ``learning``, ``reduced``, ``full`` or ``untrusted``: who answers.
         energy: [J], above the hanging branch.
         force: Of the gripper on the branch [N], three components.
+        strain: The greatest principal strain.
+        sag: How far what moved most along gravity has come down [m].
         positions: Of the surface's vertices [m], float32, shape [v, 3].
     """
 
@@ -47,6 +51,8 @@ class HeldFrame:
     who: str
     energy: float
     force: tuple[float, float, float]
+    strain: float
+    sag: float
     positions: np.ndarray
 
 
@@ -86,7 +92,7 @@ class FrameFile:
                 return HeldFrame(
                     sequence, int(numbers["id"]), _WHO.get(int(numbers["status"]), "untrusted"),
                     numbers["energy_j"], tuple(numbers[f"force_{axis}_n"] for axis in "xyz"),
-                    positions.reshape(-1, 3))
+                    numbers["greatest_strain"], numbers["sag_m"], positions.reshape(-1, 3))
         return None
 
     def close(self) -> None:
@@ -168,6 +174,18 @@ class Session:
     def release(self) -> int:
         """Let go of all."""
         return self._send(command="release")
+
+    def load(self, **loads: Any) -> int:
+        """Let wind, snow and fruit act and cut twigs off, instead of those before.
+
+        Returns:
+            The number that the reply carries; it says what is ``gone``.
+        """
+        return self._send(command="outdoors", **loads)
+
+    def weigh(self, on: bool) -> int:
+        """Let the branch bear its weight, or not."""
+        return self._send(command="gravity", on=on)
 
     def close(self) -> None:
         """End the session; safe to call again."""

@@ -74,7 +74,7 @@ class Field:
         if self.kind == "vector":
             return [flag, *map(number_text, value)]
         if self.kind == "rows":
-            return [text for row in _rows(self, value) for text in (flag, *map(number_text, row))]
+            return [text for row in rows_of(self, value) for text in (flag, *map(number_text, row))]
         if self.kind == "list":
             return [flag, ",".join(_items(value))]
         return [flag, number_text(value) if self.kind == "number" else str(value)]
@@ -85,7 +85,7 @@ class Field:
             return np.array_equal(np.asarray(value, np.float32),
                                   np.asarray(self.default, np.float32))
         if self.kind == "rows":
-            return _rows(self, value) == self.default
+            return rows_of(self, value) == self.default
         if self.kind == "list":
             return _items(value) == [number_text(item) if isinstance(item, float) else str(item)
                                      for item in self.default]
@@ -206,7 +206,8 @@ def _items(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
 
 
-def _rows(field: Field, text: str) -> list[list[float]]:
+def rows_of(field: Field, text: str) -> list[list[float]]:
+    """Return the rows of numbers that a panel keeps as text; SettingError where it is none."""
     try:
         rows = [[float(part) for part in row.split()] for row in text.split(";") if row.strip()]
     except ValueError as error:

@@ -1,6 +1,7 @@
 """Grab the branch where the mouse is and bend it by hand, the worker answering in real time."""
 
 import enum
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -15,10 +16,14 @@ from ..bridge import animation, meshes
 from ..session import HeldFrame, Session
 from ..stages import stages
 from ..worker import WorkerNotFound
+from . import live_loads
+from .live_loads import LiveLoads
 
 _INTERVAL_SECONDS = 1 / 60
-_KEYS = ("Drag: bend | Enter: keep for a simulation | S, G: keep as the plan's start, goal | "
-         "Esc: let go and leave")
+_KEYS = ("Drag: bend | F: hang a fruit | C: cut here | Enter: keep for a simulation | "
+         "S, G: keep as the plan's start, goal | Esc: let go and leave")
+_PLACED = {"F": "fruit", "C": "cut"}
+_PANEL_SECONDS = 0.2
 _NAVIGATION = {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "WHEELINMOUSE", "WHEELOUTMOUSE",
                "TRACKPADPAN", "TRACKPADZOOM", "MOUSEROTATE", "MOUSESMARTZOOM", "NDOF_MOTION"}
 _WORDS = {"learning": "full model, slow; learning", "reduced": "learnt model",
@@ -118,6 +123,8 @@ class LIMBER_OT_grab(bpy.types.Operator):
 
     def _begin(self, context) -> None:
         mesh = self._surface.data
+        self._loads = LiveLoads(context.scene, self._surface)
+        self._panel_drawn = 0.0
         self._rest = meshes.positions(mesh)
         self._mouse = self._waiting = None
         motion = self._surface.modifiers.get(animation.MODIFIER)
@@ -154,6 +161,9 @@ class LIMBER_OT_grab(bpy.types.Operator):
                 self._hold.is_dragged = False
         elif event.type == "MOUSEMOVE" and is_dragged:
             self._drag()
+        elif event.type in _PLACED and event.value == "PRESS":
+            if (seen := self._seen(context, self._mouse)) is not None:
+                self._loads.add(_PLACED[event.type], seen[0])
         elif event.type in {"ESC", "RIGHTMOUSE"} and event.value == "PRESS":
             self._end(context)
             return {"CANCELLED"}
@@ -165,7 +175,10 @@ class LIMBER_OT_grab(bpy.types.Operator):
     def _answered(self, context):
         """Take in what the session has said, show its newest frame, say where to go."""
         for told in self._session.poll():
-            if self._hold is not None and told.get("id") == self._hold.asked:
+            if self._loads.hear(told):
+                if self._loads.error:
+                    self.report({"WARNING"}, self._loads.error)
+            elif self._hold is not None and told.get("id") == self._hold.asked:
                 self._taken(told)
             elif told["event"] == "error":
                 self.report({"WARNING"}, str(told.get("message", "")))
@@ -178,7 +191,10 @@ class LIMBER_OT_grab(bpy.types.Operator):
         if frame is not None:
             self._frame = frame
             meshes.set_positions(self._surface.data, frame.positions)
-            self._area.tag_redraw()
+            self._loads.tell(frame)
+            self._region.tag_redraw()
+            self._draw_panel()
+        self._loads.step(self._session)
         if self._waiting is not None and self._session.hello:
             self._take(context, self._waiting)
             self._waiting = None
@@ -186,6 +202,12 @@ class LIMBER_OT_grab(bpy.types.Operator):
             self._session.move(self._hold.number, tuple(self._hold.wanted))
             self._hold.wanted = None
         return {"RUNNING_MODAL"}
+
+    def _draw_panel(self) -> None:
+        """Let the sidebar show the numbers, a few times a second."""
+        if time.monotonic() - self._panel_drawn > _PANEL_SECONDS:
+            self._panel_drawn = time.monotonic()
+            next(r for r in self._area.regions if r.type == "UI").tag_redraw()
 
     def _take(self, context, mouse: tuple[int, int]) -> None:
         """Hold the branch where the mouse is; what was held before is let go."""
@@ -210,6 +232,7 @@ class LIMBER_OT_grab(bpy.types.Operator):
         mesh = thing.data
         nearest = min(mesh.polygons[face].vertices,
                       key=lambda k: (mesh.vertices[k].co - place).length)
+        nearest = self._loads.vertex(nearest)
         return Vector(self._rest[nearest].tolist()), thing.matrix_world @ place
 
     def _taken(self, told: dict) -> None:
@@ -235,6 +258,10 @@ class LIMBER_OT_grab(bpy.types.Operator):
 
     def _keep(self, context, kept: Kept):
         hold = self._hold
+        if hold is None and kept is Kept.MOTION and self._loads.acts:
+            self._end(context, is_kept=True)
+            self.report({"INFO"}, "Kept: Material, Wind, Snow, Fruit, Cuts has these loads.")
+            return {"FINISHED"}
         if hold is None or hold.position is None or self._target is None:
             self.report({"WARNING"}, "Nothing is bent yet: press on the branch and drag.")
             return {"RUNNING_MODAL"}
@@ -246,7 +273,7 @@ class LIMBER_OT_grab(bpy.types.Operator):
                                      "press Enter to keep this grab for a simulation.")
             return {"RUNNING_MODAL"}
         target = tuple(self._target)
-        self._end(context)
+        self._end(context, is_kept=True)
         if kept is Kept.MOTION:
             moved = tuple(a - b for a, b in zip(target, hold.rest, strict=True))
             self._give(context, "simulate", grasp_point=tuple(hold.rest), move=moved)
@@ -267,7 +294,7 @@ class LIMBER_OT_grab(bpy.types.Operator):
 
     _target: Vector | None = None
 
-    def _end(self, context) -> None:
+    def _end(self, context, *, is_kept: bool = False) -> None:
         """Let go, and show the branch as it was shown before."""
         if self._session is None:
             return
@@ -277,6 +304,7 @@ class LIMBER_OT_grab(bpy.types.Operator):
         self._session.close()
         self._session = None
         if self._surface is not None:
+            self._loads.end(is_kept=is_kept)
             meshes.set_positions(self._surface.data, self._rest)
             if self._had_motion:
                 self._surface.modifiers[animation.MODIFIER].show_viewport = True
@@ -313,7 +341,8 @@ class LIMBER_OT_grab(bpy.types.Operator):
         if self._session is None or not self._session.hello:
             return ["loading the branch ..."], _NORMAL
         if self._frame is None or self._hold is None:
-            return ["press on the branch and drag"], _NORMAL
+            told = [] if self._frame is None or not self._loads.acts else live_loads.lines[:2]
+            return [*told, "press on the branch and drag"], _NORMAL
         force = Vector(self._frame.force).length
         words = _WORDS[self._frame.who]
         if self._frame.who == "learning" and self._session.message:

@@ -5,6 +5,7 @@ import json
 import bpy
 
 from .. import preferences, scene
+from ..operators import live_loads
 from .sidebar import SidebarPanel
 
 
@@ -29,7 +30,27 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         surface = scene.find_surface(context.scene)
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
+            _draw_live(self.layout, settings)
             _draw_legend(self.layout, json.loads(surface[scene.INFO_KEY]))
+
+
+def _draw_live(layout: bpy.types.UILayout, settings) -> None:
+    """Draw what acts on the branch while it is held, and what it does."""
+    header, body = layout.panel("limber_live_loads", default_closed=True)
+    header.label(text="Live Loads")
+    if body is None:
+        return
+    column = body.column(align=True)
+    for line in live_loads.lines or ["Grab the branch: these act at once"]:
+        column.label(text=line)
+    body.prop(settings, "live_weight")
+    body.prop(settings.load, "use_wind")
+    if settings.load.use_wind:
+        body.prop(settings.load, "wind")
+    body.prop(settings.load, "snow", slider=True)
+    body.prop(settings, "fruit_mass", slider=True)
+    body.prop(settings.load, "fruit")
+    body.prop(settings.load, "cut")
 
 
 def _draw_legend(layout: bpy.types.UILayout, info: dict) -> None:

@@ -134,5 +134,43 @@ def is_left():
     return not sessions()
 
 
+def key(kind, height):
+    """Point at the beam at a height and press a key."""
+    def step():
+        if not waited(0.3):
+            return False
+        state["place"] = pixels(Vector((0.0, 0.0, height)))
+        event("MOUSEMOVE")
+        return event(kind, "PRESS")
+    return step
+
+
+def blow():
+    load = bpy.context.scene.limber.load
+    load.use_wind, load.wind = True, (3.0, 0.0, 0.0)
+    bpy.context.scene.limber.fruit_mass = 0.02
+    return True
+
+
+def is_loaded_down():
+    """Cut at the top, with a fruit in the wind: it is bent, what is cut off is hidden."""
+    lines = sys.modules[f"{KEY}.operators.live_loads"].lines
+    if len(lines) < 3 or "Limber cut" not in surface().modifiers:
+        return False
+    bent = max((now - then).length for now, then in zip(tip()[1], state["before"], strict=True))
+    shown = surface().evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    load = bpy.context.scene.limber.load
+    seen["live"] = {"lines": list(lines), "bent_m": bent, "fruit": load.fruit, "cut": load.cut,
+                    "hidden": len(surface().data.vertices) - len(shown.vertices)}
+    return bent > 1e-3 and waited(1.0)
+
+
+def is_whole():
+    load = bpy.context.scene.limber.load
+    seen["after_live"] = [load.fruit, load.cut, "Limber cut" in surface().modifiers]
+    return waited(0.3) and not sessions()
+
+
 drive([open_result, begin, is_loaded, hover, press, drag, is_bent, picture("grab"), let_go, keep,
-       is_kept, undo, begin, is_loaded, escape, is_left], longest=100)
+       is_kept, undo, begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
+       is_loaded_down, picture("loads"), escape, is_whole, is_left], longest=100)

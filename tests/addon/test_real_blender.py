@@ -13,9 +13,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from limber.geometry.generated import generate_branch
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.store import Branch
 
 pytestmark = [pytest.mark.real_blender, pytest.mark.slow]
 
@@ -159,8 +162,14 @@ def test_interface(run, blender, environment, beam, tmp_path):
 
 
 def test_grab(run, blender, environment, beam, tmp_path):
-    """By mouse events: pressed and dragged the beam follows; kept, left, undone; Esc restores."""
+    """By mouse events: pressed and dragged the beam follows; kept, left, undone; Esc restores.
+
+    A fruit, a cut and wind act while it is held; left by Esc, the branch is whole again."""
     require_screen()
+    with Branch.open(beam.folder).stage("axes") as stage:
+        height = np.linspace(0.0, 0.6, 31)
+        Skeleton.from_edges(np.column_stack([0 * height, 0 * height, height]), np.arange(-1, 30),
+                            0.012 - height / 0.6 * 0.007).write_swc(stage.path("skeleton.swc"))
     seen = driven("drive_grab.py", blender, environment, tmp_path)
     assert seen["began"] == ["RUNNING_MODAL"]
     is_given, move, place, mode = seen["kept"]
@@ -170,7 +179,14 @@ def test_grab(run, blender, environment, beam, tmp_path):
     assert seen["restored"] < 1e-6 and seen["motion_shown"]
     assert not seen["after_undo"]
     assert seen["sessions_left"] == 0 and not Path(f"/proc/{seen['session']}").exists()
-    assert _colour_count(tmp_path / "grab.png") > 50
+    live = seen["live"]
+    assert live["hidden"] > 5 and live["bent_m"] > 1e-3
+    assert live["fruit"].endswith(" 0.02") and float(live["cut"].split()[2]) == pytest.approx(
+        0.45, abs=0.04)
+    assert live["lines"][0].startswith("Sag") and "hung 0.02 kg" in live["lines"][2]
+    assert seen["after_live"] == ["", "", False]
+    for name in ("grab", "loads"):
+        assert _colour_count(tmp_path / f"{name}.png") > 50
 
 
 def test_skeleton(run, blender, environment, tmp_path):

@@ -1,0 +1,125 @@
+"""Wind, snow, fruit, cuts and weight on a branch that a session holds, as the sliders say.
+
+The settings are those of the worker's stage `load`: what was tried by hand can then be run there.
+"""
+
+from typing import Any
+
+import bpy
+import numpy as np
+
+from .. import properties
+from ..session import HeldFrame, Session
+from ..stages import SettingError, rows_of, stages
+from ..steps import PLACES
+
+_MASK = "Limber cut"
+_NOTHING = {"wind_m_s": [0.0] * 3, "snow_kg_m2": 0.0, "fruit": [], "cuts": []}
+lines: list[str] = []
+"""What the panel says while a branch is held."""
+
+
+class LiveLoads:
+    """Brings what the sliders say to a session, one wish at a time.
+
+    Args:
+        scene: Whose settings they are.
+        surface: The branch; what is cut off is hidden there until :meth:`end`.
+    """
+
+    def __init__(self, scene: bpy.types.Scene, surface: bpy.types.Object):
+        self._scene, self._surface = scene, surface
+        self._group = properties.group_of(scene, stages()["load"])
+        self._before = {name: getattr(self._group, name) for name in PLACES}
+        self._sent = {**_NOTHING, "drag": self._group.drag}
+        self._weighs = True
+        self._asked: int | None = None
+        self._reply: dict[str, Any] = {}
+        self._left: np.ndarray | None = None
+        self.error = ""
+
+    @property
+    def acts(self) -> bool:
+        """Whether there is any load."""
+        return not self._weighs or any(
+            self._sent[name] != nothing for name, nothing in _NOTHING.items())
+
+    def vertex(self, number: int) -> int:
+        """Return which vertex of the branch one of those in sight is: cut ones are hidden."""
+        return number if self._left is None else int(self._left[number])
+
+    def step(self, session: Session) -> None:
+        """Say what has changed, unless the last wish is not answered yet."""
+        if self._asked is not None or not session.hello:
+            return
+        if self._scene.limber.live_weight != self._weighs:
+            self._weighs = self._scene.limber.live_weight
+            session.weigh(self._weighs)
+        try:
+            wanted = self._wanted()
+        except SettingError:
+            # Half typed: what was said before still acts.
+            return
+        if wanted != self._sent:
+            self._sent, self._asked = wanted, session.load(**wanted)
+
+    def hear(self, told: dict[str, Any]) -> bool:
+        """Take a reply or an error; returns whether it was for us."""
+        if self._asked is None or told.get("id") != self._asked:
+            return False
+        self._asked = None
+        if told["event"] == "error":
+            self.error = str(told.get("message", ""))
+        else:
+            self.error, self._reply = "", told
+            self._hide(told.get("gone") or [])
+        return True
+
+    def add(self, name: str, place) -> None:
+        """Hang a fruit at a place [m] of the branch as scanned, or cut there."""
+        rest = (self._scene.limber.fruit_mass,) if name == "fruit" else PLACES[name]
+        row = stages()["load"].fields[name].shown([[*map(float, place), *rest]])
+        given = getattr(self._group, name)
+        setattr(self._group, name, f"{given}; {row}" if given.strip() else row)
+
+    def tell(self, frame: HeldFrame) -> None:
+        """Write down for the panel what the loads do."""
+        lines[:] = [f"Sag {1000 * frame.sag:.3g} mm",
+                    f"Greatest strain {100 * frame.strain:.3g} %"]
+        if self._reply.get("wind_force_n"):
+            force = sum(value * value for value in self._reply["wind_force_n"]) ** 0.5
+            lines.append(f"Wind {force:.3g} N, hung {self._reply['added_mass_kg']:.3g} kg, "
+                         f"cut {1000 * self._reply['cut_mass_kg']:.3g} g")
+        if self.error:
+            lines.append(self.error)
+
+    def end(self, *, is_kept: bool) -> None:
+        """Show all of the branch again; fruit and cuts go where they are not kept."""
+        lines.clear()
+        if not is_kept:
+            for name, text in self._before.items():
+                setattr(self._group, name, text)
+        self._hide([])
+
+    def _wanted(self) -> dict[str, Any]:
+        group, fields = self._group, stages()["load"].fields
+        return {"wind_m_s": list(group.wind) if group.use_wind else [0.0] * 3,
+                "drag": group.drag, "snow_kg_m2": group.snow,
+                "fruit": [{"point": row[:3], "mass_kg": row[3]}
+                          for row in rows_of(fields["fruit"], group.fruit) if row[3] > 0],
+                "cuts": rows_of(fields["cut"], group.cut)}
+
+    def _hide(self, vertices: list[int]) -> None:
+        surface = self._surface
+        old, group = surface.modifiers.get(_MASK), surface.vertex_groups.get(_MASK)
+        if old is not None:
+            surface.modifiers.remove(old)
+        if group is not None:
+            surface.vertex_groups.remove(group)
+        count = len(surface.data.vertices)
+        known = [int(number) for number in vertices if 0 <= number < count]
+        self._left = np.delete(np.arange(count), known) if known else None
+        if known:
+            surface.vertex_groups.new(name=_MASK).add(known, 1.0, "REPLACE")
+            mask = surface.modifiers.new(_MASK, "MASK")
+            mask.vertex_group, mask.invert_vertex_group = _MASK, True
