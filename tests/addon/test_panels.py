@@ -108,7 +108,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct", "limber.skeleton"]),
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
     ("material", ["limber.color_by", "limber.simulate", "limber.load"]),
-    ("pulls", ["limber.import_pull", "limber.virtual_pull"]),
+    ("pulls", ["limber.import_pull", "limber.virtual_pull", "limber.export_pull"]),
     ("estimate", ["limber.estimate", "limber.swing", "limber.predict"]),
     ("goal", ["limber.energy", "limber.target"]), ("plan", ["limber.plan"]),
     ("robot", ["limber.execute"]),
