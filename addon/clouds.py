@@ -1,5 +1,6 @@
 """Reads the points of a scan, to show them; the worker reads the file itself."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,10 @@ _PLY_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int":
               "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4",
               "float64": "f8"}
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+
+
+_LINES = 20_000
+"""Lines of text that are read at a stretch: numpy holds the interpreter meanwhile."""
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -34,8 +39,18 @@ def _read_text(path: Path) -> np.ndarray:
         if not first:
             raise ValueError("it is empty")
         delimiter = next((mark for mark in ",;" if mark in first), None)
-    skipped = 0 if _is_numbers(first, delimiter) else 1
-    return np.loadtxt(path, delimiter=delimiter, skiprows=skipped, usecols=(0, 1, 2), ndmin=2)
+        lines = itertools.chain([first], stream) if _is_numbers(first, delimiter) else stream
+        return _rows(lines, delimiter=delimiter, usecols=(0, 1, 2))
+
+
+def _rows(lines, **how) -> np.ndarray:
+    """Return numbers of lines of text, a part at a time, shape [n, columns]."""
+    parts = []
+    lines = iter(lines)
+    while part := list(itertools.islice(lines, _LINES)):
+        if any(line.strip() for line in part):
+            parts.append(np.loadtxt(part, ndmin=2, **how))
+    return np.vstack(parts) if parts else np.empty((0, 3))
 
 
 def _is_numbers(line: str, delimiter: str | None) -> bool:
@@ -49,7 +64,9 @@ def _read_ply(path: Path) -> np.ndarray:
     with open(path, "rb") as stream:
         order, count, columns = _read_ply_header(stream)
         if order == "=":
-            rows = np.loadtxt(stream, max_rows=count, ndmin=2)
+            rows = _rows(itertools.islice(stream, count))
+            if len(rows) < count:
+                raise ValueError("it is cut short")
             names = [name for name, _ in columns]
             return rows[:, [names.index(axis) for axis in "xyz"]]
         kind = np.dtype([(name, order + code) for name, code in columns])

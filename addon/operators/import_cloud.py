@@ -1,16 +1,17 @@
 """Import a scan, to look at it: from the tab, from File > Import, or dropped into a view."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import bpy
-import numpy as np
 
-from .. import branch_folder, clouds
+from .. import branch_folder, scans
 from ..bridge import meshes
 from ..scene import OFFSET_KEY, SCAN_KEY, add_object
 from .viewing import look_at
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+_INTERVAL_SECONDS = 0.05
 _KINDS = (".ply", ".xyz", ".txt", ".csv")
 
 
@@ -24,51 +25,65 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{kind}" for kind in _KINDS),
                                           options={"HIDDEN"})
 
+    _reading: scans.Reading | None = None
+    _timer = None
+    _is_from_user = False
+
     def invoke(self, context, event):
+        self._is_from_user = not bpy.app.background and context.window is not None
         if not self.filepath:
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}
         return self.execute(context)
 
     def execute(self, context):
-        settings = context.scene.limber
-        path = Path(bpy.path.abspath(self.filepath or settings.reconstruct.cloud))
+        path = self._path(context)
+        if not self._is_from_user:
+            return self._show(context, lambda: scans.read_scan(path))
+        # The interface goes on while the points are read.
+        self._reading = scans.Reading(path)
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(_INTERVAL_SECONDS, window=context.window)
+        manager.modal_handler_add(self)
+        context.workspace.status_text_set(f"Reading {path.name} ...")
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        if event.type != "TIMER" or not self._reading.is_done:
+            return {"PASS_THROUGH"}
+        self.cancel(context)
+        return self._show(context, self._reading.scan)
+
+    def cancel(self, context):
+        """Blender closes or loads another file: what is being read is shown nowhere."""
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+            context.workspace.status_text_set(None)
+
+    def _path(self, context) -> Path:
+        return Path(bpy.path.abspath(self.filepath or context.scene.limber.reconstruct.cloud))
+
+    def _show(self, context, read: Callable[[], scans.Scan]):
+        settings, path = context.scene.limber, self._path(context)
         try:
-            points = clouds.read_points(path)
-            offset = _offset(points)
-            mesh = meshes.new_mesh(path.stem, points - offset)
-            folder = self._folder(context, path)
-        except ValueError as error:
+            scan = read()
+            mesh = meshes.new_mesh(path.stem, scan.points)
+        except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         cloud = add_object(context.scene.collection, f"{path.stem} scan", mesh)
-        cloud[SCAN_KEY] = branch_folder.file_sha256(path)
-        if offset.any():
-            cloud[OFFSET_KEY] = [float(value) for value in offset]
+        cloud[SCAN_KEY] = scan.sha256
+        if scan.offset.any():
+            cloud[OFFSET_KEY] = [float(value) for value in scan.offset]
         cloud.scale = [_METRES[settings.reconstruct.unit]] * 3
         settings.reconstruct.cloud = str(path)
-        settings.branch_folder = str(folder)
+        chosen = settings.branch_folder
+        if not (chosen and branch_folder.is_of(Path(bpy.path.abspath(chosen)), scan.sha256)):
+            settings.branch_folder = str(scan.folder)
         look_at(context, cloud)
-        self.report({"INFO"}, f"{len(points)} points")
+        self.report({"INFO"}, f"{len(scan.points)} points")
         return {"FINISHED"}
-
-    def _folder(self, context, path: Path) -> Path:
-        """Return the branch folder of the scan: the one that is set if it is its own."""
-        chosen = context.scene.limber.branch_folder
-        if chosen and branch_folder.is_of(Path(bpy.path.abspath(chosen)),
-                                          branch_folder.file_sha256(path)):
-            return Path(chosen)
-        return branch_folder.folder_for(path)
-
-
-def _offset(points: np.ndarray) -> np.ndarray:
-    """Return what to take off the points [n, 3]: map coordinates would lose their last digits.
-
-    A viewport has single precision. Whole numbers, so that nothing is lost by taking them off.
-    """
-    middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2)
-    extent = np.ptp(points, axis=0).max()
-    return middle if np.abs(middle).max() > 100 * max(extent, 1e-9) else np.zeros(3)
 
 
 class LIMBER_FH_cloud(bpy.types.FileHandler):

@@ -1,0 +1,66 @@
+"""A scan as it is shown, and read by a thread while the interface goes on. No bpy here.
+
+A million points take most of a second.
+"""
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from . import branch_folder, clouds
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A scan to be shown.
+
+    Attributes:
+        points: In its own unit, ``offset`` taken off, float32, shape [n, 3].
+        offset: Whole numbers [3]: map coordinates would lose their last digits in a viewport.
+        sha256: Of the file. folder: The branch folder that is, or would be, its own.
+    """
+
+    points: np.ndarray
+    offset: np.ndarray
+    sha256: str
+    folder: Path
+
+
+def read_scan(path: Path) -> Scan:
+    """Read what is shown of a scan; ValueError as :func:`.clouds.read_points`."""
+    points = clouds.read_points(path)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = np.round((low + high) / 2)
+    is_far = np.abs(middle).max() > 100 * max((high - low).max(), 1e-9)
+    offset = middle if is_far else np.zeros(3)
+    return Scan((points - offset).astype(np.float32), offset, branch_folder.file_sha256(path),
+                branch_folder.folder_for(path))
+
+
+class Reading:
+    """A scan that is being read by a thread; look at ``is_done``, then ask for the scan."""
+
+    def __init__(self, path: Path):
+        self._found: Scan | None = None
+        self._error: ValueError | OSError | None = None
+        self._thread = threading.Thread(target=self._read, args=(path,), daemon=True)
+        self._thread.start()
+
+    @property
+    def is_done(self) -> bool:
+        return not self._thread.is_alive()
+
+    def scan(self) -> Scan:
+        """Return the scan, once it is done; raises what reading it raised."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._found
+
+    def _read(self, path: Path) -> None:
+        try:
+            self._found = read_scan(path)
+        except (ValueError, OSError) as error:
+            self._error = error
