@@ -13,7 +13,8 @@ from pathlib import Path
 from limber.plain import plain
 from limber.progress import BarSink, Progress
 
-NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans", "worker")
+NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans", "viewport",
+         "worker")
 
 
 @dataclass(frozen=True)
