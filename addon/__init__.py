@@ -18,6 +18,7 @@ MODULES = (
     "operators.play",
     "operators.grab",
     "operators.skeleton",
+    "operators.sharing",
     "operators.cancel_job",
     "operators.check_worker",
     "panels.job",
@@ -25,6 +26,7 @@ MODULES = (
     "panels.steps",
     "panels.play",
     "skeleton_overlay",
+    "viewport_legend",
     "relative_paths",
     "command",
 )

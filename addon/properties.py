@@ -39,6 +39,8 @@ class LimberSettings(bpy.types.PropertyGroup):
     fruit_mass: bpy.props.FloatProperty(
         name="Mass of each fruit [kg]", default=0.1, min=0.0, soft_max=1.0, max=1000.0, precision=3,
         description="Of the fruit that hang on the branch", update=_set_fruit_mass)
+    show_legend: bpy.props.BoolProperty(
+        name="Legend", default=True, description="Write in the 3D view what the colours mean")
     show_expert: bpy.props.BoolProperty(
         name="Expert settings", description="Show also the settings that few need")
 

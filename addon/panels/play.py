@@ -30,6 +30,9 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
             shown = round(animation.cache_frame(surface, context.scene.frame_current))
             number = min(max(shown, 0), last)
             self.layout.label(text=f"Energy {1000 * energies[number]:.3g} mJ")
+        row = self.layout.row(align=True)
+        row.operator("limber.export_motion", icon="EXPORT")
+        row.operator("limber.turntable", icon="CAMERA_DATA")
 
 
 @persistent

@@ -1,0 +1,93 @@
+"""The legend of the branch's colours in the 3D view: title, bar, values with their unit."""
+
+import json
+
+import blf
+import bpy
+import gpu
+from gpu_extras.batch import batch_for_shader
+
+from . import scene
+
+_MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
+_GAP = 60  # above the lower edge: what Blender writes there stays readable
+_handle: list = []
+
+
+def shown_scale(surface: bpy.types.Object) -> dict | None:
+    """Return the scale of the scalar that colours the branch now, None where nothing does."""
+    active = surface.data.color_attributes.active_color
+    scalars = json.loads(surface.get(scene.INFO_KEY, "{}")).get("scalars", {})
+    return scalars.get(active.name.removesuffix("_color")) if active is not None else None
+
+
+def bar(stops: list[list[float]], x: float, y: float, width: float, height: float,
+        ) -> tuple[list, list, list]:
+    """Return corners, their colours and triangles of a bar of rows ``[position, r, g, b]``."""
+    places, colours, triangles = [], [], []
+    for position, *colour in stops:
+        places += [(x, y + position * height), (x + width, y + position * height)]
+        colours += [(*(_display(value) for value in colour), 1.0)] * 2
+    for k in range(0, len(places) - 2, 2):
+        triangles += [(k, k + 1, k + 2), (k + 1, k + 3, k + 2)]
+    return places, colours, triangles
+
+
+def _display(value: float) -> float:
+    """Return a linear part of a colour as sRGB screens take it."""
+    return 12.92 * value if value < 0.0031308 else 1.055 * value ** (1 / 2.4) - 0.055
+
+
+def _draw() -> None:
+    context = bpy.context
+    surface = scene.find_surface(context.scene)
+    if (surface is None or not context.scene.limber.show_legend or not surface.visible_get()
+            or not context.space_data.overlay.show_overlays):
+        return
+    shading = context.space_data.shading
+    if shading.type == "WIREFRAME" or (shading.type == "SOLID" and shading.color_type != "VERTEX"):
+        return
+    scale = shown_scale(surface)
+    if scale is None:
+        return
+    size = context.preferences.system.ui_scale
+    x = _left(context) + _MARGIN * size
+    y = _GAP * size
+    places, colours, triangles = bar(scale["stops"], x, y, _WIDTH * size, _HEIGHT * size)
+    shader = gpu.shader.from_builtin("SMOOTH_COLOR")
+    gpu.state.blend_set("ALPHA")
+    batch_for_shader(shader, "TRIS", {"pos": places, "color": colours},
+                     indices=triangles).draw(shader)
+    gpu.state.blend_set("NONE")
+    _write(scale, x, y, size)
+
+
+def _write(scale: dict, x: float, y: float, size: float) -> None:
+    blf.size(0, _TEXT * size)
+    blf.color(0, 1.0, 1.0, 1.0, 1.0)
+    blf.enable(0, blf.SHADOW)
+    blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
+    ticks = scale["ticks"]
+    for number, tick in enumerate(ticks):
+        share = number / max(len(ticks) - 1, 1)
+        blf.position(0, x + (_WIDTH + 6) * size, y + (share * _HEIGHT - 4) * size, 0)
+        blf.draw(0, str(tick))
+    blf.position(0, x, y + (_HEIGHT + 10) * size, 0)
+    blf.draw(0, scale["title"])
+    blf.disable(0, blf.SHADOW)
+
+
+def _left(context: bpy.types.Context) -> float:
+    """The toolbar lies upon the view; the legend stands beside it."""
+    tools = next((region for region in context.area.regions if region.type == "TOOLS"), None)
+    return 0.0 if tools is None or tools.width <= 1 else float(tools.width)
+
+
+def register() -> None:
+    if not bpy.app.background:
+        _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
+
+
+def unregister() -> None:
+    while _handle:
+        bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")

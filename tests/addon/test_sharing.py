@@ -1,0 +1,75 @@
+"""The motion in other programs' files, the turntable, and the legend of the view."""
+
+import importlib
+import math
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture()
+def opened(bpy, registered, beam):
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    return importlib.import_module("limber_addon.scene").find_surface(bpy.context.scene)
+
+
+@pytest.mark.parametrize("kind", [".abc", ".usdc"])
+def test_the_motion_is_in_the_file(bpy, opened, beam, tmp_path, kind):
+    """Read back, the branch is at each frame where it was; what was selected still is."""
+    path = tmp_path / f"motion{kind}"
+    other = bpy.data.objects["Grasp 1"]
+    for thing in bpy.context.view_layer.objects:
+        thing.select_set(thing is other)
+    assert bpy.ops.limber.export_motion(filepath=str(path)) == {"FINISHED"}
+    assert list(bpy.context.selected_objects) == [other]
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    if kind == ".abc":
+        bpy.ops.wm.alembic_import(filepath=str(path), as_background_job=False)
+    else:
+        bpy.ops.wm.usd_import(filepath=str(path))
+    (thing,) = [thing for thing in bpy.data.objects if thing.type == "MESH"]
+    for number in (0, len(beam.frames) - 1):
+        bpy.context.scene.frame_set(1 + number)
+        mesh = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        places = np.array([thing.matrix_world @ vertex.co for vertex in mesh.vertices])
+        np.testing.assert_allclose(places, beam.frames[number], atol=1e-5)
+
+
+def test_a_kind_that_is_none_is_refused(bpy, opened, tmp_path):
+    with pytest.raises(RuntimeError, match=r"name it \.abc"):
+        bpy.ops.limber.export_motion(filepath=str(tmp_path / "motion.fbx"))
+
+
+def test_the_turntable_goes_round_and_sees_the_branch(bpy, opened):
+    """Once round in its frames, at an even speed; every corner of the branch is in the picture."""
+    from bpy_extras.object_utils import world_to_camera_view
+
+    scene = bpy.context.scene
+    end = scene.frame_end
+    assert bpy.ops.limber.turntable(frames=40) == {"FINISHED"}
+    assert bpy.ops.limber.turntable(frames=40) == {"FINISHED"}
+    assert len(bpy.data.collections["Turntable"].objects) == 2
+    assert scene.frame_end == end, "the scene's frames are the user's"
+    pivot = bpy.data.objects["Turntable pivot"]
+    for frame in (1, 11, 26, 41):
+        scene.frame_set(frame)
+        bpy.context.view_layer.update()
+        assert pivot.rotation_euler[2] == pytest.approx(2 * math.pi * (frame - 1) / 40, abs=1e-3)
+        for corner in opened.bound_box:
+            seen = world_to_camera_view(scene, scene.camera, opened.matrix_world @ type(
+                scene.camera.location)(corner))
+            assert 0 < seen.x < 1 and 0 < seen.y < 1 and seen.z > 0
+
+
+def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
+    """Its scale follows the button; the bar has a row a stop, in the colours of the screen."""
+    legend = importlib.import_module("limber_addon.viewport_legend")
+    assert legend.shown_scale(opened)["title"] == "Young's modulus"
+    bpy.ops.limber.color_by(scalar="strain_energy")
+    scale = legend.shown_scale(opened)
+    assert "energy" in scale["title"]
+    places, colours, triangles = legend.bar([[0, 0, 0, 0], [0.5, 1, 0, 0], [1, 0.2, 0.2, 0.2]],
+                                            10, 20, 5, 100)
+    assert places[0] == (10, 20) and places[-1] == (15, 120) and len(triangles) == 4
+    assert colours[2] == pytest.approx((1, 0, 0, 1))
+    assert colours[4][0] == pytest.approx(0.4845, abs=1e-3)
