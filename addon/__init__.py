@@ -27,6 +27,7 @@ MODULES = (
     "panels.play",
     "skeleton_overlay",
     "viewport_legend",
+    "cloud_overlay",
     "relative_paths",
     "command",
 )

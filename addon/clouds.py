@@ -33,6 +33,20 @@ def read_points(path: Path) -> np.ndarray:
     return points
 
 
+def read_colours(path: Path) -> np.ndarray | None:
+    """Return red, green, blue of a PLY file's points as bytes, shape [n, 3]; None without.
+
+    Colours of other kinds of files, and those of ASCII files, are left to the worker.
+    """
+    if path.suffix.lower() != ".ply":
+        return None
+    rows = _binary_rows(path)
+    names = ("red", "green", "blue")
+    if rows is None or any(rows.dtype.fields.get(name, (None,))[0] != np.uint8 for name in names):
+        return None
+    return np.column_stack([rows[name] for name in names])
+
+
 def _read_text(path: Path) -> np.ndarray:
     with open(path, encoding="utf-8", errors="replace") as stream:
         first = stream.readline()
@@ -61,22 +75,31 @@ def _is_numbers(line: str, delimiter: str | None) -> bool:
 
 
 def _read_ply(path: Path) -> np.ndarray:
+    rows = _binary_rows(path)
+    if rows is not None:
+        return np.column_stack([rows[axis].astype(float) for axis in "xyz"])
+    with open(path, "rb") as stream:
+        _, count, columns = _read_ply_header(stream)
+        values = _rows(itertools.islice(stream, count))
+    if len(values) < count:
+        raise ValueError("it is cut short")
+    names = [name for name, _ in columns]
+    return values[:, [names.index(axis) for axis in "xyz"]]
+
+
+def _binary_rows(path: Path) -> np.ndarray | None:
+    """Return the vertices of a binary PLY file as a table; None of one in ASCII."""
     with open(path, "rb") as stream:
         order, count, columns = _read_ply_header(stream)
         if order == "=":
-            rows = _rows(itertools.islice(stream, count))
-            if len(rows) < count:
-                raise ValueError("it is cut short")
-            names = [name for name, _ in columns]
-            return rows[:, [names.index(axis) for axis in "xyz"]]
+            return None
         kind = np.dtype([(name, order + code) for name, code in columns])
         if count * kind.itemsize > path.stat().st_size:
             raise ValueError("it is cut short")
         content = stream.read(count * kind.itemsize)
     if len(content) < count * kind.itemsize:
         raise ValueError("it is cut short after its header")
-    rows = np.frombuffer(content, kind)
-    return np.column_stack([rows[axis].astype(float) for axis in "xyz"])
+    return np.frombuffer(content, kind)
 
 
 def _read_ply_header(stream) -> tuple[str, int, list[tuple[str, str]]]:

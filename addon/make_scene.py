@@ -81,6 +81,7 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     shown = scenes.show_branch(scene, data, color)
     camera = studio.set_up_studio(scene, data, studio.Picture(width))
     legend.add_legend(scene, camera, data, shown)
+    _look_through_camera()
     _say(progress=0.2, message="scene built")
     target = picture_path or scene_path.with_suffix(".png")
     scene.render.filepath = animation.shown_path(target)
@@ -92,6 +93,16 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
         bpy.ops.render.render(write_still=True)
     return {"object_count": len(scene.objects), "frame_count": shown.frame_count,
             "blender": bpy.app.version_string}
+
+
+def _look_through_camera() -> None:
+    """Let every 3D view of the file open on the branch, in its colours."""
+    for screen in bpy.data.screens:
+        for area in screen.areas:
+            if area.type == "VIEW_3D":
+                space = area.spaces.active
+                space.region_3d.view_perspective = "CAMERA"
+                space.shading.color_type = "VERTEX"
 
 
 def _frame_rate(frames: dict | None) -> int:

@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from . import compat
+from .scene import SCAN_KEY
 from .stages import Field, SettingError, Stage, rows_of, stages
 
 OPEN = "use_"
@@ -27,6 +28,12 @@ def _set_fruit_mass(settings: bpy.types.PropertyGroup, _context) -> None:
     settings.load.fruit = field.shown([[*row[:3], settings.fruit_mass] for row in rows])
 
 
+def _show_scan(settings: bpy.types.PropertyGroup, _context) -> None:
+    for thing in settings.id_data.objects:
+        if SCAN_KEY in thing:
+            thing.hide_viewport = not settings.show_scan
+
+
 class LimberSettings(bpy.types.PropertyGroup):
     """Choices of one scene; the settings of each stage stand below its name."""
 
@@ -39,6 +46,9 @@ class LimberSettings(bpy.types.PropertyGroup):
     fruit_mass: bpy.props.FloatProperty(
         name="Mass of each fruit [kg]", default=0.1, min=0.0, soft_max=1.0, max=1000.0, precision=3,
         description="Of the fruit that hang on the branch", update=_set_fruit_mass)
+    show_scan: bpy.props.BoolProperty(
+        name="Scan", default=True, update=_show_scan,
+        description="Show imported scans; they lie over the branch that was made of them")
     show_legend: bpy.props.BoolProperty(
         name="Legend", default=True, description="Write in the 3D view what the colours mean")
     show_expert: bpy.props.BoolProperty(

@@ -1,7 +1,8 @@
-"""Keeps the motion's files relative to the .blend, so that both can move together.
+"""Keeps branch folders and motions relative to the .blend, so that all can move together.
 
 A result opened before the first save has an absolute path: Blender cannot know better then. It is
-made relative when the file is saved; what is relative already, Blender itself keeps right.
+made relative when the file is saved. What is relative already, Blender itself keeps right in a
+modifier; of the settings and of what a collection shows, it does not know.
 """
 
 from pathlib import Path
@@ -10,6 +11,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from .bridge import animation
+from .scene import FOLDER_KEY
 
 
 @persistent
@@ -21,6 +23,18 @@ def _before_saving(path: str, *_) -> None:
         modifier = thing.modifiers.get(animation.MODIFIER)
         if modifier is not None:
             modifier.filepath = animation.relative_path(modifier.filepath, Path(path).parent)
+    for collection in bpy.data.collections:
+        if FOLDER_KEY in collection:
+            collection[FOLDER_KEY] = _moved(collection[FOLDER_KEY], Path(path).parent)
+    for scene in bpy.data.scenes:
+        settings = scene.limber
+        settings.branch_folder = _moved(settings.branch_folder, Path(path).parent)
+        settings.reconstruct.cloud = _moved(settings.reconstruct.cloud, Path(path).parent)
+
+
+def _moved(value: str, folder: Path) -> str:
+    """Return a path as a file in ``folder`` has it: from where the file was before, if relative."""
+    return animation.relative_path(bpy.path.abspath(value), folder) if value else value
 
 
 def register() -> None:

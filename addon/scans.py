@@ -19,6 +19,7 @@ class Scan:
     Attributes:
         points: In its own unit, ``offset`` taken off, float32, shape [n, 3].
         offset: Whole numbers [3]: map coordinates would lose their last digits in a viewport.
+        colours: Red, green, blue, alpha from 0 to 1 as on a screen, float32, [n, 4], if it has any.
         sha256: Of the file. folder: The branch folder that is, or would be, its own.
     """
 
@@ -26,6 +27,7 @@ class Scan:
     offset: np.ndarray
     sha256: str
     folder: Path
+    colours: np.ndarray | None = None
 
 
 def read_scan(path: Path) -> Scan:
@@ -35,8 +37,11 @@ def read_scan(path: Path) -> Scan:
     middle = np.round((low + high) / 2)
     is_far = np.abs(middle).max() > 100 * max((high - low).max(), 1e-9)
     offset = middle if is_far else np.zeros(3)
+    colours = clouds.read_colours(path)
+    if colours is not None:
+        colours = np.column_stack([colours / np.float32(255), np.ones(len(colours), np.float32)])
     return Scan((points - offset).astype(np.float32), offset, branch_folder.file_sha256(path),
-                branch_folder.folder_for(path))
+                branch_folder.folder_for(path), colours)
 
 
 class Reading:

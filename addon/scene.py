@@ -82,14 +82,21 @@ def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
     return None
 
 
-def place_scans(scene: bpy.types.Scene, data: SceneData) -> None:
-    """Put imported scans to where the branch made of them is: it was set upright and to 0."""
+def place_scans(scene: bpy.types.Scene, data: SceneData) -> int:
+    """Put imported scans to where the branch made of them is: it was set upright and to 0.
+
+    Returns:
+        How many there are.
+    """
+    count = 0
     for thing in scene.objects:
         if thing.get(SCAN_KEY) == data.info["source"].get("sha256", ""):
             # In double precision: offset and alignment take far places off each other.
             matrix = np.array(data.info["alignment"], float)
             matrix[:3, 3] += matrix[:3, :3] @ np.array(thing.get(OFFSET_KEY, (0.0,) * 3))
             thing.matrix_world = Matrix(matrix.tolist())
+            count += 1
+    return count
 
 
 def color_by(surface: bpy.types.Object, name: str) -> None:
@@ -157,8 +164,8 @@ def _remove_shown(scene: bpy.types.Scene, name: str, folder: Path) -> _Before:
     for collection in list(scene.collection.children):
         if FOLDER_KEY not in collection:
             continue
-        before = Path(bpy.path.abspath(collection[FOLDER_KEY]))
-        if before == folder or (collection[NAME_KEY] == name and not before.is_dir()):
+        before = Path(bpy.path.abspath(collection[FOLDER_KEY])).resolve()
+        if before == folder.resolve() or (collection[NAME_KEY] == name and not before.is_dir()):
             for thing in list(collection.objects):
                 mesh = thing.data if thing.type == "MESH" else None
                 if mesh is not None and skeletons.NODES_KEY in mesh:

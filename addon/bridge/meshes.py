@@ -111,6 +111,14 @@ def set_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
     mesh.update_tag()
 
 
+def set_screen_colors(mesh: bpy.types.Mesh, name: str, values: np.ndarray) -> None:
+    """Write an RGBA colour a vertex as screens take it, a byte a part; shape [v, 4]."""
+    values = _checked(values, 4, name)
+    _attribute(mesh, name, "BYTE_COLOR", len(values)).data.foreach_set(
+        "color_srgb", np.ascontiguousarray(values, np.float32).ravel())
+    mesh.update_tag()
+
+
 def set_one_color(mesh: bpy.types.Mesh, color: tuple[float, float, float]) -> None:
     """Give all vertices one linear colour: Solid mode then shows it beside coloured surfaces."""
     set_colors(mesh, "color", np.tile((*color, 1.0), (len(mesh.vertices), 1)))

@@ -7,6 +7,7 @@ import bpy
 
 from .. import branch_folder, scans
 from ..bridge import meshes
+from ..cloud_overlay import COLOUR
 from ..scene import OFFSET_KEY, SCAN_KEY, add_object
 from .viewing import look_at
 
@@ -69,6 +70,8 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         try:
             scan = read()
             mesh = meshes.new_mesh(path.stem, scan.points)
+            if scan.colours is not None:
+                meshes.set_screen_colors(mesh, COLOUR, scan.colours)
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
@@ -81,6 +84,7 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         chosen = settings.branch_folder
         if not (chosen and branch_folder.is_of(Path(bpy.path.abspath(chosen)), scan.sha256)):
             settings.branch_folder = str(scan.folder)
+        settings.show_scan = True
         look_at(context, cloud)
         self.report({"INFO"}, f"{len(scan.points)} points")
         return {"FINISHED"}

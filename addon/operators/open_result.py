@@ -43,7 +43,9 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
                                  f"{json.dumps(result)} {' '.join(self._job.log)}")
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
-        scene.place_scans(context.scene, data)
+        if scene.place_scans(context.scene, data):
+            # The branch would be buried under it; a switch in the panel brings it back.
+            context.scene.limber.show_scan = False
         self._take_over_settings(context, data.folder)
         look_at(context, shown.surface)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")

@@ -31,7 +31,9 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
             _draw_live(self.layout, settings)
-            self.layout.prop(settings, "show_legend")
+            row = self.layout.row()
+            row.prop(settings, "show_legend")
+            row.prop(settings, "show_scan")
             _draw_legend(self.layout, json.loads(surface[scene.INFO_KEY]))
 
 

@@ -191,7 +191,8 @@ def test_an_opened_result(bpy, panels, beam):
     assert panels("play").poll(bpy.context)
     bpy.context.scene.frame_set(6)
     drawn = _draw(panels("play"), bpy.context)
-    assert drawn.names("operator") == ["limber.play"]
+    assert drawn.names("operator") == ["limber.play", "limber.export_motion",
+                                                 "limber.turntable"]
     assert drawn.names("label") == ["Energy 10 mJ"]
 
 

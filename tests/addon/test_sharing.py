@@ -73,3 +73,47 @@ def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
     assert places[0] == (10, 20) and places[-1] == (15, 120) and len(triangles) == 4
     assert colours[2] == pytest.approx((1, 0, 0, 1))
     assert colours[4][0] == pytest.approx(0.4845, abs=1e-3)
+
+
+def test_a_scan_keeps_its_colours_and_gives_way_to_its_branch(bpy, registered, tmp_path):
+    """Red, green and blue of a PLY file, as a screen has them; the switch hides the scan."""
+    overlay = importlib.import_module("limber_addon.cloud_overlay")
+    colours = np.random.default_rng(3).integers(0, 256, (50, 3)).astype("u1")
+    rows = np.zeros(50, [(axis, "<f4") for axis in "xyz"] + [
+        (name, "u1") for name in ("red", "green", "blue")])
+    for number, name in enumerate(("red", "green", "blue")):
+        rows[name] = colours[:, number]
+    rows["x"] = np.arange(50)
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 50\n" + "".join(
+        f"property {kind} {name}\n" for kind, names in (("float", "xyz"), ("uchar", (
+            "red", "green", "blue"))) for name in names) + "end_header\n"
+    (tmp_path / "c.ply").write_bytes(head.encode() + rows.tobytes())
+    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "c.ply"))
+    cloud = bpy.data.objects["c scan"]
+    np.testing.assert_allclose(overlay.colours_of(cloud.data)[:, :3], colours / 255, atol=2e-3)
+    bpy.context.scene.limber.show_scan = False
+    assert cloud.hide_viewport
+    bpy.context.scene.limber.show_scan = True
+    assert not cloud.hide_viewport
+
+
+def test_folder_and_file_move_together(bpy, opened, beam, tmp_path):
+    """Saved, moved with its branch, opened there; saved again elsewhere: the folder is found."""
+    from pathlib import Path
+
+    def folder():
+        return Path(bpy.path.abspath(bpy.context.scene.limber.branch_folder)).resolve()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert bpy.context.scene.limber.branch_folder.startswith("//")
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    beam.folder.rename(moved / beam.folder.name)
+    (tmp_path / "a.blend").rename(moved / "a.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "a.blend"))
+    assert folder() == (moved / beam.folder.name).resolve()
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "deep" / "er" / "b.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "deep" / "er" / "b.blend"))
+    assert folder() == (moved / beam.folder.name).resolve()
+    assert bpy.ops.limber.open_result() == {"FINISHED"}
+    assert len([c for c in bpy.context.scene.collection.children if "limber_folder" in c]) == 1
