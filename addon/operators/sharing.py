@@ -128,16 +128,10 @@ def _half_angle(render: bpy.types.RenderSettings, lens: bpy.types.Camera) -> flo
 
 
 def _turn(pivot: bpy.types.Object, first: int, frames: int) -> None:
-    """Key one turn at an even speed; played round and round it has no step."""
-    preferences = bpy.context.preferences.edit
-    before = preferences.keyframe_new_interpolation_type
-    preferences.keyframe_new_interpolation_type = "LINEAR"
-    try:
-        for frame, angle in ((first, 0.0), (first + frames, 2 * math.pi)):
-            pivot.rotation_euler[2] = angle
-            pivot.keyframe_insert("rotation_euler", index=2, frame=frame)
-    finally:
-        preferences.keyframe_new_interpolation_type = before
+    """Key one turn at an even speed, each frame: no curve of the user's choice bends it."""
+    for number in range(frames + 1):
+        pivot.rotation_euler[2] = 2 * math.pi * number / frames
+        pivot.keyframe_insert("rotation_euler", index=2, frame=first + number)
     pivot.rotation_euler[2] = 0.0
 
 
