@@ -200,7 +200,7 @@ def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dic
     """
     common = ("status", "error", "warnings", "seconds")
     kept = {name: outcome[name] for name in common if name in outcome}
-    if not stage.key:
+    if not stage.keeps_entry(values_of(group_of(scene, stage), stage, {"name"})):
         kept["result"] = {name: value for name, value in outcome.items()
                           if name not in (*common, "command")}
     group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})

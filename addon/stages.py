@@ -115,6 +115,10 @@ class Stage:
     fields: dict[str, Field]
     settings: frozenset[str]
 
+    def keeps_entry(self, values: Mapping[str, Any]) -> bool:
+        """Whether the branch folder knows the result of a run with these values."""
+        return bool(self.key) and ("{name}" not in self.key or bool(values.get("name")))
+
     def groups(self) -> dict[str, list[Field]]:
         """Return the fields by the title of their group, in the worker's order."""
         found: dict[str, list[Field]] = {}

@@ -80,6 +80,7 @@ STEPS = (
                  StageView("export-pull", "Export a Pull"))),
     Step("estimate", "Estimate", StageView("estimate", "Estimate"),
          others=(StageView("swing", "Fit a Free Swing"),
+                StageView("vibration", "Fit Natural Frequencies"),
                 StageView("predict", "Predict Another Load"))),
     Step("goal", "Goal", StageView("energy", "Sample the Energy"),
          settings_of=(StageView("plan", "", ("start and goal",)),),

@@ -66,7 +66,8 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
     folder = bpy.path.abspath(scene.limber.branch_folder)
     record = branch_folder.read_record(Path(folder)) if folder else None
     group = properties.group_of(scene, stage)
-    entry = record.of(stage, properties.values_of(group, stage, {"name"})) if record else None
+    values = properties.values_of(group, stage, {"name"})
+    entry = record.of(stage, values) if record else None
     job = jobs.current()
     if job is not None and job.state is jobs.JobState.RUNNING and job.title == button_of(name):
         return StepState.RUNNING, entry
@@ -75,8 +76,8 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
         return StepState.FAILED, entry
     if entry is None:
         # What makes no entry (a prediction) is done where it has ended well.
-        return (StepState.DONE if outcome.get("status") == "done" and not stage.key
-                else StepState.NOT_RUN), None
+        return (StepState.DONE if outcome.get("status") == "done"
+                and not stage.keeps_entry(values) else StepState.NOT_RUN), None
     return _age(stage, group, record, entry), entry
 
 

@@ -115,16 +115,22 @@ def test_loads_and_exports_have_a_button(bpy, opened, tmp_path):
     """A fruit and a cut at the 3D cursor: the answer stays with the button. A file is written."""
     folder, _ = opened
     axes = read_skeleton(folder / "skeleton.csv")
-    properties = importlib.import_module("limber_addon.properties")
-    stages = importlib.import_module("limber_addon.stages").stages()
+    steps = importlib.import_module("limber_addon.panels.steps")
     for field, node in (("cut", _tip(folder)), ("fruit", 40), ("fruit", 60)):
         bpy.context.scene.cursor.location = axes.nodes[node]
         assert bpy.ops.limber.from_cursor(stage="load", field=field) == {"FINISHED"}
     assert bpy.context.scene.limber.load.fruit.count(";") == 1
     assert bpy.ops.limber.load() == {"FINISHED"}
-    kept = properties.outcome_of(bpy.context.scene, stages["load"], str(folder))
-    assert kept["result"]["added_mass_kg"] == pytest.approx(0.2)
-    assert kept["result"]["cut_mass_kg"] > 0 and kept["result"]["sag_m"] > 0
+    assert steps.state_of(bpy.context.scene, "load")[0] is steps.StepState.DONE
+    properties = importlib.import_module("limber_addon.properties")
+    stages = importlib.import_module("limber_addon.stages").stages()
+
+    def told(name):
+        # The branch folder knows nothing of it: what was said stays with the button.
+        return properties.outcome_of(bpy.context.scene, stages[name], str(folder))["result"]
+    assert told("load")["added_mass_kg"] == pytest.approx(0.2)
+    assert told("load")["cut_mass_kg"] > 0 and told("load")["sag_m"] > 0
     out = tmp_path / "twig.xml"
     assert bpy.ops.limber.export(output=str(out)) == {"FINISHED"}
     assert "<mujoco" in out.read_text()
+    assert told("export")["link_count"] > 5

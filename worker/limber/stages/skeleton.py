@@ -153,14 +153,20 @@ def _belong(early: Any, made: Any) -> bool:
     """Whether a kept skeleton and a mesh are of the same scan and settings, edits aside."""
     def source(entry: Any) -> dict[str, str]:
         return {name: value for name, value in entry.reads.items() if name != "edits"}
-    return early.settings == made.settings and source(early) == source(made)
+    # As this version has them: one of both may have been written before a setting was added.
+    return (_settings(early) == _settings(made)) and source(early) == source(made)
+
+
+def _settings(entry: Any) -> Any:
+    from limber.geometry.settings import ReconstructSettings
+
+    return ReconstructSettings.model_validate(entry.settings)
 
 
 def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     """Apply edits to the skeleton as it was found; make surface and mesh of what comes out."""
     from limber.geometry.cloud.files import read_points
     from limber.geometry.reconstruct import labelled, mesh_skeleton
-    from limber.geometry.settings import ReconstructSettings
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
     from limber.stages.loading import load_found_skeleton, load_masses
@@ -172,7 +178,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
             f"{branch.folder} has no mesh of the skeleton that would be edited.",
             "Its last reconstruct failed, or is of an older Limber; the scan is needed again.",
             "Run `limber reconstruct CLOUD -o NAME.branch --edits FILE`.")
-    settings = ReconstructSettings.model_validate(made.settings)
+    settings = _settings(made)
     alignment = branch.manifest.alignment
     digests = {name: value for name, value in made.reads.items() if name != "edits"}
     found = load_found_skeleton(branch, alignment, settings.unit)
