@@ -12,6 +12,7 @@ from scipy.linalg import eigh
 from benchmarks.table import Row
 from limber.exports.abaqus import inp_text
 from limber.exports.mjcf import mjcf_text
+from limber.exports.usd import as_deformable
 from limber.geometry.generated import generate_branch
 from limber.geometry.reconstruct import mesh_skeleton
 from limber.geometry.settings import ReconstructSettings
@@ -50,6 +51,9 @@ def rows(seeds: list[int], progress: Progress) -> list[Row]:
             theirs = bent_in_mujoco(model, branch.skeleton, mesh.nodes[node], load)
             if theirs is not None:
                 found.setdefault(label, []).append(_apart(ours, theirs))
+            if gravity is None:
+                found.setdefault("USD (its mesh and modulus by our solver)", []).append(
+                    _apart(ours, bent_as_usd(model, node, load)))
             if gravity is None and (theirs := bent_in_calculix(model, node, load)) is not None:
                 found.setdefault("CalculiX, weightless", []).append(_apart(ours, theirs))
     return [_row(label, errors) for label, errors in found.items()] or [
@@ -84,6 +88,11 @@ def bent_here(model: BranchModel, node: int, load: np.ndarray) -> Bent:
     forces[node] = load
     moved = solve_static(model, nodal_forces=forces).require().displacement[node]
     return Bent(moved, float(lowest_modes(model, 1).frequencies[0]))
+
+
+def bent_as_usd(model: BranchModel, node: int, load: np.ndarray) -> Bent:
+    """What stands in the USD file, bent here: no program that bends it runs without a GPU."""
+    return bent_here(as_deformable(model, node).model, node, load)
 
 
 def bent_in_mujoco(model: BranchModel, skeleton: Skeleton, tip: np.ndarray, load: np.ndarray,

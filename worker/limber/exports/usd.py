@@ -5,7 +5,7 @@ The schema is NVIDIA's ``OmniPhysics`` deformable schema, which stands ready to 
 to USD itself, and are written as applied schemas and attributes of those names.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,9 @@ from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.rods import tip_compliance
 
+_PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3],
+                   [4, 9, 5, 6], [4, 9, 6, 7], [4, 9, 7, 8], [4, 9, 8, 5]])
+"""Nodes of a quadratic tetrahedron (VTK's order) in eight linear ones."""
 _FRICTION = 0.5
 """Of bark on a gripper; nobody has measured it."""
 
@@ -36,23 +39,25 @@ class Deformable:
 def as_deformable(model: BranchModel, tip: int) -> Deformable:
     """Return a branch with linear tetrahedra and the modulus that makes its tip as compliant.
 
-    PhysX takes one material a body, and linear tetrahedra are too stiff in bending: one modulus
-    takes both in. It bends to another shape than the branch where the moduli vary along it.
+    Each quadratic tetrahedron becomes eight on the same nodes: fewer linear ones are far too stiff
+    in bending. PhysX takes one material a body; one modulus takes that in, and what stiffness is
+    left over. It bends to another shape than the branch where the moduli vary along it.
 
     Args:
         model: Of the hanging branch; its shape carries the weight, so none acts on it here.
         tip: Node at which both are compared.
     """
     bare = model.without_point_masses().with_parameters(gravity=(0.0, 0.0, 0.0))
-    linear = bare.mesh.linear()
-    place = bare.mesh.nodes[tip]
-    end = int(np.linalg.norm(linear.nodes - place, axis=1).argmin())
+    parts = _PARTS if bare.mesh.is_quadratic else np.array([[0, 1, 2, 3]])
+    linear = replace(bare.mesh, tets=bare.mesh.tets[:, parts].reshape(-1, 4),
+                     cell_data={}).oriented()
+    each = len(parts)
     first = float(np.mean(model.young))
-    density = np.broadcast_to(model.density, model.mesh.tet_count)
-    made = BranchModel(linear, young=first, density=density, gravity=None,
+    density = np.repeat(np.broadcast_to(model.density, model.mesh.tet_count), each)
+    made = BranchModel(linear, young=first, density=density, gravity=None, fixed=bare.fixed,
                        poisson=float(np.mean(model.poisson)))
-    young = first * tip_compliance(made, end) / tip_compliance(bare, tip)
-    return Deformable(made.with_young(young), np.array(model.young), young)
+    young = first * tip_compliance(made, tip) / tip_compliance(bare, tip)
+    return Deformable(made.with_young(young), np.repeat(model.young, each), young)
 
 
 def write_usd(branch: Deformable, damping: RayleighDamping, name: str, path: Path) -> None:

@@ -153,8 +153,7 @@ def _scene(branch: Branch, output: Path, progress: Progress) -> tuple[bytes, dic
         write_usd(made, known_damping(branch, progress), branch.name, path)
         content = path.read_bytes()
     mesh = made.model.mesh
-    end = int(np.linalg.norm(mesh.nodes - model.mesh.nodes[tip], axis=1).argmin())
-    return content, {"tet_count": mesh.tet_count, "node_count": mesh.node_count, "tip_node": end,
+    return content, {"tet_count": mesh.tet_count, "node_count": mesh.node_count, "tip_node": tip,
                      "young_pa": made.young}
 
 
