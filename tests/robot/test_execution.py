@@ -253,11 +253,23 @@ def armed(planned_folder, tmp_path, address, *, unexpected: float):
     settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
     path = cell_file(cell, tmp_path)
     with robot_holding(branch, cell, tmp_path) as robot:
-        result = execute(planned_folder, "path", path, settings,
-                         ExecuteOptions(arm=True, confirm="path"))
+        try:
+            result = execute(planned_folder, "path", path, settings,
+                             ExecuteOptions(arm=True, confirm="path"))
+        except SafetyStop:
+            _require_a_true_branch(robot.state)
+            raise
         time.sleep(0.2)
         state = robot.state
+    _require_a_true_branch(state)
     return result, state
+
+
+def _require_a_true_branch(state) -> None:
+    """On a machine with too much else to do the simulated branch itself is off, and says so."""
+    off = state["extrapolation_error_n"]
+    if off > 0.5:
+        pytest.skip(f"the virtual branch was solved too slowly here: its force was {off:.1f} N off")
 
 
 def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_folder, tmp_path,

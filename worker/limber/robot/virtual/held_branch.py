@@ -273,11 +273,11 @@ class HeldBranch:
         """Return its state as plain data."""
         solution = self._solution
         told: dict[str, Any] = {"branch": self.state, "solution_age_s": self._age,
-                                "points": self.points.tolist()}
+                                "points": self.points.tolist(),
+                                "extrapolation_error_n": self._largest_jump}
         if solution is not None:
             told |= {"solve_s": solution.seconds, "peak_strain": solution.peak_strain,
-                     "converged": solution.converged, "true_wrench": solution.wrench.tolist(),
-                     "extrapolation_error_n": self._largest_jump}
+                     "converged": solution.converged, "true_wrench": solution.wrench.tolist()}
         return told
 
     def _follow_twist(self, patch: np.ndarray, seconds: float) -> None:
