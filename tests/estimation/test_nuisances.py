@@ -10,7 +10,7 @@ from tests.subjects.paper_branches import measured
 from limber.errors import WorkError
 from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
 from limber.estimation.doubt.path_error import led_by_path, path_error
-from limber.estimation.fit import fit_pulls
+from limber.estimation.fit import FALL, _evaluated, fit_pulls
 from limber.estimation.forward.watched import WatchedForward
 from limber.estimation.nuisances import eliminated, in_words
 from limber.estimation.objective import Objective
@@ -128,6 +128,29 @@ def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small
     monkeypatch.setattr(Objective, "evaluate", lambda *_, **__: None)
     with pytest.raises(WorkError, match=r"zero known to 1 N that drifts by 1 N.*Tare the sensor"):
         fit_pulls(objective, objective.space.base, SETTINGS.model_copy(update={"young": 1e7}))
+
+
+def test_a_start_without_equilibrium_gives_way(small_bench, small_pull, monkeypatch):
+    """Moduli that fall outwards are tried next, from the force as it was read."""
+    pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"calibration": None}))
+    objective = objective_of(small_bench, pull)
+    forward, evaluate, tried = objective.forwards[0], Objective.evaluate, []
+    read = np.array(forward._measured)
+    forward._drives = [3 * drive for drive in forward._drives]
+    forward.keep()
+
+    def refusing(self, free, **options):
+        tried.append(np.array(forward._drives))
+        return evaluate(self, free, **options) if len(tried) > 1 else None
+
+    monkeypatch.setattr(Objective, "evaluate", refusing)
+    uniform = objective.space.base
+    start, found = _evaluated(objective, replace(uniform, young=30.0 * uniform.young), uniform)
+    assert found is not None and len(tried) == 2
+    assert np.diff(np.log(start.young)) == pytest.approx(-FALL)
+    assert np.abs(tried[0] - read).max() > 1.0 * np.abs(read).max()
+    # Of the reading at rest, the zero alone is taken off.
+    assert np.ptp(tried[1] - read, axis=0) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_calibration_survives_a_pull_file(tmp_path, small_pull):

@@ -25,11 +25,11 @@ from benchmarks.truth_branch import (
 from limber.errors import Cancelled, LimberError
 from limber.estimation.doubt.causes import variance_parts
 from limber.estimation.doubt.model_error import total_interval
+from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.field_form import open_field
-from limber.estimation.fit import Estimate, fit_pulls, judge_model, require_result
+from limber.estimation.fit import Estimate, fit_branch, judge_model, require_result
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values
-from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.subject import Subject
 from limber.geometry.skeleton.control_points import control_points
@@ -107,7 +107,7 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
 
 def _estimated(pulls: list[Pull], subject: Subject, settings: EstimateSettings) -> Estimate:
     """What `limber estimate` finds, its mesh's stiffness corrected, or its refusal."""
-    found = fit_pulls(_objective(pulls, subject, settings), subject.start, settings)
+    found = fit_branch(pulls, subject, settings, log=EvaluationLog(None, ""))
     require_result(found)
     judge_model(found, subject, pulls[0].entry.grasp, settings, axes=None, cloud=None)
     return found
@@ -149,9 +149,3 @@ def _subject(mesh: object, truth: Truth, poisson: float, density: float) -> Subj
     model = BranchModel(mesh, young=1e9, poisson=poisson, density=density, gravity=None)
     return Subject(mesh, skeleton, points, weights, model, Values(np.full(4, 1e9), poisson,
                    density), open_field(mesh, skeleton, weights, FRACTIONS))
-
-
-def _objective(pulls: list[Pull], subject: Subject, settings: EstimateSettings) -> Objective:
-    forwards = forwards_of(pulls, subject, settings)
-    return Objective(forwards, parameter_space(subject, forwards, settings),
-                     force_sigma=[pull.entry.sensor.force_sigma_n for pull in pulls])

@@ -57,6 +57,14 @@ WIDE = 0.15
 """Standard deviation of a log E from which it is worth a word what would narrow it."""
 
 
+FALL = 0.9
+"""By which log E falls from one control point to the next of a start, as the paper's branches."""
+
+
+class _ForceLeadsNowhereError(WorkError):
+    """No equilibrium under a pull's measured force; its path may still lead."""
+
+
 @dataclass
 class Estimate:
     """What an estimate found.
@@ -166,13 +174,25 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     if log.resumed_count:
         progress.warn(f"Resumed: {log.resumed_count} evaluations of a stopped run were taken over.")
 
-    def fitted(branch: Subject) -> Estimate:
-        forwards = forwards_of(pulls, branch, settings, progress)
-        objective = Objective(forwards, parameter_space(branch, forwards, settings),
+    def once(branch: Subject, chosen: EstimateSettings, log: EvaluationLog) -> Estimate:
+        forwards = forwards_of(pulls, branch, chosen, progress)
+        objective = Objective(forwards, parameter_space(branch, forwards, chosen),
                               log=log, force_sigma=[pull.entry.sensor.force_sigma_n
                                                     for pull in pulls], progress=progress,
-                              expected_count=20 if settings.method == "gauss-newton" else 200)
-        return fit_pulls(objective, branch.start, settings, progress, cache=cache, digest=digest)
+                              expected_count=20 if chosen.method == "gauss-newton" else 200)
+        return fit_pulls(objective, branch.start, chosen, progress, cache=cache, digest=digest)
+
+    def fitted(branch: Subject) -> Estimate:
+        try:
+            return once(branch, settings, log)
+        except _ForceLeadsNowhereError as error:
+            progress.warn(f"{error.seen} {error.why} So the gripper's recorded path leads instead.")
+            # What was evaluated by force says nothing of this.
+            led = settings.model_copy(update={"drive": "pose"})
+            try:
+                return once(branch, led, EvaluationLog(None, ""))
+            except WorkError as second:
+                raise error from second
 
     if not (subject.hangs and any(under_its_weight(subject.model, pull.entry).hanging is not None
                                   for pull in pulls)):
@@ -226,9 +246,10 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
             suspicion = force_unit_suspicion(float(np.mean(start.young)))
             if suspicion:
                 progress.warn(suspicion)
+    uniform = start
     if settings.method == "gauss-newton" and reduction is None:
-        start = led_start(judged_on, start)
-    first = _evaluated(judged_on, start)
+        start = led_start(judged_on, uniform)
+    start, first = _evaluated(judged_on, start, uniform)
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
@@ -264,13 +285,26 @@ def _force_is_measured(objective: Objective) -> bool:
     return False
 
 
-def _evaluated(objective: Objective, values: Values) -> Evaluation:
-    """Evaluate with derivatives; softer or stiffer where there is no equilibrium."""
-    for factor in (1.0, 3.0, 0.3, 10.0, 0.1):
-        scaled = replace(values, young=values.young * factor)
-        found = objective.evaluate(objective.space.pack(scaled), jacobian=True)
+def _evaluated(objective: Objective, start: Values, uniform: Values,
+               ) -> tuple[Values, Evaluation]:
+    """Evaluate with derivatives at the start, or near it where there is an equilibrium.
+
+    A fit by force alone can end at moduli that carry no force at all; then the uniform modulus is
+    tried, and one that falls outwards as of branches, softer or stiffer.
+    """
+    place = np.arange(len(uniform.young))
+    falling = np.exp(FALL * (place.mean() - place))
+    trials = [start]
+    trials += [replace(uniform, young=uniform.young * factor * course)
+               for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)]
+    for number, trial in enumerate(trials):
+        if number:
+            for forward in objective.forwards:
+                if forward.watches_pose:
+                    forward.forget()
+        found = objective.evaluate(objective.space.pack(trial), jacobian=True)
         if found is not None:
-            return found
+            return trial, found
     raise _without_equilibrium(objective)
 
 
@@ -282,7 +316,7 @@ def _without_equilibrium(objective: Objective) -> WorkError:
                          "Check the grasp point, the frame of reference and the units.")
     known = calibration_of(by_force[0].entry)
     peak = np.nanmax(np.linalg.norm(by_force[0].frames.wrenches[:, :3], axis=1))
-    return WorkError(
+    return _ForceLeadsNowhereError(
         seen, f"The measured force drives it: {peak:.2g} N at most, with a zero known to "
         f"{known.force_bias_sigma_n:g} N that drifts by {known.force_drift_sigma_n:g} N. So far "
         "off, it may fold a branch up that is soft at its end.",

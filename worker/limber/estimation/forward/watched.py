@@ -95,6 +95,12 @@ class WatchedForward(QuasiStaticForward):
             drives, self._drives_for, memory, self._values, self.response = self._good
             self._drives, self._memory, self._hints = list(drives), list(memory), None
 
+    def forget(self) -> None:
+        """Return to the force as it was read, and to no state."""
+        self._good = self._drives_for = None
+        self._memory = [None] * len(self.keys)
+        self.set_key_count(self.key_count)
+
     def moved_by(self, change: np.ndarray) -> float:
         """How far the gripper's place moves by a change of the force's unknowns, at most [m]."""
         moved = (self.response.grasps @ change).reshape(-1, 3)
