@@ -8,6 +8,7 @@ import pytest
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.fit import fit_branch, fit_pulls
 from limber.estimation.forward.quasi_static import QuasiStaticForward
+from limber.estimation.forward.watched import WatchedForward
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace
 from limber.estimation.preparation import forwards_of
@@ -18,6 +19,7 @@ from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
 from limber.mechanics.added import PointMass
 from limber.progress import Progress
+from limber.recordings.calibration import CalibrationEntry
 from limber.stages.mesh import mesh_surface
 from limber.stages.virtual_pull import virtual_pull
 from limber.store import Branch
@@ -87,6 +89,21 @@ def test_a_branch_too_soft_for_its_weight_is_estimated_without(scanned):
                        progress=Progress(on_warning=messages.append))
     assert found.is_weightless and any("too soft to carry" in text for text in messages)
     np.testing.assert_allclose(found.values.young, soft, rtol=0.02)
+
+
+def test_where_the_force_leads_nowhere_the_path_leads(scanned, pull, monkeypatch):
+    """No equilibrium under the measured force: said, and the gripper's path gives the moduli."""
+    start = subject(scanned)
+    start = replace(start, model=start.model.without_point_masses())
+    known = CalibrationEntry(pose_sigma_m=1e-4, pose_sigma_rad=0.0)
+    pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": known}))
+    monkeypatch.setattr(WatchedForward, "simulate", lambda *_, **__: None)
+    messages: list[str] = []
+    found = fit_branch([pull], start, EstimateSettings(**SETTINGS), log=EvaluationLog(None, ""),
+                       progress=Progress(on_warning=messages.append))
+    assert [forward.drive for forward in found.objective.forwards] == ["pose"]
+    assert any("So the gripper's recorded path leads" in text for text in messages)
+    np.testing.assert_allclose(found.values.young, TRUTH, rtol=2e-3)
 
 
 def test_forward_derivatives_under_weight(scanned, pull):
