@@ -103,36 +103,55 @@ def _gripper(bag: Bag, frames: Frames, settings: ImportSettings, clock: str,
              ) -> tuple[np.ndarray, np.ndarray, str]:
     """Times [s], poses [n, 6] of the gripper, and the frame that they are in."""
     name = settings.pose_topic
-    if bag.of("pose") and (name is None or name.startswith("/")):
-        topic = _chosen(bag, "pose", name, "--pose-topic", "The gripper's pose is needed.")
-        motion = Motion.of(getattr(topic, clock), topic.values)
-        if len(motion.times) < 2:
-            raise InputError(f"{bag.path}: {topic.name} has {len(motion.times)} poses.",
-                             "A pull needs at least two.", "Record it again.")
-        return motion.times, _six(motion.positions, motion.turns), topic.frame.lstrip("/")
+    if not bag.of("pose") or (name is not None and not name.startswith("/")):
+        found = (_by_frames(bag, frames, name, clock, warnings)
+                 or _by_joints(bag, name, clock, joint_poses))
+        if found is not None:
+            return found
+    topic = _chosen(bag, "pose", name, "--pose-topic", "The gripper's pose is needed.")
+    motion = Motion.of(getattr(topic, clock), topic.values)
+    if len(motion.times) < 2:
+        raise InputError(f"{bag.path}: {topic.name} has {len(motion.times)} poses.",
+                         "A pull needs at least two.", "Record it again.")
+    return motion.times, _six(motion.positions, motion.turns), topic.frame.lstrip("/")
+
+
+def _by_frames(bag: Bag, frames: Frames, name: str | None, clock: str, warnings: list[str],
+               ) -> tuple[np.ndarray, np.ndarray, str] | None:
+    """The gripper by the tree of frames, where it moves in it."""
     moving = [topic for topic in bag.of("transform") if len(topic.stamps) > 2]
     wanted = [frame for frame in frames.names
               if (frame == name if name else frame.lower() in _GRIPPERS)]
-    if moving and wanted:
-        # Of a chain flange, tool0, gripper the last by our list is what holds.
-        frame = min(wanted, key=lambda frame: name is None and _GRIPPERS.index(frame.lower()))
-        longest = max(moving, key=lambda topic: len(topic.stamps))
-        root = _root(bag, frame)
-        times = np.unique(getattr(longest, clock))
-        found = frames.between(frame, root, times)
-        if found is not None:
-            warnings.append(f"{bag.path.name}: the gripper is frame {frame} in {root}.")
-            return times, _six(*found), root
-    if bag.of("joints") and joint_poses is not None:
-        topic = _chosen(bag, "joints", name, "--pose-topic", "The gripper's pose is needed.")
-        times, first = np.unique(getattr(topic, clock), return_index=True)
-        return times, joint_poses(topic.labels, topic.values[first]), "base"
-    if bag.of("joints"):
+    if not moving or not wanted:
+        return None
+    # Of a chain flange, tool0, gripper the last by our list is what holds.
+    frame = min(wanted, key=lambda frame: name is None and _GRIPPERS.index(frame.lower()))
+    longest = max(moving, key=lambda topic: len(topic.stamps))
+    root = _root(bag, frame)
+    times = np.unique(getattr(longest, clock))
+    found = frames.between(frame, root, times)
+    if found is None:
+        return None
+    warnings.append(f"{bag.path.name}: the gripper is frame {frame} in {root}.")
+    return times, _six(*found), root
+
+
+def _by_joints(bag: Bag, name: str | None, clock: str, joint_poses: JointPoses | None,
+               ) -> tuple[np.ndarray, np.ndarray, str] | None:
+    """The gripper by the arm's joint angles.
+
+    Raises:
+        InputError: there are angles alone, and no arm was named.
+    """
+    if not bag.of("joints"):
+        return None
+    if joint_poses is None:
         raise InputError(f"{bag.path} tells joint angles alone.",
                          "Where the gripper is follows from the arm's model and tool.",
                          "Give the robot with --cell cell.toml, or record poses or TF.")
-    _chosen(bag, "pose", name, "--pose-topic", "The gripper's pose is needed.")
-    raise AssertionError("unreachable: there is no pose")
+    topic = _chosen(bag, "joints", name, "--pose-topic", "The gripper's pose is needed.")
+    times, first = np.unique(getattr(topic, clock), return_index=True)
+    return times, joint_poses(topic.labels, topic.values[first]), "base"
 
 
 def _root(bag: Bag, frame: str) -> str:
