@@ -18,6 +18,7 @@ from ..stages import stages
 from ..worker import WorkerNotFound
 from . import live_loads
 from .live_loads import LiveLoads
+from .needs_result import NeedsBranchInObjectMode
 
 _INTERVAL_SECONDS = 1 / 60
 _KEYS = ("Drag: bend | F: hang a fruit | C: cut here | Enter: keep for a simulation | "
@@ -63,7 +64,7 @@ class Hold:
     is_dragged: bool = True
 
 
-class LIMBER_OT_grab(bpy.types.Operator):
+class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
     """Bend the branch by hand: press on it and drag. Force and energy stand at the mouse"""
 
     bl_idname = "limber.grab"
@@ -78,13 +79,6 @@ class LIMBER_OT_grab(bpy.types.Operator):
     _surface: bpy.types.Object | None = None
     _hold: Hold | None = None
     _frame: HeldFrame | None = None
-
-    @classmethod
-    def poll(cls, context):
-        if scene.find_surface(context.scene) is None:
-            cls.poll_message_set("Open a result first")
-            return False
-        return context.mode == "OBJECT"
 
     def execute(self, context):
         self.report({"ERROR"}, "A grab needs the mouse in a 3D view. From a script use "

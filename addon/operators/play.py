@@ -6,20 +6,14 @@ import bpy
 
 from .. import scene
 from ..bridge import animation
+from .needs_result import NeedsBranch
 
 
-class LIMBER_OT_play(bpy.types.Operator):
+class LIMBER_OT_play(NeedsBranch, bpy.types.Operator):
     """Play or stop the branch's motion along the path"""
 
     bl_idname = "limber.play"
     bl_label = "Play"
-
-    @classmethod
-    def poll(cls, context):
-        if scene.find_surface(context.scene) is None:
-            cls.poll_message_set("Open a result first")
-            return False
-        return True
 
     def execute(self, context):
         trouble = animation.cache_trouble(scene.find_surface(context.scene))

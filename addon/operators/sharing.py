@@ -8,23 +8,13 @@ import bpy
 from mathutils import Vector
 
 from .. import scene
+from .needs_result import NeedsBranchInObjectMode
 
 _KINDS = (".abc", ".usd", ".usda", ".usdc", ".usdz")
 RIG = "Turntable"
 
 
-class _NeedsBranch:
-    """Mix-in: needs a branch in the scene."""
-
-    @classmethod
-    def poll(cls, context):
-        if scene.find_surface(context.scene) is None:
-            cls.poll_message_set("Open a result first")
-            return False
-        return context.mode == "OBJECT"
-
-
-class LIMBER_OT_export_motion(_NeedsBranch, bpy.types.Operator):
+class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
     """Write the moving branch, with its values at each vertex, as Alembic (.abc) or USD"""
 
     bl_idname = "limber.export_motion"
@@ -80,7 +70,7 @@ class LIMBER_OT_export_motion(_NeedsBranch, bpy.types.Operator):
                                   export_animation=current.frame_end > current.frame_start)
 
 
-class LIMBER_OT_turntable(_NeedsBranch, bpy.types.Operator):
+class LIMBER_OT_turntable(NeedsBranchInObjectMode, bpy.types.Operator):
     """Add a camera that goes once round the branch, and look through it; pressed again, it fits
     the branch as it is shown now"""
 

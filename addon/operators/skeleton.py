@@ -14,6 +14,7 @@ import bpy
 from .. import scene
 from ..bridge import skeletons
 from ..skeleton_edits import Mark, SkeletonEditError, edits_of
+from .needs_result import NeedsSkeleton
 from .worker_operator import WorkerOperator
 
 _ACTIONS = (
@@ -28,18 +29,7 @@ _ACTIONS = (
                                "nodes back"))
 
 
-class _SkeletonOperator:
-    """Mix-in: needs a skeleton in the scene."""
-
-    @classmethod
-    def poll(cls, context):
-        if scene.find_skeleton(context.scene) is None:
-            cls.poll_message_set("Open a result first")
-            return False
-        return True
-
-
-class LIMBER_OT_edit_skeleton(_SkeletonOperator, bpy.types.Operator):
+class LIMBER_OT_edit_skeleton(NeedsSkeleton, bpy.types.Operator):
     """Show the skeleton and edit its nodes: move them with G, delete them with X"""
 
     bl_idname = "limber.edit_skeleton"
@@ -61,7 +51,7 @@ class LIMBER_OT_edit_skeleton(_SkeletonOperator, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LIMBER_OT_edit_node(_SkeletonOperator, bpy.types.Operator):
+class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
     """Change how the chosen nodes hang; the worker does it when the edits are applied"""
 
     bl_idname = "limber.edit_node"
@@ -161,7 +151,7 @@ class LIMBER_OT_edit_node(_SkeletonOperator, bpy.types.Operator):
                                         if number in by_number], context="VERTS")
 
 
-class LIMBER_OT_apply_skeleton(_SkeletonOperator, WorkerOperator, bpy.types.Operator):
+class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator):
     """Make surface and mesh anew with the edits of the skeleton; they stay through a reconstruct"""
 
     bl_idname = "limber.apply_skeleton"
@@ -175,7 +165,7 @@ class LIMBER_OT_apply_skeleton(_SkeletonOperator, WorkerOperator, bpy.types.Oper
 
     @classmethod
     def poll(cls, context):
-        return _SkeletonOperator.poll.__func__(cls, context) and (
+        return NeedsSkeleton.poll.__func__(cls, context) and (
             WorkerOperator.poll.__func__(cls, context))
 
     def arguments(self, context):
@@ -204,7 +194,7 @@ class LIMBER_OT_apply_skeleton(_SkeletonOperator, WorkerOperator, bpy.types.Oper
         self._temporary.cleanup()
 
 
-class LIMBER_OT_discard_skeleton(_SkeletonOperator, bpy.types.Operator):
+class LIMBER_OT_discard_skeleton(NeedsSkeleton, bpy.types.Operator):
     """Forget the edits that are not applied yet"""
 
     bl_idname = "limber.discard_skeleton"
