@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, override, picture, seen, view, waited
+from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, seen, waited
 
 
 def jobs():
@@ -17,18 +17,7 @@ def jobs():
 
 
 def begin():
-    for thing in list(bpy.data.objects):
-        bpy.data.objects.remove(thing)
-    view()[1].spaces.active.show_region_ui = True
-    return True
-
-
-def open_tab():
-    if not waited(0.5):
-        return False
-    _, area, sidebar = view("UI")
-    sidebar.active_panel_category = "Limber"
-    area.tag_redraw()
+    clear()
     return True
 
 
@@ -88,7 +77,7 @@ def play():
     return True
 
 
-drive([begin, open_tab, picture("1_empty"),
+drive([begin, is_tab_open, picture("1_empty"),
        press("import_cloud", filepath=str(FOLDER / "scan.ply")), is_imported, picture("2_scan"),
        press("reconstruct"), done("reconstruct"), picture("3_branch"),
        press("energy", samples=30), done("energy"),

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, override, picture, seen, view, waited
+from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, seen, waited
 
 state = {}
 
@@ -25,20 +25,15 @@ def marks():
 
 
 def open_result():
-    view()[1].spaces.active.show_region_ui = True
-    for thing in list(bpy.data.objects):
-        bpy.data.objects.remove(thing)
+    clear()
     with override():
         bpy.ops.limber.open_result(directory=str(FOLDER / "twig.branch"))
     return True
 
 
 def open_tab():
-    if not waited(0.5):
+    if not is_tab_open():
         return False
-    _, area, sidebar = view("UI")
-    sidebar.active_panel_category = "Limber"
-    area.tag_redraw()
     with override():
         bpy.ops.limber.edit_skeleton()
         bpy.ops.ed.undo_push(message="editing")

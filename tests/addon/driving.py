@@ -28,6 +28,23 @@ def view(kind="WINDOW"):
     return window, area, next(region for region in area.regions if region.type == kind)
 
 
+def clear():
+    """Empty the scene and open the sidebar."""
+    view()[1].spaces.active.show_region_ui = True
+    for thing in list(bpy.data.objects):
+        bpy.data.objects.remove(thing)
+
+
+def is_tab_open():
+    """Show Limber's tab, half a second into the current step; whether it is shown."""
+    if not waited(0.5):
+        return False
+    _, area, sidebar = view("UI")
+    sidebar.active_panel_category = "Limber"
+    area.tag_redraw()
+    return True
+
+
 def override():
     window, area, region = view()
     return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
