@@ -81,8 +81,8 @@ def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarr
     names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
     optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
     if like.shape_slopes is not None:
-        optional["shape_slopes"] = np.array([grasp_model.shape_slopes(u)
-                                             for u in states.displacements])
+        slopes = [grasp_model.shape_slopes(moved) for moved in states.displacements]
+        optional["shape_slopes"] = np.reshape(slopes, (-1, *like.shape_slopes.shape[1:]))
     return GraspSamples(states.poses, states.energies, states.forces, states.tips,
                         states.min_det_f, np.hstack([unsolved, np.zeros_like(unsolved)]),
                         states.strains, **optional)
