@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from limber.planning.timing import Pace, times_along
+from limber.planning.timing import Pace, poses_at, time_law, times_along
 
 PACE = Pace(0.05, 0.1)
 TANGENTIAL = 0.1 * np.sqrt(0.5)
@@ -41,3 +41,29 @@ def test_it_stands_still_at_a_stop_and_slows_at_a_corner():
     bent = np.concatenate([line[:11], line[10] + line[1:11][:, [1, 0, 2]]])
     assert times_along(line, PACE)[-1] < times_along(bent, PACE)[-1] < stopped[-1]
     assert (np.diff(times_along(np.repeat(line, 2, axis=0), PACE)) >= 0.0).all()
+
+
+def test_poses_at_a_controllers_rate_go_through_the_path():
+    """At the corners' times they are the corners; between, no speed is over the limit, the turn is
+    the rotations' and nothing moves at a stop."""
+    s = np.linspace(0.0, 1.0, 41)
+    poses = np.column_stack([0.1 * np.sin(2 * s), 0.1 * np.cos(2 * s), 0.05 * s, s, 0 * s, 0 * s])
+    there_and_back = np.concatenate([poses, poses[-2::-1]])
+    law = time_law(there_and_back[:, :3], PACE, stops=(40,))
+    times = times_along(there_and_back[:, :3], PACE, stops=(40,))
+    assert law.duration == pytest.approx(times[-1])
+    assert np.allclose(poses_at(there_and_back, law, times, (40,)), there_and_back, atol=1e-9)
+    instants = np.arange(0.0, law.duration, 1 / 500)
+    streamed = poses_at(there_and_back, law, instants, (40,))
+    speed = np.linalg.norm(np.diff(streamed[:, :3], axis=0), axis=1) * 500
+    assert speed.max() <= 1.001 * PACE.speed
+    assert np.abs(np.diff(speed)).max() * 500 <= 1.05 * TANGENTIAL
+    assert speed[np.searchsorted(instants, times[40]) - 1] < 0.01 * PACE.speed
+    assert np.allclose(np.hypot(streamed[:, 0], streamed[:, 1]), 0.1, atol=2e-6)
+    assert (np.diff(streamed[instants < times[40], 3]) >= 0.0).all()
+
+
+def test_a_slower_pace_takes_that_much_longer():
+    """Along the same way, k times slower takes k times as long."""
+    line = np.linspace(0.0, 0.1, 21)[:, None] * [1.0, 0.0, 0.0]
+    assert times_along(line, PACE.slower(3.0))[-1] == pytest.approx(3 * times_along(line, PACE)[-1])

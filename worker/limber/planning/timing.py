@@ -7,11 +7,13 @@ that the whole is never over the limit.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 _SHARE = np.sqrt(0.5)  # of the acceleration, each along and across
 _PIECES = 16  # an edge is cut into, so that speeds change within it
+_STILL = 1e-9  # [m] below which two poses are one
 
 
 @dataclass(frozen=True)
@@ -21,17 +23,54 @@ class Pace:
     speed: float = 0.02
     acceleration: float = 0.1
 
+    def slower(self, times: float) -> "Pace":
+        """Return the pace of a motion that takes so many times as long."""
+        return Pace(self.speed / times, self.acceleration / times**2)
+
 
 DEFAULT_PACE = Pace()
 
 
-def times_along(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> np.ndarray:
-    """Return when ``positions`` [n, 3] are passed [s], from 0, shape [n].
+@dataclass(frozen=True)
+class TimeLaw:
+    """How far along its way a motion is when; the acceleration is constant between its knots.
 
-    The motion stands still at both ends and at the points ``stops``.
+    Attributes:
+        along: Distance along the way at the knots [m], from 0, ascending, shape [k].
+        times: When they are passed [s], from 0, shape [k].
+        speeds: How fast [m/s], shape [k].
     """
-    if len(positions) < 2:
-        return np.zeros(len(positions))
+
+    along: np.ndarray
+    times: np.ndarray
+    speeds: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return float(self.times[-1])
+
+    @property
+    def accelerations(self) -> np.ndarray:
+        """Along the way, between the knots [m/s^2], shape [k - 1]."""
+        durations = np.diff(self.times)
+        return np.diff(self.speeds) / np.maximum(durations, 1e-12) * (durations > 0.0)
+
+    def at(self, instants: np.ndarray) -> np.ndarray:
+        """Return the distance along the way at ``instants`` [s] [m]; the last one afterwards."""
+        instants = np.clip(instants, 0.0, self.duration)
+        piece = np.clip(np.searchsorted(self.times, instants, side="right") - 1, 0,
+                        len(self.times) - 2)
+        since = instants - self.times[piece]
+        moved = self.speeds[piece] * since + 0.5 * self.accelerations[piece] * since**2
+        return np.clip(self.along[piece] + moved, self.along[piece], self.along[piece + 1])
+
+
+def time_law(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> TimeLaw:
+    """Return the fastest motion along ``positions`` [n, 3], two or more.
+
+    It stands still at both ends and at the points ``stops``.
+    """
     edges = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     slowest = _at_corners(positions, edges, pace)
     slowest[[0, -1, *stops]] = 0.0
@@ -47,7 +86,51 @@ def times_along(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) 
         squared[k] = min(squared[k], squared[k + 1] + gain[k])
     speeds = np.sqrt(squared)
     durations = 2.0 * steps / np.maximum(speeds[1:] + speeds[:-1], 1e-12)
-    return np.concatenate([[0.0], np.cumsum(np.where(steps > 0.0, durations, 0.0))])[::_PIECES]
+    times = np.cumsum(np.where(steps > 0.0, durations, 0.0))
+    return TimeLaw(np.concatenate([[0.0], np.cumsum(steps)]), np.concatenate([[0.0], times]),
+                   speeds)
+
+
+def times_along(positions: np.ndarray, pace: Pace, stops: tuple[int, ...] = ()) -> np.ndarray:
+    """Return when ``positions`` [n, 3] are passed [s], from 0, shape [n]; see :func:`time_law`."""
+    if len(positions) < 2:
+        return np.zeros(len(positions))
+    return time_law(positions, pace, stops).times[::_PIECES]
+
+
+def poses_at(poses: np.ndarray, law: TimeLaw, instants: np.ndarray,
+             stops: tuple[int, ...] = ()) -> np.ndarray:
+    """Return the poses [m, rad] of a motion through ``poses`` [n, 6] at ``instants`` [s], [m, 6].
+
+    Between stops a smooth curve through the positions (Akima's, which hardly overshoots), and the
+    shortest turns between rotations.
+
+    Args:
+        law: Of these poses' positions and stops.
+    """
+    from scipy.interpolate import Akima1DInterpolator
+    from scipy.spatial.transform import Rotation, Slerp
+
+    knots = law.along[::_PIECES]
+    along = law.at(instants)
+    found = np.empty((len(along), 6))
+    ends = [0, *stops, len(poses) - 1]
+    for first, last in pairwise(ends):
+        here = (along >= knots[first]) & (along <= knots[last])
+        moves = np.flatnonzero(np.diff(knots[first:last + 1]) > _STILL) + first + 1
+        passed = np.concatenate([[first], moves]).astype(int)
+        if len(passed) < 2 or not here.any():
+            found[here] = poses[first]
+            continue
+        places, asked = knots[passed], np.clip(along[here], knots[first], knots[passed[-1]])
+        found[here, :3] = (
+            Akima1DInterpolator(places, poses[passed, :3], method="makima")(asked)
+            if len(passed) > 2 else poses[first, :3] + np.outer(
+                (asked - places[0]) / (places[1] - places[0]),
+                poses[passed[1], :3] - poses[first, :3]))
+        turns = Rotation.from_rotvec(poses[passed, 3:])
+        found[here, 3:] = Slerp(places, turns)(asked).as_rotvec()
+    return found
 
 
 def _at_corners(positions: np.ndarray, edges: np.ndarray, pace: Pace) -> np.ndarray:
