@@ -196,7 +196,7 @@ def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
 
 def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
     """Analytic gradients agree with central differences, limits broken and goal missed."""
-    problem = problem_on(ridge_field, max_energy=0.02, max_force=0.5)
+    problem = replace(problem_on(ridge_field, max_energy=0.02, max_force=0.5), longest=0.1)
     path = next(bulges(problem, 1))[::4] * 1.6
     path[-1] += 0.05
     direction = np.random.default_rng(0).normal(size=path.shape)
@@ -250,3 +250,18 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
             middles = (path[1:] + path[:-1]) / 2
             pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
             assert ridge_field.energy(middles) @ pieces >= held.energy_bound
+
+
+def test_a_length_is_kept_as_a_limit(ridge_field):
+    """From the path round the ridge: just as long as allowed, and gentler than the shortest."""
+    problem = problem_on(ridge_field)
+    line = np.linspace(START, GOAL.position, 40)
+    shortest, _ = refine(line, replace(problem, weights=problem.weights._replace(energy=0.0)))
+    longest = 1.02 * np.linalg.norm(np.diff(shortest, axis=0), axis=1).sum()
+    limited = replace(problem, longest=longest, weights=problem.weights._replace(
+        length=0.01 * problem.weights.length))
+    found, cost = refine(plan_gentle(problem).points, limited)
+    length = np.linalg.norm(np.diff(found, axis=0), axis=1).sum()
+    assert np.isfinite(cost) and 0.995 * longest < length <= longest * (1 + 1e-9)
+    assert cost < limited.cost(shortest)
+    assert limited.cost(line + 0.05 * np.sin(np.linspace(0, np.pi, 40))[:, None]) == np.inf

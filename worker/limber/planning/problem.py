@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.planning.cost import EdgeWeights, resample
+from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
 from limber.planning.goals import Goal
 
@@ -16,7 +16,8 @@ class GentleProblem:
     """Any path from ``start`` [3] into ``goal`` within ``limits`` (see ``EnergyField.limited``).
 
     ``weights`` are the cost of an edge. ``field_error`` [J] is subtracted from the energy where a
-    lower bound is asked for, so that it holds for every branch whose energy lies that near.
+    lower bound is asked for, so that it holds for every branch whose energy lies that near. No path
+    may be longer than ``longest`` [m]; bounds do without that limit, and hold with it as well.
     """
 
     energy_field: EnergyField
@@ -25,9 +26,11 @@ class GentleProblem:
     start: np.ndarray
     goal: Goal
     field_error: float = 0.0
+    longest: float = np.inf
 
     def cost(self, path: np.ndarray) -> float:
-        """Return the cost of a polyline [n, 3]; infinite if it breaks a limit or misses the goal.
+        """Return the cost of a polyline [n, 3]; infinite if it breaks a limit, is too long or
+        misses the goal.
 
         Finer than the planners' edges: what is reported must not owe to their quadrature.
         """
@@ -36,6 +39,8 @@ class GentleProblem:
         if self.goal_excess(path[-1]) > 1e-9:
             return np.inf
         fine = resample(np.ascontiguousarray(path, float), _FINE)
+        if arc_lengths(fine)[-1] > self.longest * (1.0 + 1e-9):
+            return np.inf
         return float(path_cost(fine, self.limits, self.weights._replace(step=_FINE)))
 
     def limits_in_words(self) -> str:

@@ -6,7 +6,10 @@ metre, every path costs I + w length >= B(w), the certificate's bound; so one no
     I >= B(w) - w L        for any w
 
 (weak duality: Boyd and Vandenberghe 2004, 5.2). The weight is sought at which the gentlest path is
-just short enough; there the bound is nearly met.
+just short enough; there the bound is nearly met. Where the length jumps at a weight (energy over
+length is not convex: one way round a ridge, or the other) no weight gives a path that is just short
+enough. So from the short path and from the long one it is also sought directly, the length a limit;
+what the bound leaves open then is the jump's.
 """
 
 from dataclasses import dataclass, replace
@@ -85,10 +88,12 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
     for attempt in range(3):
         weight = search.short_weight * 1.2**attempt
         found = plan_gentle(_weighed(problem, weight), [search.short_path],
-                            progress=progress.part(0.5, 1.0))
+                            progress=progress.part(0.5, 0.9))
         search.add(weight, found.points, found.certificate.lower)
         if arc_lengths(found.points)[-1] <= longest * (1.0 + 1e-9):
             break
+        search.long_path = found.points
+    progress(0.95, "just short enough")
     return search.result(found, weight, float(least))
 
 
@@ -100,6 +105,7 @@ class _Search:
         self.low, self.high = np.log(_RANGE)
         self.curve: list[TradePoint] = []
         self.short_weight, self.short_path = _RANGE[1], starts[0]
+        self.long_path: np.ndarray | None = None
         self.last_length = np.nan
 
     def step(self) -> bool:
@@ -116,7 +122,7 @@ class _Search:
         # From here on the neighbouring weight's path is start enough.
         self.starts = [path, self.short_path]
         if self.last_length > self.longest:
-            self.low = np.log(weight)
+            self.low, self.long_path = np.log(weight), path
             return True
         first = len(self.curve) == 1
         self.high, self.short_weight, self.short_path = np.log(weight), weight, path
@@ -131,15 +137,24 @@ class _Search:
             weight * self.problem.weights.length / energy))
 
     def result(self, found: GentlePath, weight: float, shortest: float) -> DetourPath:
+        """Return the gentlest of the short enough paths that are known, and the best bound."""
         bounds = [p.lower_bound_jm - p.metre_jm * self.longest for p in self.curve
                   if p.lower_bound_jm is not None]
-        length, integral = _measured(found.points, self.problem)
-        if length > self.longest * (1.0 + 1e-9):
-            # The length jumps at this weight: the gentlest of the short ones that are known.
-            found = replace(found, points=self.short_path)
-            length, integral = _measured(found.points, self.problem)
+        known = [found.points, self.short_path, *self._just_short_enough()]
+        measured = [_measured(path, self.problem) for path in known]
+        integral, number = min((integral, number) for number, (length, integral)
+                               in enumerate(measured) if length <= self.longest * (1.0 + 1e-9))
+        cost = _weighed(self.problem, weight).cost(known[number])
+        found = GentlePath(known[number], cost, replace(found.certificate, upper=cost))
         return DetourPath(found, weight, shortest, self.longest, integral, max(bounds),
                           tuple(sorted(self.curve, key=lambda point: point.weight)))
+
+    def _just_short_enough(self) -> list[np.ndarray]:
+        """Return what the short and the long path become with the length as a limit."""
+        limited = replace(_weighed(self.problem, _RANGE[0]), longest=self.longest)
+        starts = [self.short_path] if self.long_path is None else [self.short_path, self.long_path]
+        found = [refine(path, limited) for path in starts]
+        return [path for path, cost in found if np.isfinite(cost)]
 
 
 def _weighed(problem: GentleProblem, weight: float) -> GentleProblem:

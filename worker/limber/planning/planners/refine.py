@@ -45,6 +45,8 @@ def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> np.ndarra
                       / _POINTS)
     points[0] = problem.start
     scale = 1.0 / problem.weights.length if problem.weights.length > 0.0 else 1.0
+    if problem.longest < np.inf:
+        scale = problem.longest
     for penalty in _ROUNDS:
         points = resample(points, np.linalg.norm(np.diff(points, axis=0), axis=1).sum() / _POINTS)
         shape = points[1:].shape
@@ -67,7 +69,7 @@ def violation(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
     """Return the mean squared violation of a path [n, 3] over ``scale`` [m], and its gradient.
 
     Places closer than ``margin`` [m] to the limit of the trusted region violate it; so does an end
-    outside the goal. Energy and force count relative to their limits.
+    outside the goal. Energy, force and length count relative to their limits.
     """
     total, gradient = 0.0, np.zeros_like(points)
     for excess, slope in _excesses(points, problem, margin, scale):
@@ -78,6 +80,15 @@ def violation(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
     if outside > 0.0:
         total += outside**2
         gradient[-1] += 2.0 * outside * _goal_slope(points[-1], problem) / scale
+    if problem.longest < np.inf:
+        edges = np.diff(points, axis=0)
+        lengths = np.maximum(np.linalg.norm(edges, axis=1), 1e-12)
+        over = (lengths.sum() + margin) / problem.longest - 1.0
+        if over > 0.0:
+            total += over**2
+            along = 2.0 * over / problem.longest * edges / lengths[:, None]
+            gradient[1:] += along
+            gradient[:-1] -= along
     return total, gradient
 
 
