@@ -39,6 +39,14 @@ def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     assert plan.summary["robot"]["model"] == "ur5e"
     assert plan.summary["robot"]["singularity_distance"] > 0.05
     assert plan.summary["limits"]["force_n"]["limit"] == 40.0
+    moving = plan.summary["in_motion"]
+    assert 0.0 < moving["peaks"]["force_n"]["moving"] <= 40.0
+    assert plan.summary["timing"]["speed_m_s"] == moving["speed_m_s"] <= 0.02
+    points = np.genfromtxt(copied / "plans/reached-setpoints.csv", delimiter=",", names=True)
+    assert plan.summary["setpoint_rate_hz"] == 500.0
+    assert np.allclose(np.diff(points["t_s"]), 1 / 500, atol=1e-6)
+    assert points["t_s"][-1] == pytest.approx(plan.motion.times[-1], abs=1 / 500)
+    assert points["x_m"][-1] == pytest.approx(plan.motion.poses[-1, 0], abs=1e-6)
 
 
 def test_a_cell_that_allows_too_little_force_is_named(copied):

@@ -9,13 +9,20 @@ from scipy.spatial.transform import Rotation
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from limber.errors import InputError, NoPathError, SafetyStop
 from limber.mechanics.status import Status
+from limber.progress import Progress
 from limber.robot.belonging import check_plan
 from limber.robot.calibration import fit_base
 from limber.robot.cell import Cell
 from limber.robot.execution import across, followed, robot_motion
 from limber.robot.expected import Predicted
 from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
-from limber.stages.execute import ExecuteOptions, ExecuteSettings, _positions, execute
+from limber.stages.execute import (
+    ExecuteOptions,
+    ExecuteSettings,
+    _as_slow_as_checked,
+    _positions,
+    execute,
+)
 from limber.stages.loading import load_grasp_model, load_skeleton
 from limber.store import Branch
 
@@ -207,6 +214,20 @@ def test_the_plans_own_approach_is_taken(planned_folder):
             "x_m,y_m,z_m,phase\n" + "".join(f"{x},0,0.3,{phase}\n" for phase, x in rows))
     found = _positions(branch, "path", np.array([0, 0, 0.3]))
     np.testing.assert_allclose(found[:, 0], [0.0, 0.03, 0.02, 0.01])
+
+
+def test_a_plan_that_was_checked_in_motion_is_followed_no_faster():
+    """Its pace where that is slower, with a warning; the cell's and the settings' where not."""
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.6, 0, 0, 0, 0, 0)})
+    told = []
+    settings, slow = _as_slow_as_checked({"speed_m_s": 0.01, "acceleration_m_s2": 0.02},
+                                         ExecuteSettings(speed=0.03), cell,
+                                         Progress(on_warning=told.append))
+    assert settings.speed == 0.01 and "10.0 mm/s" in told[0]
+    assert slow.limits.acceleration_m_s2 == pytest.approx(0.02 * np.sqrt(0.5))
+    settings, same = _as_slow_as_checked({"speed_m_s": 0.2, "acceleration_m_s2": 2.0},
+                                         ExecuteSettings(speed=0.03), cell, Progress())
+    assert settings.speed == 0.03 and same.limits == cell.limits and len(told) == 1
 
 
 def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):

@@ -41,10 +41,50 @@ class Risk:
         """Whether every limit is kept with the confidence."""
         return not self.told()
 
+    def left(self, limits: Limits, path: ResolvedPath) -> Limits:
+        """Return what the estimate's branch may reach in motion where the motion keeps limits.
+
+        As far below them as standing still, at the pose where each is nearest.
+        """
+        standing = sizes(path.ahead)
+        return limits.tightened({
+            name: share * getattr(limits, name) / float(np.abs(standing[name]).max())
+            for name, share in self.excess.items()})
+
     def told(self) -> list[str]:
         """Return in words which limits are not kept with the confidence."""
         return [f"with the confidence asked for, {name.replace('_', ' ')} may be {100 * share:.0f} "
                 "% of what is allowed" for name, share in self.excess.items() if share > 1.0]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What limits are on, at poses of a motion that come near to them.
+
+    Attributes:
+        asked: The limits, by name.
+        values: On the estimate, shape [n] each.
+        slopes: Of their logs to log E at the control points, shape [n, K] each.
+    """
+
+    asked: dict[str, float]
+    values: dict[str, np.ndarray]
+    slopes: dict[str, np.ndarray]
+
+    def risk(self, covariance: np.ndarray, confidence: float) -> Risk:
+        """Return how the motion keeps its limits where log E has this covariance [K, K]."""
+        lost, factors, excess = 0.0, {}, {}
+        z = norm.ppf(1.0 - (1.0 - confidence) / max(len(self.asked), 1))
+        for name, limit in self.asked.items():
+            rows, values = self.slopes[name], self.values[name]
+            if not len(values):
+                continue
+            spread = np.sqrt(np.maximum(np.einsum("ik,kl,il->i", rows, covariance, rows), 1e-18))
+            lost += float(norm.sf(np.log(limit / values) / spread).max())
+            worst = int(np.argmax(values * np.exp(z * spread)))
+            factors[name] = float(np.exp(z * spread).max())
+            excess[name] = float((values * np.exp(z * spread))[worst] / limit)
+        return Risk(max(1.0 - lost, 0.0), factors, excess)
 
 
 @dataclass(frozen=True)
@@ -72,9 +112,23 @@ class YoungDoubt:
         white = generator.multivariate_normal(np.zeros(len(self.deviations)), self.correlation)
         return self.deviations * white
 
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of log E at the control points, shape [K, K]."""
+        return self.correlation * np.outer(self.deviations, self.deviations)
+
     def risk(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits, confidence: float,
              progress: Progress = SILENT) -> Risk:
         """Return how a motion keeps limits with a confidence between 0.5 and 1.
+
+        Raises:
+            ConvergenceError: the branch with other moduli cannot be solved at a pose.
+        """
+        return self.exposure(grasp_model, path, limits, progress).risk(self.covariance, confidence)
+
+    def exposure(self, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,
+                 progress: Progress = SILENT) -> "Exposure":
+        """Return how what limits are on changes with the moduli along a motion.
 
         Raises:
             ConvergenceError: the branch with other moduli cannot be solved at a pose.
@@ -84,21 +138,12 @@ class YoungDoubt:
         whole = path.approach.joined(path.solved)
         chosen = whole.take(_chosen(whole, asked))
         known = sizes(chosen)
-        near = {name: known[name] > _NEAR * limit for name, limit in asked.items()}
         slopes = self._slopes(grasp_model, chosen, asked, progress)
-        lost, factors, excess = 0.0, {}, {}
-        z = norm.ppf(1.0 - (1.0 - confidence) / max(len(asked), 1))
-        for name, limit in asked.items():
-            rows, values = slopes[name][near[name]], known[name][near[name]]
-            if not len(values):
-                continue
-            spread = np.sqrt(np.maximum(np.einsum("ik,kl,il->i", rows, self.correlation, rows),
-                                        1e-18))
-            lost += float(norm.sf(np.log(limit / values) / spread).max())
-            worst = int(np.argmax(values * np.exp(z * spread)))
-            factors[name] = float(np.exp(z * spread).max())
-            excess[name] = float((values * np.exp(z * spread))[worst] / limit)
-        return Risk(max(1.0 - lost, 0.0), factors, excess)
+        per_log = np.divide(1.0, self.deviations, out=np.zeros(len(self.deviations)),
+                            where=self.deviations > 0.0)
+        near = {name: known[name] > _NEAR * limit for name, limit in asked.items()}
+        return Exposure(asked, {name: known[name][near[name]] for name in asked},
+                        {name: slopes[name][near[name]] * per_log for name in asked})
 
     def _slopes(self, grasp_model: GraspModel, states: SolvedPoses, asked: dict[str, float],
                 progress: Progress) -> dict[str, np.ndarray]:

@@ -181,6 +181,17 @@ class Limits:
                 & (places <= self.high + 1e-6).all(axis=1))
 
 
+def with_unit(name: str) -> str:
+    """Return the key that a limit of ``UNITS`` has in files: its name and unit."""
+    return f"{name}_{UNITS[name].lower()}".rstrip("_")
+
+
+def limits_in_file(told: dict[str, dict[str, float]]) -> Limits:
+    """Return the limits that a plan's file tells, by the keys of :func:`with_unit`."""
+    return Limits(**{name: float(told[with_unit(name)]["limit"]) for name in UNITS
+                     if with_unit(name) in told})
+
+
 def sizes(states: SolvedPoses) -> dict[str, np.ndarray]:
     """Return what limits are on, by the names of ``UNITS``, shape [n] each."""
     return {"energy": states.energies, "force": states.force_sizes,

@@ -26,9 +26,12 @@ from limber.planning.field.sampling import displacements_at
 from limber.planning.full_check import broken_on_full_model, field_error, learnt
 from limber.planning.goals import Goal, GraspGoal, TargetGoal, default_goal
 from limber.planning.limits import Limits
+from limber.planning.motion_check import check_motion
 from limber.planning.planners.tree_search import SearchTree
 from limber.planning.regions import Ball, BoxRegion, Region, View
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
+from limber.planning.search_files import CostToGo
+from limber.planning.timing import DEFAULT_PACE, Pace
 from limber.progress import SILENT, Progress
 from limber.threads import one_thread
 
@@ -46,6 +49,8 @@ class PlannedMotion:
         baseline, plan: The shortest path (RRT*), and the gentle one.
         field: With what was learnt from plans that were refused.
         trees: What the planners with a tree searched, by their name.
+        pace: How fast the motion may be.
+        to_go: What a path from anywhere costs at least; None where no bound was asked for.
     """
 
     summary: dict[str, Any]
@@ -53,12 +58,14 @@ class PlannedMotion:
     plan: ResolvedPath
     field: EnergyField
     trees: dict[str, SearchTree]
+    pace: Pace = DEFAULT_PACE
+    to_go: CostToGo | None = None
 
 
 def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings, *,
                 limits: Limits | None = None, region: Region | None = None,
-                doubt: YoungDoubt | None = None, workers: int | None = None,
-                progress: Progress = SILENT) -> PlannedMotion:
+                doubt: YoungDoubt | None = None, pace: Pace | None = None,
+                workers: int | None = None, progress: Progress = SILENT) -> PlannedMotion:
     """Plan both paths on the field, and solve the branch along them.
 
     ``limits`` are the settings' where not given; those of a robot's cell come in this way, and
@@ -68,7 +75,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and it is planned anew, at most
     ``settings.replans`` times. So is one along which the field is too far off to have been the
-    gentlest; the last of those is passed on with a warning.
+    gentlest; the last of those is passed on with a warning. And so is a motion that breaks a limit
+    by the branch's inertia, however slow it was tried.
 
     Raises:
         InputError: the start is not allowed, or two goals are given.
@@ -81,8 +89,9 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     limits = limits or Limits.of(settings)
     if limits.obstacles:
         field = _among(field, grasp_model, limits, progress)
+    pace = pace or Pace(settings.speed, settings.acceleration)
     rounds: list[dict[str, Any]] = []
-    pair = baseline = None
+    pair = baseline = moving = None
     planned_limits, risks = limits, []
     for number in range(settings.replans + 1):
         ahead = progress.part(number / (settings.replans + 1), (number + 1) / (
@@ -105,11 +114,19 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             planned_limits = planned_limits.tightened(
                 {name: _RESERVE * share for name, share in risks[-1].excess.items() if share > 1.0})
         off = field_error(field, plan.solved)
+        is_last = number == settings.replans
+        is_near = is_last or off <= settings.field_error / 100.0
+        if settings.inertia and not broken and is_near and limits.asked():
+            moving = check_motion(
+                grasp_model, plan, limits if not risks else risks[-1].left(limits, plan), pace,
+                slowings=settings.slowings, workers=workers, progress=ahead.part(0.95, 1.0))
+            broken = moving.broken
+            planned_limits = planned_limits.tightened(
+                {name: _RESERVE * share for name, share in moving.excess.items() if share > 1.0})
         rounds.append({"broken": broken, "sample_count": len(field.samples.poses),
                        "margins": pair.margins, "field_energy_error": off,
                        "plan_seconds": planned - began, "check_seconds": perf_counter() - planned})
-        is_last = number == settings.replans
-        if not broken and (is_last or off <= settings.field_error / 100.0):
+        if not broken and is_near:
             break
         if is_last:
             raise _refused(broken, settings)
@@ -123,10 +140,16 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         summary["confidence"] = {"asked": settings.confidence, "kept_at_least": risks[-1].kept,
                                  "factors": risks[-1].factors,
                                  "of_a_plan_for_the_estimate": risks[0].kept}
+    if moving is not None:
+        summary["in_motion"] = moving.describe()
+        if moving.slowings:
+            progress.warn(f"The motion was slowed down to {1e3 * moving.pace.speed:.1f} mm/s: "
+                          "faster, the branch's inertia breaks a limit.")
     for message in _doubts(summary, settings.field_error, baseline, plan):
         progress.warn(message)
     return PlannedMotion(summary, baseline, plan, field, {
-        name: path.tree for name, path in pair.trees.items()})
+        name: path.tree for name, path in pair.trees.items()},
+        moving.pace if moving is not None else pace, pair.certificate.to_go)
 
 
 def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, progress: Progress,
@@ -232,9 +255,11 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
         "goal": goal.describe() | {"chosen": _is_chosen(settings)},
         "start_m": start, "seed": settings.seed, "planner": settings.planner,
         "engine": chosen_engine(settings.engine),
-        "certificate": pair.certificate.describe(),
-        "paths_on_field": {name: asdict(_on_field(field, points))
-                           for name, points in pair.compared.items()},
+        "certificate": pair.certificate.describe() | {"full_model": _on_full_model(
+            field, pair, after)},
+        "paths_on_field": {name: asdict(_on_field(field, points)) | {
+            "peak_strain": float(np.abs(field.load(resample(points, STEP), "strain")).max())}
+            for name, points in pair.compared.items()},
         "margins": pair.margins,
         "detour": pair.detour and pair.detour.describe(),
         "weights": {"deformation": settings.deformation_weight,
@@ -250,6 +275,24 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
         "length_added_percent": _change(before.length_m, after.length_m, 1),
         "convergence": {"baseline": pair.baseline.history, "plan": pair.plan.history},
     }
+
+
+def _on_full_model(field: EnergyField, pair: PathPair, found: PathMeasures) -> dict[str, Any]:
+    """Return what the bound says of every branch whose energy is nowhere farther below the field's
+    than 95 % of the samples were, each left out in turn, and how far above that the plan is.
+
+    With c = w E + l and E less an error e, but not below 0, c is nowhere less than l / (l + w e) of
+    what it was, and so is the bound.
+    """
+    weights = pair.cost.weights
+    cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
+    missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])
+    error = float(np.quantile(missed, 0.95)) if len(missed) else float(
+        np.abs(field.missed[:, 0]).max())
+    lower = pair.certificate.lower * weights.length / (weights.length + weights.energy * error)
+    cost = weights.energy * found.energy_integral_jm + weights.length * found.length_m
+    return {"field_error_j": error, "lower_bound": lower, "cost": cost,
+            "gap_percent": 100.0 * (cost / lower - 1.0) if lower > 0.0 else None}
 
 
 def _is_chosen(settings: PlanSettings) -> bool:

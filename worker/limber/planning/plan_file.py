@@ -12,8 +12,10 @@ branch, outward), ``strains`` and ``stresses_pa`` (largest in the branch), ``tip
 [n][6] where a robot is given; ``motion`` also ``phases``.
 
 ``timing`` has the limits of speed and acceleration that the times keep; a motion stands still at
-rest, at the path's end, and at rest again. ``limits`` has for each limit asked for its value, the
-peak of the motion and the margin. ``robot`` is null for plans that were not made in a robot's cell.
+rest, at the path's end, and at rest again. ``in_motion``, where limits were asked for, says that
+they hold at this pace with the branch's inertia, and the peaks moving and standing still.
+``limits`` has for each limit asked for its value, the peak of the motion standing still at each
+pose and the margin. ``robot`` is null for plans that were not made in a robot's cell.
 
 Format 1 had no version, no motion, and the sizes of forces alone. It is read as well.
 """
@@ -28,7 +30,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
 from limber.plain import plain
-from limber.planning.limits import UNITS, Limits
+from limber.planning.limits import Limits, with_unit
 from limber.planning.resolve import ResolvedPath, SolvedPoses
 from limber.planning.timing import DEFAULT_PACE, Pace, times_along
 from limber.reading import checked_as, read_json
@@ -99,10 +101,25 @@ class PlanGoal(_Told):
     tolerance_m: float | None = Field(None, gt=0)
 
 
+class PlanBranchBound(_Told):
+    """The same on the full model."""
+
+    field_error_j: float
+    gap_percent: float | None = None
+
+
 class PlanCertificate(_Told):
     """How far the path is from the best at most."""
 
     gap_percent: float | None = None
+    full_model: PlanBranchBound | None = None
+
+
+class PlanInMotion(_Told):
+    """The pace at which a plan keeps its limits with the branch's inertia."""
+
+    speed_m_s: float = Field(gt=0)
+    acceleration_m_s2: float = Field(gt=0)
 
 
 class PlanStep(_Told):
@@ -121,6 +138,7 @@ class PlanSummary(_Told):
     baseline: PathScores = PathScores()
     plan: PathScores = PathScores()
     certificate: PlanCertificate | None = None
+    in_motion: PlanInMotion | None = None
     energy_saved_percent: float | None = None
     length_added_percent: float | None = None
     convergence: dict[str, list[PlanStep]] = {}
@@ -167,12 +185,10 @@ def whole_motion(path: ResolvedPath, targets: tuple[str, ...] = (),
 
     Equilibria have no memory: on the way back the branch takes the states that it came by.
     """
-    there, approach = path.solved, path.approach
-    near = np.linalg.norm(approach.poses[-1, :3] - there.poses[0, :3]) < 1e-9
-    approach = approach.take(np.arange(len(approach.poses) - near))
-    count, ahead = len(approach.poses), approach.joined(there)
+    ahead, on_path = path.ahead, len(path.solved.poses)
     back = np.arange(len(ahead.poses) - 1)[::-1]
-    phases = ("approach",) * count + ("path",) * len(there.poses) + ("return",) * len(back)
+    phases = (("approach",) * (len(ahead.poses) - on_path) + ("path",) * on_path
+              + ("return",) * len(back))
     return way_of(ahead.joined(ahead.take(back)), targets, pace=pace,
                   stops=(len(ahead.poses) - 1,), phases=phases)
 
@@ -187,9 +203,7 @@ def limits_of_motion(motion: Way, limits: Limits) -> dict[str, dict[str, float]]
         if name not in peaks:
             continue
         peak = float(np.abs(peaks[name]).max())
-        unit = UNITS[name].lower()
-        found[f"{name}_{unit}" if unit else name] = {"limit": limit, "peak": peak,
-                                                     "margin": limit - peak}
+        found[with_unit(name)] = {"limit": limit, "peak": peak, "margin": limit - peak}
     return found
 
 

@@ -112,6 +112,13 @@ class ResolvedPath:
                             self.solved.force_sizes)
 
     @property
+    def ahead(self) -> SolvedPoses:
+        """Approach and path, the pose where they join once."""
+        joined = np.linalg.norm(self.approach.poses[-1, :3] - self.solved.poses[0, :3]) < 1e-9
+        kept = np.arange(len(self.approach.poses) - joined)
+        return self.approach.take(kept).joined(self.solved)
+
+    @property
     def unsolved_count(self) -> int:
         return len(self.reasons)
 

@@ -31,10 +31,10 @@ class PlanSettings(Settings):
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "max_stress", "workspace_low", "workspace_high", "confidence"),
-        "timing": ("speed", "acceleration"),
+        "timing": ("speed", "acceleration", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
-    experts = ("start_seed", "iterations", "engine", "replans", "field_error")
+    experts = ("start_seed", "iterations", "engine", "replans", "field_error", "slowings")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
@@ -87,6 +87,11 @@ class PlanSettings(Settings):
     speed: float = Field(0.02, gt=0, le=0.25, description="Of the gripper, at most [m/s].")
     acceleration: float = Field(0.1, gt=0, le=2.0, description=(
         "Of the gripper, at most [m/s^2]; the motion stands still at both ends of the path."))
+    inertia: bool = Field(True, description=(
+        "Where there are limits, the motion keeps them also in time, with the branch's inertia; "
+        "it is slowed down until it does. Otherwise they are kept at every pose, standing still."))
+    slowings: int = Field(4, ge=0, le=10, description=(
+        "How often at most to slow the motion down for that."))
     planner: Literal["eikonal", "d-rrt-star"] = Field("eikonal", description=(
         "eikonal: the cheapest way on a grid, refined, mostly within 1 % of the best possible "
         "path; d-rrt-star: the paper's D-RRT*. Either comes with a proven bound."))

@@ -1,14 +1,12 @@
 """Paths to a goal in a scene: their points, poses and energies, what was searched, the goal."""
 
-import csv
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from limber.errors import BranchFolderError
 from limber.planning.plan_file import read_plan_summary
-from limber.reading import read_arrays, read_columns, read_text, require_shapes
+from limber.planning.search_files import read_trees
+from limber.reading import read_arrays, read_columns, require_shapes
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of
 from limber.store import Branch
@@ -82,27 +80,11 @@ def _add_trees(data: SceneData, branch: Branch, plan: str) -> None:
     data.info["trees"] = {}
     if not branch.has(f"plans/{plan}-trees.csv"):
         return
-    path = branch.path(f"plans/{plan}-trees.csv")
-    rows = list(csv.DictReader(read_text(path, "search trees").splitlines()))
+    trees = read_trees(branch.path(f"plans/{plan}-trees.csv"))
     for planner, key in _TREES.items():
-        own = [row for row in rows if row.get("planner") == planner]
-        if not own:
-            continue
-        try:
-            nodes = np.array([[float(row[name]) for name in _POSITION] for row in own])
-            parents = np.array([int(row["parent"]) for row in own], np.int64)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise _damaged_trees(path, str(error)) from error
-        if not np.isfinite(nodes).all() or parents[0] != -1 or (
-                (parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
-            raise _damaged_trees(path, f"the nodes of {planner} are no tree")
-        data.arrays[f"tree:{key}"], data.arrays[f"tree_parent:{key}"] = nodes, parents
-        data.info["trees"][key] = {"title": planner, "node_count": len(nodes)}
-
-
-def _damaged_trees(path: Path, why: str) -> BranchFolderError:
-    return BranchFolderError(f"{path} holds no search trees ({why}).", "The file is damaged.",
-                             "Run `limber plan` again with --force.")
+        if planner in trees:
+            data.arrays[f"tree:{key}"], data.arrays[f"tree_parent:{key}"] = trees[planner]
+            data.info["trees"][key] = {"title": planner, "node_count": len(trees[planner][0])}
 
 
 def _add_energy_scale(data: SceneData) -> None:

@@ -100,8 +100,10 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
         progress.warn(warning)
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} names no plan.", "", "See plans/ in the branch folder.")
-    if warning := check_plan(_made_for(branch, name), cell):
+    told = _told(branch, name)
+    if warning := check_plan(told.get("robot"), cell):
         progress.warn(warning)
+    settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
     if options.arm:
         require_payload(cell)
     progress(0.02, "forces along the path")
@@ -121,13 +123,31 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     return _armed(branch, cell, name, settings, options, motion, result, progress)
 
 
-def _made_for(branch: Branch, name: str) -> dict[str, Any] | None:
-    """The robot that a plan's file names; None for one that was made for none."""
+def _told(branch: Branch, name: str) -> dict[str, Any]:
+    """What a plan's file says of the robot that it was made for and of its check in motion, as far
+    as it says it in the way of this program."""
     from limber.planning.plan_file import read_plan_summary
 
     file = f"plans/{name}.json"
-    found = read_plan_summary(branch.path(file)).get("robot") if branch.has(file) else None
-    return found if isinstance(found, dict) else None
+    found = read_plan_summary(branch.path(file)) if branch.has(file) else {}
+    return {key: found[key] for key in ("robot", "in_motion") if isinstance(found.get(key), dict)}
+
+
+def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSettings, cell: Cell,
+                        progress: Progress) -> tuple[ExecuteSettings, Cell]:
+    """Return settings and cell with the pace at which the plan keeps its limits in motion."""
+    if checked is None:
+        return settings, cell
+    speed, acceleration = checked["speed_m_s"], checked["acceleration_m_s2"]
+    if settings.speed > speed:
+        progress.warn(f"The plan keeps its limits with the branch's inertia up to "
+                      f"{1e3 * speed:.1f} mm/s, and is followed no faster; plan with a higher "
+                      "--speed if it shall be.")
+    limits = cell.limits.model_copy(update={
+        # The plan's law spends that share of it along the way, the robot's all.
+        "acceleration_m_s2": min(cell.limits.acceleration_m_s2, np.sqrt(0.5) * acceleration)})
+    return (settings.model_copy(update={"speed": min(settings.speed, speed)}),
+            cell.model_copy(update={"limits": limits}))
 
 
 def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: Progress,

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 
 _MOST_NODES = 2000  # of a search tree in its file; those that carry the most others stay
+_SETPOINT_RATE = 125.0  # [Hz] of poses in time, where no robot says its own
 _FRAME_RATE = 24.0  # frames a second when the motion is played; a pose is a frame
 _COLUMNS = ("s_m", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "energy_j", "force_n",
             "strain")
@@ -61,8 +62,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
          progress: Progress = SILENT) -> dict[str, Any]:
     """Plan paths on the branch's energy field.
 
-    Writes ``plans/NAME.json``, csv files of both paths, the whole motion and the search trees, and
-    the frames.
+    Writes ``plans/NAME.json``, csv files of both paths, the whole motion, its poses at the
+    controller's rate and the search trees, and the frames.
 
     Raises:
         BranchFolderError: no energy field, or one of another geometry or material.
@@ -75,15 +76,15 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     from limber.planning.plan import plan_motion
     from limber.planning.plan_file import whole_motion
     from limber.planning.timing import Pace
-    from limber.stages.loading import load_grasp_model
+    from limber.stages.loading import known_damping, load_grasp_model
     from limber.stages.plan_cell import reached_by, require_taken
     from limber.stages.plan_doubt import young_doubt
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name) or name.endswith(
-            ("-baseline", "-motion", "-trees")):
+            ("-baseline", "-bound", "-motion", "-setpoints", "-trees")):
         raise InputError(f"--name {name!r} cannot name a plan.",
-                         "It becomes part of file names; -baseline, -motion and -trees are its own "
-                         "tables.",
+                         "It becomes part of file names; -baseline, -bound, -motion, -setpoints "
+                         "and -trees are its own files.",
                          "Use letters, digits, dash, dot and underscore.")
     branch = Branch.open(folder)
     field_path = branch.require("energy.npz", "energy")
@@ -96,6 +97,8 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
             "The energy field is of another mesh, material, weight or of other targets.",
             "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
             "Run `limber energy` again.")
+    grasp_model = grasp_model.damped(known_damping(branch))
+    digests = digests | {"damping": repr(grasp_model.model.damping)}
     stiffer = _stiffer(branch) if settings.max_stress else 1.0
     digests = digests | {"stiffer": f"{stiffer:.6f}"}
     asked = Limits.of(settings, stiffer)
@@ -113,12 +116,13 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     with branch.stage(key, settings, **inputs) as stage:
         field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
-        found = plan_motion(field, grasp_model, settings, limits=limits,
-                            region=in_cell and in_cell.region, doubt=doubt, workers=workers,
-                            progress=progress)
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:
             pace = in_cell.slowed(pace)
+        found = plan_motion(field, grasp_model, settings, limits=limits,
+                            region=in_cell and in_cell.region, doubt=doubt, pace=pace,
+                            workers=workers, progress=progress)
+        pace = found.pace
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:
             progress(0.95, "inverse kinematics")
@@ -127,6 +131,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
             found.summary["robot"] = reached_by(in_cell.cell, motion, grasp_model.reach.axis,
                                                 limits.obstacles, pace.speed)
         progress(0.95, "writing")
+        rate = _SETPOINT_RATE if in_cell is None else in_cell.cell.arm.rate
+        found.summary["setpoint_rate_hz"] = rate
+        stage.path(f"plans/{name}-setpoints.csv").write_text(_setpoints(motion, pace, rate),
+                                                             encoding="utf-8")
         _write(stage, name, limits, pace, motion, grasp_model, found)
         stage.result.update(found.summary)
     progress(1.0, "planned")
@@ -204,6 +212,8 @@ def _write(stage: Stage, name: str, limits: Limits, pace: Pace, motion: Way,
     stage.path(f"plans/{name}-baseline.csv").write_text(_table(baseline), encoding="utf-8")
     stage.path(f"plans/{name}-motion.csv").write_text(_motion_table(motion), encoding="utf-8")
     stage.path(f"plans/{name}-trees.csv").write_text(_trees_table(found), encoding="utf-8")
+    if found.to_go is not None:
+        found.to_go.write(stage.path(f"plans/{name}-bound.npz"))
     displacements = found.plan.solved.displacements
     vertices = np.unique(grasp_model.mesh.surface_faces())
     frames = grasp_model.mesh.nodes[vertices] + displacements[:, vertices]
@@ -231,6 +241,17 @@ def _motion_table(motion: Way) -> str:
     rows = np.column_stack([motion.times, motion.poses, motion.forces, motion.torques,
                             motion.energies, motion.strains, *motion.targets.values()])
     return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
+
+
+def _setpoints(motion: Way, pace: Pace, rate: float) -> str:
+    """Return the grasp's poses every 1 / ``rate`` [s], and last at the motion's end."""
+    from limber.planning.timing import poses_at, time_law
+
+    end = motion.phases.count("approach") + motion.phases.count("path") - 1
+    law = time_law(motion.poses[:, :3], pace, (end,))
+    instants = np.arange(int(np.ceil(law.duration * rate)) + 1) / rate
+    return _csv(_MOTION_COLUMNS[:7], np.column_stack(
+        [instants, poses_at(motion.poses, law, instants, (end,))]))
 
 
 def _trees_table(found: PlannedMotion) -> str:
@@ -271,6 +292,7 @@ STAGE = StageDescription(
     "plan", 100, run, PlanInputs, PlanSettings, ParallelOptions, key="plan:{name}",
     reads=("mesh.vtu", "energy.npz"),
     writes=("plans/{name}.json", "plans/{name}.csv", "plans/{name}-baseline.csv",
-            "plans/{name}-motion.csv", "plans/{name}-trees.csv", "frames/{name}.pc2",
-            "frames/{name}.json", "frames/{name}.npz"),
+            "plans/{name}-motion.csv", "plans/{name}-setpoints.csv", "plans/{name}-trees.csv",
+            "plans/{name}-bound.npz", "frames/{name}.pc2", "frames/{name}.json",
+            "frames/{name}.npz"),
     tables=_tables)

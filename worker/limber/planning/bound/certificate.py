@@ -33,6 +33,7 @@ from limber.planning.bound.subsolution import (
 )
 from limber.planning.field.energy_field import LOADS
 from limber.planning.problem import GentleProblem
+from limber.planning.search_files import CostToGo
 from limber.progress import SILENT, Progress
 
 _FIRST_CELLS = 12_000  # of the first grid, over the whole sampled region
@@ -54,12 +55,14 @@ class Certificate:
         upper: Cost of the best path known, infinite without one.
         levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
         field_error_j: What was subtracted from the energy before bounding [J].
+        to_go: The bound from anywhere, on the first grid.
     """
 
     lower: float
     upper: float
     levels: list[dict[str, float]] = field(default_factory=list)
     field_error_j: float = 0.0
+    to_go: CostToGo | None = None
 
     @property
     def gap(self) -> float:
@@ -111,12 +114,13 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = _ENOUGH
         NoPathError: closed cells separate start and goal; it is proven that no path exists.
     """
     grid, cell = _first_grid(problem)
-    lower, upper, levels = 0.0, np.inf, []
+    lower, upper, levels, to_go = 0.0, np.inf, [], None
     began = perf_counter()
     for level in range(_LEVELS):
         progress(level / _LEVELS, "bounding the best path", lower=lower, upper=upper)
         found = _bound(problem, grid, cell)
         if level == 0:
+            to_go = found.to_go(grid)
             upper = improve(None)  # after the first bound, which may prove that there is no path
         upper = min(upper, improve(found.rough_path))
         lower = max(lower, min(found.lower, upper))
@@ -128,7 +132,7 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = _ENOUGH
         if _CHILDREN * keep.sum() > _MOST_CELLS:
             break
         grid, cell = _refined(grid, keep, cell)
-    return Certificate(lower, upper, levels, problem.field_error)
+    return Certificate(lower, upper, levels, problem.field_error, to_go)
 
 
 @dataclass(frozen=True)
@@ -145,6 +149,12 @@ class _Bounds:
     @property
     def open_cells(self) -> np.ndarray:
         return self.ground.open_cells
+
+    def to_go(self, grid: "_Grid") -> CostToGo:
+        """Return the bound at the centres of open cells."""
+        reached = self.open_cells & np.isfinite(self.to_goal)
+        costs = np.where(reached, np.maximum(self.to_goal - self.slack, 0.0), np.nan)
+        return CostToGo(grid.origin, grid.axes, grid.spacing, costs)
 
     def keep(self, upper: float) -> np.ndarray:
         """Return the cells through which a path could still be cheaper than ``upper``."""

@@ -7,7 +7,7 @@ by turning as the branch would, so each pose carries that natural rotation for t
 gripper that turns otherwise bends the branch more than planned here.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,7 @@ from limber.mechanics import (
     follow_poses,
 )
 from limber.mechanics.loaded import LoadedBranch
+from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.status import Status
 from limber.mechanics.strain import strain_state
 from limber.sparse import NotPositiveDefiniteError
@@ -86,6 +87,11 @@ class GraspModel:
     def mesh(self) -> TetMesh:
         """The hanging branch."""
         return self.branch.mesh
+
+    def damped(self, damping: RayleighDamping) -> "GraspModel":
+        """Return the branch with another damping, for motion in time."""
+        model = self.model.with_parameters(damping=damping)
+        return replace(self, branch=replace(self.branch, model=model))
 
     @cached_property
     def rest(self) -> StaticResult:

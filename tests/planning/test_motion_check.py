@@ -1,0 +1,66 @@
+"""Motions in time on the full model: slow ones are static, fast ones are slowed until they hold."""
+
+import numpy as np
+import pytest
+
+from limber.mechanics import simulate_dynamics
+from limber.mechanics.dynamics.motion import EnergyMomentumSettings
+from limber.planning.limits import Limits
+from limber.planning.motion_check import check_motion
+from limber.planning.resolve import resolve_path
+from limber.planning.timing import Pace, poses_at, time_law
+
+BRISK = Pace(0.25, 2.0)
+
+
+@pytest.fixture(scope="module")
+def bent(small_model):
+    """The weightless small branch, taken to the side by 5 cm."""
+    side = np.linspace(0.0, 1.0, 9)[1:, None] * np.array([0.0, 0.05, -0.003])
+    return resolve_path(small_model, small_model.rest_position + side,
+                        small_model.rest_position[None])
+
+
+def peak_force(small_model, path, pace):
+    """By the energy-momentum scheme, in steps of 4 ms: another scheme than the check's."""
+    poses = path.ahead.poses
+    law = time_law(poses[:, :3], pace)
+    times = np.arange(0.0, law.duration + 0.3, 0.004)
+    places = poses_at(poses, law, times)[:, :3]
+    found = simulate_dynamics(
+        small_model.model, grasp=small_model.grasp, times=times,
+        start=path.ahead.displacements[0], poses=np.hstack([places, 0 * places]),
+        settings=EnergyMomentumSettings(max_step=0.004))
+    assert found.converged
+    return np.linalg.norm(found.reaction_force, axis=1).max()
+
+
+def test_a_slow_motion_is_as_standing_still(small_model, bent):
+    """At 5 mm/s inertia adds under a percent to any limit's value, and nothing is slowed down."""
+    standing = bent.ahead.force_sizes.max()
+    limits = Limits(force=1.2 * standing, strain=0.2, axial_force=2 * standing)
+    found = check_motion(small_model, bent, limits, Pace(0.005, 0.02), slowings=2, workers=1)
+    assert not found.broken and found.slowings == 0
+    assert found.peaks["force"] == pytest.approx(standing, rel=0.01)
+    assert found.peaks["strain"] == pytest.approx(bent.ahead.strains.max(), rel=0.01)
+
+
+def test_a_motion_that_inertia_takes_over_a_limit_is_slowed_until_it_holds(small_model, bent):
+    """Fast, another scheme finds more force than is allowed; at the pace that was found, not."""
+    standing, brisk = bent.ahead.force_sizes.max(), peak_force(small_model, bent, BRISK)
+    assert brisk > 1.05 * standing
+    limit = 0.7 * standing + 0.3 * brisk
+    found = check_motion(small_model, bent, Limits(force=limit), BRISK, slowings=4, workers=1)
+    assert not found.broken and found.slowings >= 1
+    assert found.pace.speed < BRISK.speed
+    assert peak_force(small_model, bent, found.pace) <= 1.005 * limit
+    told = found.describe()
+    assert told["peaks"]["force_n"]["moving"] <= limit and told["slowings"] == found.slowings
+
+
+def test_what_no_pace_keeps_is_broken_with_its_place(small_model, bent):
+    """Standing still is over already: it is said at once, where."""
+    limits = Limits(force=0.9 * bent.ahead.force_sizes.max())
+    found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=4, workers=1)
+    assert found.slowings == 0 and found.excess["force"] > 1.0
+    assert "force in motion" in found.broken[0] and "at (" in found.broken[0]

@@ -1,0 +1,89 @@
+"""What a plan's search leaves beside it: ``plans/NAME-trees.csv`` and ``plans/NAME-bound.npz``.
+
+The trees: a row a node with its planner, its position, and the row of that tree that it hangs on
+(-1: none). The bound: what a path from anywhere costs at least, on the first grid of the
+certificate, which covers the whole sampled region.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from limber.errors import BranchFolderError
+from limber.reading import read_arrays, read_text, require_shapes
+
+_POSITION = ("x_m", "y_m", "z_m")
+_WHAT = "a plan's bound"
+
+
+@dataclass(frozen=True)
+class CostToGo:
+    """A lower bound on the cost of any path to the goal, from the centres of a grid's cells.
+
+    Attributes:
+        origin: Corner of the first cell [m], shape [3].
+        axes: Of the grid, unit, as rows, shape [3, 3].
+        spacing: Edge of a cell [m].
+        costs: NaN where no path leads, shape [nx, ny, nz].
+    """
+
+    origin: np.ndarray
+    axes: np.ndarray
+    spacing: float
+    costs: np.ndarray
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Return it at ``points`` [n, 3] between the centres, for pictures; NaN where unknown."""
+        from scipy.ndimage import map_coordinates
+
+        places = ((points - self.origin) @ self.axes.T) / self.spacing - 0.5
+        return map_coordinates(self.costs, places.T, order=1, cval=np.nan)
+
+    def write(self, path: Path) -> None:
+        """Write it as plain arrays."""
+        np.savez_compressed(path, origin_m=self.origin, axes=self.axes, costs=self.costs,
+                            spacing_m=np.array(self.spacing))
+
+    @classmethod
+    def read(cls, path: Path) -> "CostToGo":
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        arrays = read_arrays(path, _WHAT)
+        require_shapes(path, arrays, {"origin_m": (3,), "axes": (3, 3), "spacing_m": (),
+                                      "costs": ("x", "y", "z")}, _WHAT)
+        return cls(arrays["origin_m"], arrays["axes"], float(arrays["spacing_m"]),
+                   arrays["costs"])
+
+
+def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return nodes [n, 3] [m] and parents [n] of each planner's search tree, by planner.
+
+    A parent comes before its children; the first node is the start and has the parent -1.
+
+    Raises:
+        BranchFolderError: the file is damaged.
+    """
+    rows = list(csv.DictReader(read_text(path, "search trees").splitlines()))
+    found = {}
+    for planner in dict.fromkeys(row.get("planner") or "" for row in rows):
+        own = [row for row in rows if row.get("planner") == planner]
+        try:
+            nodes = np.array([[float(row[name]) for name in _POSITION] for row in own])
+            parents = np.array([int(row["parent"]) for row in own], np.int64)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise _damaged(path, str(error)) from error
+        if not np.isfinite(nodes).all() or parents[0] != -1 or (
+                (parents[1:] < 0) | (parents[1:] >= np.arange(1, len(parents)))).any():
+            raise _damaged(path, f"the nodes of {planner} are no tree")
+        found[planner] = nodes, parents
+    return found
+
+
+def _damaged(path: Path, why: str) -> BranchFolderError:
+    return BranchFolderError(f"{path} holds no search trees ({why}).", "The file is damaged.",
+                             "Run `limber plan` again with --force.")
