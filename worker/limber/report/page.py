@@ -365,6 +365,17 @@ def _plan(branch: Branch, name: str) -> Section:
     if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
         section.text.append(f"Certificate: on the energy field it is at most {gap:.1f} % above the "
                             "best possible path; no path is cheaper than the lower bound.")
+    if whole := (plan.get("certificate") or {}).get("full_model"):
+        if whole["gap_percent"] is not None:
+            section.text.append(
+                f"On the full model, the field being off by {1e3 * whole['field_error_j']:.2g} mJ: "
+                f"at most {whole['gap_percent']:.1f} % above the best possible path.")
+    if moving := plan.get("in_motion"):
+        peaks = ", ".join(f"{key} {peak['moving']:.3g} ({peak['standing']:.3g} standing still)"
+                          for key, peak in moving["peaks"].items())
+        section.text.append(
+            f"Moved in time on the full model, with inertia, at {1e3 * moving['speed_m_s']:.0f} "
+            f"mm/s, the whole motion keeps its limits: peaks {peaks}.")
     for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
     return section

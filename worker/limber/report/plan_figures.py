@@ -1,5 +1,6 @@
 """Figures of a plan: energy along both paths, and both paths over a slice of the energy field."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -7,9 +8,11 @@ import numpy as np
 from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
+from limber.planning.search_files import CostToGo, read_trees
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _COLOURS = {"baseline": "#c0504d", "plan": "#1f5fa8"}
@@ -25,13 +28,19 @@ def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
         (along_paths(plan), "Energy above the hanging state (strain and weight), gripper force and "
                             "largest strain along both paths, on the full model; the energy of the "
                             "field that the planner saw is dashed."),
-        (paths_over_slice(field, plan), "Both paths over the energy field, in the plane that "
-                                        "fits them best; white where the branch was not sampled. "
-                                        "The cross is the rest pose."),
+        (paths_over_slice(field, plan, _tree_of(branch, name)),
+         "Both paths over the energy field, in the plane that fits them best; white where the "
+         "branch was not sampled. The cross is the rest pose; grey, as seen onto that plane, what "
+         "D-RRT* searched."),
         (convergence(plan), "Cost of the best path so far over the planner's iterations, relative "
                             "to the last."),
     ]
     if plan.summary.get("certificate"):
+        if branch.has(f"plans/{name}-bound.npz"):
+            bound = CostToGo.read(branch.path(f"plans/{name}-bound.npz"))
+            shown.append((paths_over_bound(field, bound, plan), "Both paths over the bound, in the "
+                          "same plane: what any path from there to the goal costs at least. The "
+                          "gentlest path runs down it as steeply as it falls."))
         shown.append((certificate(plan), "What the gentle path costs, and what no path on the "
                       "energy field costs less than, as the grid of the proof is refined."))
     if plan.summary.get("detour"):
@@ -62,36 +71,115 @@ def along_paths(plan: PlanFile) -> "Figure":
     return figure
 
 
-def paths_over_slice(field: EnergyField, plan: PlanFile) -> "Figure":
-    """Draw both paths over the energy field in their common plane."""
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
+def paths_over_slice(field: EnergyField, plan: PlanFile,
+                     tree: tuple[np.ndarray, np.ndarray] | None = None) -> "Figure":
+    """Draw both paths, and a search tree, over the energy field in the paths' common plane."""
+    from matplotlib.collections import LineCollection
 
-    paths = {key: way.poses[:, :3] for key, way in _ways(plan).items()}
-    origin, across, up = _plane(np.concatenate(list(paths.values())))
-    flat = {key: (path - origin) @ np.stack([across, up], axis=1) for key, path in paths.items()}
-    rest = (field.rest - origin) @ np.stack([across, up], axis=1)
-    x, y, energy = _slice(field, origin, across, up, np.concatenate([*flat.values(), rest[None]]))
-    # As high as the slice needs at equal scales: paths are often long and flat.
-    height = 6.2 * float(np.ptp(y) / max(np.ptp(x), 1e-9)) + 1.0
-    figure = Figure(figsize=(8, float(np.clip(height, 2.8, 6.5))), layout="constrained")
-    axis = figure.subplots()
+    view = _View.of(field, plan)
+    energy = field.energy(view.points)
+    energy[~field.region.contains(view.points)] = np.nan
+    figure, axis = view.figure()
     # Nearly all of the paths' range of energy, not the few stiff corners of the slice.
     top = max(1.5 * max(way.energies.max() for way in _ways(plan).values()), 1e-9)
-    levels = MaxNLocator(14).tick_values(0.0, 1e3 * top)
-    filled = axis.contourf(1e3 * x, 1e3 * y, np.ma.masked_invalid(1e3 * energy), levels=levels,
-                           cmap="viridis", extend="max")
-    figure.colorbar(filled, ax=axis, label="energy above rest [mJ]")
-    for key, points in flat.items():
-        axis.plot(*(1e3 * points.T), color="white", lw=4)
-        axis.plot(*(1e3 * points.T), color=_COLOURS[key], lw=2, label=_LABELS[key])
-        axis.plot(*(1e3 * points[-1]), "o", color=_COLOURS[key], mec="white")
-    axis.plot(*(1e3 * flat["plan"][0]), "s", color="black", mec="white", label="start")
-    axis.plot(*(1e3 * rest), "x", color="black", ms=9, mew=2, label="rest pose")
-    axis.set(xlabel="in the plane, along the straight line [mm]", ylabel="upwards [mm]",
-             aspect="equal")
-    axis.legend(loc="best", fontsize=8, framealpha=0.85)
+    view.fill(figure, axis, 1e3 * energy, 1e3 * top, "energy above rest [mJ]", "viridis")
+    if tree is not None:
+        nodes, parents = 1e3 * view.flat(tree[0]), tree[1]
+        axis.add_collection(LineCollection(
+            np.stack([nodes[1:], nodes[parents[1:]]], axis=1), colors="#dddddd", linewidths=0.4,
+            alpha=0.7), autolim=False)
+    view.draw_paths(axis)
     return figure
+
+
+def paths_over_bound(field: EnergyField, bound: CostToGo, plan: PlanFile) -> "Figure":
+    """Draw both paths over the least cost of any path to the goal, in the paths' common plane."""
+    view = _View.of(field, plan)
+    cost = bound.at(view.points)
+    cost[~field.region.contains(view.points)] = np.nan
+    figure, axis = view.figure()
+    known = cost[np.isfinite(cost)]
+    top = float(known.max()) if len(known) else 1.0
+    view.fill(figure, axis, cost, top, "cost to the goal at least", "cividis", lines=True)
+    view.draw_paths(axis)
+    return figure
+
+
+@dataclass(frozen=True)
+class _View:
+    """The plane that fits both paths best, a grid of points in it, and the paths on it [m]."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    paths: dict[str, np.ndarray]
+    rest: np.ndarray
+
+    @classmethod
+    def of(cls, field: EnergyField, plan: PlanFile) -> "_View":
+        paths = {key: way.poses[:, :3] for key, way in _ways(plan).items()}
+        origin, across, up = _plane(np.concatenate(list(paths.values())))
+        axes = np.stack([across, up])
+        flat = {key: (path - origin) @ axes.T for key, path in paths.items()}
+        rest = (field.rest - origin) @ axes.T
+        shown = np.concatenate([*flat.values(), rest[None]])
+        low, high = shown.min(axis=0), shown.max(axis=0)
+        margin = 0.25 * (high - low).max()
+        x, y = (np.linspace(low[k] - margin, high[k] + margin, _GRID) for k in range(2))
+        return cls(origin, axes, x, y, flat, rest)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Of the grid [m], shape [n, 3]."""
+        across, up = self.axes
+        return (self.origin + self.x[None, :, None] * across
+                + self.y[:, None, None] * up).reshape(-1, 3)
+
+    def flat(self, points: np.ndarray) -> np.ndarray:
+        """Return points [n, 3] as seen onto the plane [m], [n, 2]."""
+        return (points - self.origin) @ self.axes.T
+
+    def figure(self) -> tuple["Figure", "Axes"]:
+        from matplotlib.figure import Figure
+
+        # As high as the slice needs at equal scales: paths are often long and flat.
+        height = 6.2 * float(np.ptp(self.y) / max(np.ptp(self.x), 1e-9)) + 1.0
+        figure = Figure(figsize=(8, float(np.clip(height, 2.8, 6.5))), layout="constrained")
+        axis = figure.subplots()
+        axis.set(xlabel="in the plane, along the straight line [mm]", ylabel="upwards [mm]",
+                 aspect="equal")
+        return figure, axis
+
+    def fill(self, figure: "Figure", axis: "Axes", values: np.ndarray, top: float, label: str,
+             colours: str, *, lines: bool = False) -> None:
+        """Fill the plane by ``values`` at the grid's points up to ``top``; NaN stays white."""
+        from matplotlib.ticker import MaxNLocator
+
+        levels = MaxNLocator(14).tick_values(0.0, top)
+        masked = np.ma.masked_invalid(values.reshape(_GRID, _GRID))
+        filled = axis.contourf(1e3 * self.x, 1e3 * self.y, masked, levels=levels, cmap=colours,
+                               extend="max")
+        if lines:
+            axis.contour(1e3 * self.x, 1e3 * self.y, masked, levels=levels, colors="white",
+                         linewidths=0.4)
+        figure.colorbar(filled, ax=axis, label=label)
+
+    def draw_paths(self, axis: "Axes") -> None:
+        for key, points in self.paths.items():
+            axis.plot(*(1e3 * points.T), color="white", lw=4)
+            axis.plot(*(1e3 * points.T), color=_COLOURS[key], lw=2, label=_LABELS[key])
+            axis.plot(*(1e3 * points[-1]), "o", color=_COLOURS[key], mec="white")
+        axis.plot(*(1e3 * self.paths["plan"][0]), "s", color="black", mec="white", label="start")
+        axis.plot(*(1e3 * self.rest), "x", color="black", ms=9, mew=2, label="rest pose")
+        axis.set(xlim=1e3 * self.x[[0, -1]], ylim=1e3 * self.y[[0, -1]])
+        axis.legend(loc="best", fontsize=8, framealpha=0.85)
+
+
+def _tree_of(branch: Branch, name: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return nodes [m] and parents of what D-RRT* searched; None where it is not kept."""
+    file = f"plans/{name}-trees.csv"
+    return read_trees(branch.path(file)).get("D-RRT*") if branch.has(file) else None
 
 
 def convergence(plan: PlanFile) -> "Figure":
@@ -174,14 +262,3 @@ def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     up = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.2 else directions[1]
     return origin, np.cross(up, normal), up
-
-
-def _slice(field: EnergyField, origin: np.ndarray, across: np.ndarray, up: np.ndarray,
-           shown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = 0.25 * (high - low).max()
-    x, y = (np.linspace(low[k] - margin, high[k] + margin, _GRID) for k in range(2))
-    points = (origin + x[None, :, None] * across + y[:, None, None] * up).reshape(-1, 3)
-    energy = field.energy(points)
-    energy[~field.region.contains(points)] = np.nan
-    return x, y, energy.reshape(_GRID, _GRID)
