@@ -75,6 +75,9 @@ class StageOperator(WorkerOperator):
             position = result.get("grasp_position_m") or result.get("position_m")
             if position:
                 self.report({"INFO"}, f"It comes to rest at {position} m")
+        if self.stage_name == "suggest-pull" and (best := result.get("best")):
+            self.report({"INFO"}, f"Hold it at {best['grasp_point_m']} m and pull to "
+                                  f"{best['end_m']} m")
         if bpy.app.background or not _is_seen(self.stage):
             return
         # The folder that this job filled, whatever the scene names by now.

@@ -109,7 +109,8 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
     ("material", ["limber.color_by", "limber.simulate", "limber.load"]),
     ("pulls", ["limber.import_pull", "limber.virtual_pull", "limber.export_pull"]),
-    ("estimate", ["limber.estimate", "limber.swing", "limber.vibration", "limber.predict"]),
+    ("estimate", ["limber.estimate", "limber.swing", "limber.vibration", "limber.predict",
+                  "limber.suggest_pull"]),
     ("goal", ["limber.energy", "limber.target"]), ("plan", ["limber.plan"]),
     ("robot", ["limber.execute"]),
     ("report", ["limber.report", "limber.open_report", "limber.export"])])

@@ -1,0 +1,88 @@
+"""The next pull: what it would tell, what it would risk, whether a plan is served by it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError, WorkError
+from limber.estimation.next_pull import Cell, Known, PullChoice, _of_moduli, expected_pull, suggest
+from limber.estimation.settings import EstimateSettings
+from limber.planning.chance import Exposure
+from limber.stages.loading import load_subject
+from limber.stages.suggest_pull import SuggestPullSettings, suggest_pull, verdict
+from limber.store import Branch
+
+
+@pytest.fixture(scope="module")
+def subject(planned_branch):
+    return load_subject(Branch.open(planned_branch), EstimateSettings(fractions=(0.3, 0.6)))
+
+
+def test_information_adds_up_as_gauss_has_it():
+    """Two unknowns, one of them no modulus; a repeat error that both moduli share."""
+    jacobian = np.array([[2.0, 0.0, 1.0], [0.0, 3.0, 1.0], [0.0, 0.0, 4.0]])
+    found = np.linalg.inv(_of_moduli(jacobian, 2, 0.1))
+    wanted = np.linalg.inv(jacobian.T @ jacobian)[:2, :2] + 0.01
+    assert np.allclose(found, wanted)
+    known = Known(np.diag([0.04, 0.09]), 0.01 * np.eye(2))
+    after = known.after(np.diag([25.0, 0.0]))
+    assert np.allclose(after.total, np.diag([0.02 + 0.01, 0.09 + 0.01]))
+    assert known.gain(after) == pytest.approx(0.5 * np.log2(0.05 / 0.03))
+
+
+def test_a_longer_pull_tells_more_and_strains_more(subject):
+    """Each step: more bits, more strain, more force; the grasp goes about as far as asked."""
+    known = Known.nothing(2)
+    pulls = [expected_pull(PullChoice(0.8, 0.5, reach), subject, subject.start, known, Cell())
+             for reach in (0.05, 0.2)]
+    assert pulls[1].bits > pulls[0].bits > 0.0
+    assert pulls[1].peak_strain > 2.0 * pulls[0].peak_strain
+    assert pulls[1].peak_force > 2.0 * pulls[0].peak_force
+    for pull, reach in zip(pulls, (0.05, 0.2), strict=True):
+        assert np.linalg.norm(pull.end - pull.point) == pytest.approx(reach * 0.8 * 0.5, rel=0.1)
+    after = known.after(pulls[1].information)
+    assert (np.diag(after.total) < np.diag(known.total)).all()
+
+
+def test_no_pull_within_the_strain_is_said(subject):
+    with pytest.raises(WorkError, match="No pull keeps the limits"):
+        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=1e-9,
+                workers=1)
+
+
+def exposed(slope, value=0.8):
+    return Exposure({"force": 1.0}, {"force": np.array([value])},
+                    {"force": np.array([[slope, 0.0]])})
+
+
+@pytest.mark.parametrize(("value", "now", "after", "worth", "words"), [
+    (0.5, 0.2, 0.1, False, "none holds it back"),
+    (0.8, 0.25, 0.05, True, "does not keep force"),
+    (0.95, 0.25, 0.2, True, "not expected to after one"),
+    (0.8, 0.13, 0.04, True, "more of that could be used"),
+    (0.8, 0.13, 0.12, False, "only"),
+])
+def test_a_pull_is_worth_it_where_it_changes_what_a_plan_may_do(value, now, after, worth, words):
+    """By the share of its limit that the plan takes and how well the modulus is known."""
+    risks = [exposed(1.0, value).risk(np.diag([deviation**2, 1.0]), 0.95)
+             for deviation in (now, after)]
+    found, why = verdict(*risks, 0.95)
+    assert found is worth and words in why
+
+
+def test_the_stage_writes_the_best_pull_and_answers_for_a_plan(planned_branch, tmp_path):
+    """Best first; a plan without limits needs no other pull; wrong places are refused."""
+    folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
+    settings = SuggestPullSettings(fractions=(0.8,), max_strain=0.05)
+    result = suggest_pull(folder, settings, plan="there", workers=1)
+    written = json.loads((folder / "suggested_pull.json").read_text())
+    shares = [pull["bits_per_percent_strain"] for pull in [written["best"], *written["others"]]]
+    assert shares == sorted(shares, reverse=True) and len(shares) > 4
+    assert written["best"]["peak_strain"] <= 0.05
+    assert all(after < now for after, now in zip(
+        written["best"]["young_deviation"], written["young_deviation_now"], strict=True))
+    assert result["plan"]["worth"] is False and "no limit" in result["plan"]["why"]
+    with pytest.raises(InputError, match="main path"):
+        suggest_pull(folder, SuggestPullSettings(fractions=(1.5,)))

@@ -1,0 +1,253 @@
+"""What a pull that nobody has made yet would tell of Young's modulus, and what it would risk.
+
+The pull is made on the branch as it is estimated, without noise, and put into the very problem that
+a fit would solve: its derivatives, with errors of cell and sensors eliminated, are the information
+that such a pull holds (Fisher's; Pukelsheim 2006, Optimal Design of Experiments, 3). Added to what
+the pulls so far have told it gives the covariance to expect. What every pull of this scan has in
+common, the errors of shape and mesh, no pull takes away.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from limber.errors import LimberError, WorkError
+from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.objective import Objective
+from limber.estimation.parameters import LINK_DEVIATION, Values
+from limber.estimation.preparation import forwards_of, parameter_space
+from limber.estimation.settings import EstimateSettings
+from limber.estimation.subject import Subject
+from limber.jobs import run_tasks
+from limber.mechanics.points import point_operator
+from limber.mechanics.strain import strain_state
+from limber.progress import SILENT, Progress
+from limber.recordings.calibration import CalibrationEntry, calibration_of
+from limber.recordings.grasping import grasp_on
+from limber.recordings.recording import (
+    GraspEntry,
+    Observations,
+    Pull,
+    PullEntry,
+    SensorEntry,
+)
+
+UNKNOWN_SCALE = 1.15
+"""Deviation of the common log E before anything is measured: a factor of ten within its 95 %."""
+_PROBE_REACH = 0.15  # of the arc length: at which places and directions are compared
+_REACHES = (0.05, 0.1, 0.25, 0.35)  # then tried for the best of them
+_DIRECTIONS = 4
+_GOOD = 2  # places and directions that other reaches are tried for
+_FRAMES = 12
+_SECONDS = 6.0
+
+
+@dataclass(frozen=True)
+class Known:
+    """Covariance of log E at the control points, [K, K] each.
+
+    Attributes:
+        measured: Of what pulls tell: another one makes it smaller.
+        common: Of what all pulls of this scan have in common.
+    """
+
+    measured: np.ndarray
+    common: np.ndarray
+
+    @classmethod
+    def nothing(cls, count: int) -> "Known":
+        """Before any pull: moduli within a factor of ten, neighbours alike as on branches."""
+        apart = 0.5 * LINK_DEVIATION**2 * np.eye(count)
+        return cls(UNKNOWN_SCALE**2 + apart, np.zeros((count, count)))
+
+    @property
+    def total(self) -> np.ndarray:
+        return self.measured + self.common
+
+    def after(self, information: np.ndarray) -> "Known":
+        """Return what is known with a pull of this information [K, K] besides."""
+        measured = np.linalg.inv(np.linalg.inv(self.measured) + information)
+        return replace(self, measured=0.5 * (measured + measured.T))
+
+    def gain(self, after: "Known") -> float:
+        """Return by how many bits ``after`` says more."""
+        return 0.5 * float(np.linalg.slogdet(self.total)[1]
+                           - np.linalg.slogdet(after.total)[1]) / np.log(2.0)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What a pull would be measured with."""
+
+    sensor: SensorEntry = SensorEntry()  # noqa: RUF009 (frozen)
+    calibration: CalibrationEntry = CalibrationEntry()  # noqa: RUF009 (frozen)
+
+    @classmethod
+    def of(cls, entry: PullEntry | None) -> "Cell":
+        """Return the cell of an earlier pull; without one, as one set up with care."""
+        return cls() if entry is None else cls(entry.sensor, calibration_of(entry))
+
+
+@dataclass(frozen=True)
+class PullChoice:
+    """A pull to think of: its place on the main path, the direction in which it starts [rad], and
+    its travel over the arc length."""
+
+    fraction: float
+    phase: float
+    reach: float
+
+
+@dataclass(frozen=True)
+class ExpectedPull:
+    """What comes of it.
+
+    Attributes:
+        choice: Which pull.
+        point, end: Of the grasp before and after [m], shape [3].
+        peak_force: Of the gripper [N].
+        peak_strain: Largest principal strain anywhere in the branch.
+        information: Of log E at the control points, shape [K, K].
+        bits: What it tells beyond what is known.
+    """
+
+    choice: PullChoice
+    point: np.ndarray
+    end: np.ndarray
+    peak_force: float
+    peak_strain: float
+    information: np.ndarray
+    bits: float
+
+    @property
+    def bits_per_percent(self) -> float:
+        """What it tells for each percent of strain."""
+        return self.bits / (100.0 * self.peak_strain)
+
+
+@dataclass(frozen=True)
+class Suggested:
+    """Pulls, the best first; those that would strain or pull too much; and how many cannot be."""
+
+    pulls: list[ExpectedPull]
+    too_much: list[ExpectedPull]
+    failed_count: int
+
+
+def suggest(subject: Subject, values: Values, known: Known, cell: Cell,
+            fractions: tuple[float, ...], *, max_strain: float, max_force: float = np.inf,
+            workers: int | None = None, progress: Progress = SILENT) -> Suggested:
+    """Return pulls by what they tell for each percent of strain.
+
+    Places and directions are compared at one travel; for the best of them others are tried.
+
+    Args:
+        values: As estimated, or likely.
+        fractions: Places on the main path where the branch may be held.
+
+    Raises:
+        WorkError: no pull keeps the limits.
+    """
+    phases = 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    first = [PullChoice(fraction, float(phase), _PROBE_REACH)
+             for fraction in fractions for phase in phases]
+    found = _all(first, subject, values, known, cell, workers, progress.part(0.0, 0.6))
+    best = sorted((one for one in found if one is not None),
+                  key=lambda one: -one.bits_per_percent)[:_GOOD]
+    found += _all([replace(one.choice, reach=reach) for one in best for reach in _REACHES],
+                  subject, values, known, cell, workers, progress.part(0.6, 1.0))
+    made = sorted((one for one in found if one is not None), key=lambda one: -one.bits_per_percent)
+    fit = [one.peak_strain <= max_strain and one.peak_force <= max_force for one in made]
+    kept = [one for one, keeps in zip(made, fit, strict=True) if keeps]
+    if not kept:
+        least = min((one.peak_strain for one in made), default=np.inf)
+        raise WorkError(
+            f"No pull keeps the limits: of {len(found)}, {len(found) - len(made)} cannot be made "
+            f"and the gentlest strains the branch by {100 * least:.2g} %.",
+            "Even short pulls are too much for it, or it has no room.",
+            "Allow more with --max-strain or --max-force, or hold it farther out (--fractions).")
+    return Suggested(kept, [one for one, keeps in zip(made, fit, strict=True) if not keeps],
+                     len(found) - len(made))
+
+
+def _all(choices: list[PullChoice], subject: Subject, values: Values, known: Known, cell: Cell,
+         workers: int | None, progress: Progress) -> list[ExpectedPull | None]:
+    return run_tasks(_tried, [(choice, subject, values, known, cell) for choice in choices],
+                     workers=workers, progress=progress, message="pulls to think of")
+
+
+def _tried(choice: PullChoice, subject: Subject, values: Values, known: Known, cell: Cell,
+           ) -> ExpectedPull | None:
+    """Return what comes of a pull; None where the branch cannot be pulled so."""
+    try:
+        return expected_pull(choice, subject, values, known, cell)
+    except LimberError:
+        return None
+
+
+def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: Known,
+                  cell: Cell) -> ExpectedPull:
+    """Make a pull on the branch as it is thought to be, and see what it tells.
+
+    Raises:
+        WorkError: the branch cannot be pulled so.
+    """
+    pull, displacements = _without_noise(choice, subject, values, cell)
+    settings = EstimateSettings(key_frames=4)
+    at = replace(subject, start=values, model=_model(subject, values))
+    forwards = forwards_of([pull], at, settings)
+    space = parameter_space(at, forwards, settings)
+    objective = Objective(forwards, space, force_sigma=[cell.sensor.force_sigma_n])
+    evaluation = objective.evaluate(space.pack(values), jacobian=True)
+    if evaluation is None:
+        raise WorkError("The pull's forces lead nowhere.", "Its branch finds no rest under them.",
+                        "Choose another pull.")
+    information = _of_moduli(evaluation.jacobian, space.group_count, cell.calibration.repeat_sigma)
+    strain = max(float(np.abs(strain_state(at.model, u).principal_strain).max())
+                 for u in displacements)
+    return ExpectedPull(choice, pull.poses[0, :3], pull.poses[-1, :3],
+                        float(np.linalg.norm(pull.wrenches[:, :3], axis=1).max()), strain,
+                        information, known.gain(known.after(information)))
+
+
+def _of_moduli(jacobian: np.ndarray, count: int, repeat_sigma: float) -> np.ndarray:
+    """Return the information of the first ``count`` free values, the others being unknown too."""
+    whole = jacobian.T @ jacobian
+    cross = whole[:count, count:]
+    found = whole[:count, :count]
+    if cross.size:
+        found = found - cross @ np.linalg.solve(whole[count:, count:], cross.T)
+    # One recording's stiffness differs from another's: an error that all moduli share.
+    along = found.sum(axis=1)
+    if repeat_sigma > 0.0:
+        found = found - np.outer(along, along) / (repeat_sigma**-2 + along.sum())
+    return 0.5 * (found + found.T)
+
+
+def _model(subject: Subject, values: Values):
+    return subject.model.with_parameters(young=subject.young(values), poisson=values.poisson,
+                                         density=values.density)
+
+
+def _without_noise(choice: PullChoice, subject: Subject, values: Values, cell: Cell,
+                   ) -> tuple[Pull, list[np.ndarray]]:
+    """Return a pull as a perfect cell would record it, and the branch's states [m]."""
+    skeleton, model = subject.skeleton, _model(subject, values)
+    point = skeleton.point_at(choice.fraction)
+    times = np.linspace(0.0, _SECONDS, _FRAMES)
+    entry = PullEntry(
+        calibration=cell.calibration, sensor=cell.sensor, weightless=not model.gravity.any(),
+        grasp=GraspEntry(point_m=tuple(map(float, point)), mode="pinned",
+                         radius_m=float(1.3 * skeleton.radius_at(choice.fraction))),
+        rest_points_m=tuple(tuple(map(float, p)) for p in subject.control_points),
+        source="limber suggest-pull")
+    grasp = grasp_on(subject.mesh, entry.grasp)
+    arc = choice.fraction * skeleton.arc_length[skeleton.main_path()[-1]]
+    made = moved(model, grasp, MotionWanted(
+        kind="pull", point=point, axis=point - skeleton.nodes[0], travel=choice.reach * arc,
+        turn=0.0, phase=choice.phase, times=times, weight=np.zeros(3)))
+    operator = point_operator(subject.mesh, subject.control_points)
+    seen = np.array([subject.control_points + (operator @ u.ravel()).reshape(-1, 3)
+                     for u in made.displacements])
+    return (Pull("suggested", entry, times, made.poses, made.wrenches,
+                 Observations(times, seen)), made.displacements)
