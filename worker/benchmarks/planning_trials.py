@@ -11,7 +11,7 @@ from limber.planning.compare import plan_within, random_start
 from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.field.grasp_model import GraspModel
-from limber.planning.goals import GraspGoal
+from limber.planning.goals import GraspGoal, goal_points
 from limber.planning.limits import Limits
 from limber.planning.plan import plan_motion
 from limber.planning.problem import GentleProblem
@@ -47,6 +47,9 @@ class Trial:
     field_error: float = np.nan
     limited: str = ""
     excess: float = np.nan
+    moving_seconds: float = np.nan
+    moving_ratio: float = np.nan
+    slowings: float = np.nan
     trouble: str = ""
 
     def __post_init__(self) -> None:
@@ -121,6 +124,9 @@ def _with_limit(trial: Trial, model: GraspModel, known: EnergyField, start: np.n
         return
     states = motion.plan.approach.joined(motion.plan.solved)
     trial.limited = f"accepted after {len(motion.summary['rounds'])}"
+    moving = motion.summary["in_motion"]
+    trial.moving_seconds, trial.slowings = moving["seconds"], moving["slowings"]
+    trial.moving_ratio = moving["peaks"]["force_n"]["moving"] / cap
     # Every pose again, from rest, at half the spacing: not the states that accepted it.
     path = motion.plan.solved.poses[:, :3]
     again = resolve_path(model, resample(path, 0.0025), motion.plan.approach.poses[:, :3])
@@ -128,21 +134,25 @@ def _with_limit(trial: Trial, model: GraspModel, known: EnergyField, start: np.n
     trial.excess = float(worst / cap - 1.0) if again.is_whole else np.inf
 
 
-def no_path_seconds(known: EnergyField, goal: GraspGoal) -> tuple[float, bool]:
-    """Return how long it takes to say that no path exists under a force too low for the goal, and
-    behind a workspace that ends before it; and whether both were said with their reason."""
-    began, said = time.perf_counter(), []
-    force = 0.5 * float(np.linalg.norm(known.force(goal.centre(known)[None])))
+def no_path_seconds(known: EnergyField, goal: GraspGoal) -> dict[str, tuple[float, str]]:
+    """Return how long it takes to say that no path exists under a force too low for any pose of the
+    goal, and behind a workspace that ends before it; and what was said instead, if anything."""
+    settings = PlanSettings(iterations=500)
+    reached = goal_points(goal, known, known.limited())
+    force = 0.5 * float(np.linalg.norm(known.force(reached), axis=1).min())
     middle = 0.5 * (known.rest + goal.centre(known))
     axis = int(np.argmax(np.abs(goal.centre(known) - known.rest)))
     side = "workspace_high" if (goal.centre(known) - known.rest)[axis] > 0.0 else "workspace_low"
     corner = np.full(3, 20.0 if side == "workspace_high" else -20.0)
     corner[axis] = middle[axis]
-    for settings, word in ((PlanSettings(max_force=force, iterations=500), "force"),
-                           (PlanSettings(**{side: tuple(map(float, corner))}, iterations=500),
-                            "workspace")):
+    found = {}
+    for word, limit in (("force", {"max_force": force}),
+                        ("workspace", {side: tuple(map(float, corner))})):
+        began, asked = time.perf_counter(), settings.model_copy(update=limit)
         try:
-            plan_within(known, known.rest.copy(), goal, settings, Limits.of(settings))
+            plan_within(known, known.rest.copy(), goal, asked, Limits.of(asked))
+            said = "a path"
         except NoPathError as error:
-            said.append(word in str(error))
-    return time.perf_counter() - began, said == [True, True]
+            said = "" if word in str(error) else str(error)
+        found[word] = time.perf_counter() - began, said
+    return found
