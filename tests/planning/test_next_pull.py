@@ -7,7 +7,16 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError, WorkError
-from limber.estimation.next_pull import Cell, Known, PullChoice, _of_moduli, expected_pull, suggest
+from limber.estimation import next_pull
+from limber.estimation.next_pull import (
+    Cell,
+    ExpectedPull,
+    Known,
+    PullChoice,
+    _of_moduli,
+    expected_pull,
+    suggest,
+)
 from limber.estimation.settings import EstimateSettings
 from limber.planning.chance import Exposure
 from limber.stages.loading import load_subject
@@ -46,9 +55,14 @@ def test_a_longer_pull_tells_more_and_strains_more(subject):
     assert (np.diag(after.total) < np.diag(known.total)).all()
 
 
-def test_no_pull_within_the_strain_is_said(subject):
-    with pytest.raises(WorkError, match="No pull keeps the limits"):
-        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=1e-9,
+def test_no_pull_within_the_strain_is_said(subject, monkeypatch):
+    """With what the gentlest would do, and how many cannot be made at all."""
+    made = ExpectedPull(PullChoice(0.8, 0.0, 0.1), np.zeros(3), np.ones(3), 2.0, 0.05, np.eye(2),
+                        1.0)
+    found = iter([made, *([None] * 20)])
+    monkeypatch.setattr(next_pull, "_tried", lambda *_: next(found))
+    with pytest.raises(WorkError, match=r"of 8, 7 cannot be made and the gentlest .* 5 %"):
+        suggest(subject, subject.start, Known.nothing(2), Cell(), (0.8,), max_strain=0.01,
                 workers=1)
 
 

@@ -41,7 +41,7 @@ _MOST_CELLS = 800_000  # of any grid's tube; the next refinement is left away
 _LEVELS = 5
 _CUT = 3  # of a cell's edge from one grid to the next
 _CHILDREN = _CUT**3
-_ENOUGH = 0.015  # gap below which no further refinement is worth its time
+ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
 _BEYOND = 1.2  # on the steepest measured growth of the goal's distance
 
@@ -106,7 +106,7 @@ def _spread(shape: tuple[int, ...], places: np.ndarray, values: np.ndarray) -> n
     return whole
 
 
-def certify(problem: GentleProblem, improve: Improve, *, enough: float = _ENOUGH,
+def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
             progress: Progress = SILENT) -> Certificate:
     """Return a lower bound on the cost of every path, refined until it is close to the known one.
 

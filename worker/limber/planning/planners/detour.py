@@ -27,6 +27,11 @@ from limber.progress import SILENT, Progress
 _RANGE = (1e-2, 1e3)  # of the weight of a metre, times that which was given
 _STEPS = 8  # of the search for the weight
 _CLOSE = 2e-3  # of the length limit: near enough below it
+_ENOUGH = 0.002  # gap of the weighed cost: of the energy, which is a part of it, it is more
+_MOST_BOUNDS = 3
+_NEAR = 0.01  # of the energy: a bound so near needs no other
+_ROUGH = 0.03  # gap of the weighed cost above which a dearer metre tells more
+_STRIDE = 2.5
 _SPACING = 0.001  # [m] at which a path's integral is taken
 
 
@@ -85,16 +90,53 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
         progress(0.5 * step / _STEPS, "how much a metre may cost", length=search.last_length)
         if not search.step():
             break
-    for attempt in range(3):
-        weight = search.short_weight * 1.2**attempt
-        found = plan_gentle(_weighed(problem, weight), [search.short_path],
-                            progress=progress.part(0.5, 0.9))
-        search.add(weight, found.points, found.certificate.lower)
-        if arc_lengths(found.points)[-1] <= longest * (1.0 + 1e-9):
+    bounds = _Bounds(problem, search)
+    weight = search.first_weight()
+    for number in range(_MOST_BOUNDS):
+        part = progress.part(0.5 + 0.4 * number / _MOST_BOUNDS, 0.5 + 0.4 * (number + 1)
+                             / _MOST_BOUNDS)
+        weight = bounds.ask(weight, part)
+        if weight is None:
             break
-        search.long_path = found.points
     progress(0.95, "just short enough")
-    return search.result(found, weight, float(least))
+    return search.result(bounds.best, bounds.best_weight, float(least))
+
+
+class _Bounds:
+    """The dual's ascent: bounds at a few weights, and which weight to try next."""
+
+    def __init__(self, problem: GentleProblem, search: "_Search"):
+        self.problem, self.search = problem, search
+        self.best: GentlePath | None = None
+        self.best_weight, self.value = np.nan, -np.inf
+        self.low, self.high = 0.0, np.inf
+
+    def ask(self, weight: float, progress: Progress) -> float | None:
+        """Bound at a weight; returns the next one, None where none is worth its time."""
+        search, weighed = self.search, _weighed(self.problem, weight)
+        found = plan_gentle(weighed, [search.short_path], enough=_ENOUGH, progress=progress)
+        search.add(weight, found.points, found.certificate.lower)
+        last = search.curve[-1]
+        value = last.lower_bound_jm - last.metre_jm * search.longest
+        if value > self.value:
+            self.best, self.best_weight, self.value = found, weight, value
+        if last.length_m <= search.longest:
+            search.shorter(found.points)
+        else:
+            search.long_path = found.points
+        if value >= (1.0 - _NEAR) * last.energy_integral_jm:
+            return None
+        spare = last.metre_jm * (search.longest - last.length_m)
+        unsure = found.cost / self.problem.weights.energy - last.lower_bound_jm
+        if spare < 0.0 or (found.certificate.gap > _ROUGH and unsure > spare):
+            self.low = weight
+        elif spare > unsure:
+            self.high = weight
+        else:
+            return None
+        if self.low > 0.0 and self.high < np.inf:
+            return float(np.sqrt(self.low * self.high))
+        return weight * _STRIDE if self.low > 0.0 else weight / _STRIDE
 
 
 class _Search:
@@ -136,11 +178,28 @@ class _Search:
             weight, self.last_length, integral, None if bound is None else bound / energy,
             weight * self.problem.weights.length / energy))
 
+    def first_weight(self) -> float:
+        """Return the weight whose bound is asked for first.
+
+        That of the search where the length holds the path back. Where it does not, any smaller one
+        proves as much, but where a metre costs nearly nothing the grid tells little: that at which
+        the length allowed costs as much as the energy.
+        """
+        if self.long_path is not None:
+            return self.short_weight
+        last = self.curve[-1]
+        return last.energy_integral_jm * last.weight / (last.metre_jm * self.longest)
+
+    def shorter(self, path: np.ndarray) -> None:
+        """Take a path that is short enough, if it is the gentlest of those so far."""
+        if _measured(path, self.problem)[1] < _measured(self.short_path, self.problem)[1]:
+            self.short_path = path
+
     def result(self, found: GentlePath, weight: float, shortest: float) -> DetourPath:
         """Return the gentlest of the short enough paths that are known, and the best bound."""
         bounds = [p.lower_bound_jm - p.metre_jm * self.longest for p in self.curve
                   if p.lower_bound_jm is not None]
-        known = [found.points, self.short_path, *self._just_short_enough()]
+        known = [self.short_path, *self._just_short_enough()]
         measured = [_measured(path, self.problem) for path in known]
         integral, number = min((integral, number) for number, (length, integral)
                                in enumerate(measured) if length <= self.longest * (1.0 + 1e-9))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from limber.errors import NoPathError
-from limber.planning.bound.certificate import Certificate, certify
+from limber.planning.bound.certificate import ENOUGH, Certificate, certify
 from limber.planning.cost import arc_lengths
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem
@@ -26,10 +26,11 @@ class GentlePath:
 
 
 def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, *,
-                progress: Progress = SILENT) -> GentlePath:
+                enough: float = ENOUGH, progress: Progress = SILENT) -> GentlePath:
     """Return the gentlest path that was found, and a lower bound on every path.
 
-    ``others`` are paths [n, 3] to start from besides the straight line.
+    ``others`` are paths [n, 3] to start from besides the straight line; ``enough`` is the gap
+    below which the bound is refined no further.
 
     Raises:
         NoPathError: it is proven that there is none, or none was found; says which.
@@ -49,7 +50,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
                 best[:] = points, cost
         return best[1]
 
-    certificate = certify(problem, improve, progress=progress)
+    certificate = certify(problem, improve, enough=enough, progress=progress)
     if best[0] is None:
         raise NoPathError(
             f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} was "
