@@ -120,11 +120,9 @@ class _Bounds:
         value = last.lower_bound_jm - last.metre_jm * search.longest
         if value > self.value:
             self.best, self.best_weight, self.value = found, weight, value
-        if last.length_m <= search.longest:
-            search.shorter(found.points)
-        else:
+        if last.length_m > search.longest:
             search.long_path = found.points
-        if value >= (1.0 - _NEAR) * last.energy_integral_jm:
+        if value >= (1.0 - _NEAR) * search.gentlest_short(found.points):
             return None
         spare = last.metre_jm * (search.longest - last.length_m)
         unsure = found.cost / self.problem.weights.energy - last.lower_bound_jm
@@ -190,30 +188,27 @@ class _Search:
         last = self.curve[-1]
         return last.energy_integral_jm * last.weight / (last.metre_jm * self.longest)
 
-    def shorter(self, path: np.ndarray) -> None:
-        """Take a path that is short enough, if it is the gentlest of those so far."""
-        if _measured(path, self.problem)[1] < _measured(self.short_path, self.problem)[1]:
-            self.short_path = path
+    def gentlest_short(self, *others: np.ndarray) -> float:
+        """Take the gentlest of the short enough paths that are known, or follow from the short and
+        the long one with the length as a limit; return its integral of energy [J m]."""
+        limited = replace(_weighed(self.problem, _RANGE[0]), longest=self.longest)
+        starts = [self.short_path] if self.long_path is None else [self.short_path, self.long_path]
+        known = [self.short_path, *others, *(refine(path, limited)[0] for path in starts)]
+        measured = [_measured(path, self.problem) for path in known]
+        integral, number = min((integral, number) for number, (length, integral)
+                               in enumerate(measured) if length <= self.longest * (1.0 + 1e-9))
+        self.short_path = known[number]
+        return integral
 
     def result(self, found: GentlePath, weight: float, shortest: float) -> DetourPath:
         """Return the gentlest of the short enough paths that are known, and the best bound."""
         bounds = [p.lower_bound_jm - p.metre_jm * self.longest for p in self.curve
                   if p.lower_bound_jm is not None]
-        known = [self.short_path, *self._just_short_enough()]
-        measured = [_measured(path, self.problem) for path in known]
-        integral, number = min((integral, number) for number, (length, integral)
-                               in enumerate(measured) if length <= self.longest * (1.0 + 1e-9))
-        cost = _weighed(self.problem, weight).cost(known[number])
-        found = GentlePath(known[number], cost, replace(found.certificate, upper=cost))
+        integral = self.gentlest_short()
+        cost = _weighed(self.problem, weight).cost(self.short_path)
+        found = GentlePath(self.short_path, cost, replace(found.certificate, upper=cost))
         return DetourPath(found, weight, shortest, self.longest, integral, max(bounds),
                           tuple(sorted(self.curve, key=lambda point: point.weight)))
-
-    def _just_short_enough(self) -> list[np.ndarray]:
-        """Return what the short and the long path become with the length as a limit."""
-        limited = replace(_weighed(self.problem, _RANGE[0]), longest=self.longest)
-        starts = [self.short_path] if self.long_path is None else [self.short_path, self.long_path]
-        found = [refine(path, limited) for path in starts]
-        return [path for path, cost in found if np.isfinite(cost)]
 
 
 def _weighed(problem: GentleProblem, weight: float) -> GentleProblem:
