@@ -20,7 +20,7 @@ from limber.stages.execute import (
     ExecuteOptions,
     ExecuteSettings,
     _as_slow_as_checked,
-    _positions,
+    _planned,
     execute,
 )
 from limber.stages.loading import load_grasp_model, load_skeleton
@@ -212,7 +212,7 @@ def test_the_plans_own_approach_is_taken(planned_folder):
     with branch.stage("plan:path") as stage:
         stage.path("plans/path-motion.csv").write_text(
             "x_m,y_m,z_m,phase\n" + "".join(f"{x},0,0.3,{phase}\n" for phase, x in rows))
-    found = _positions(branch, "path", np.array([0, 0, 0.3]))
+    found = _planned(branch, "path", np.array([0, 0, 0.3]))
     np.testing.assert_allclose(found[:, 0], [0.0, 0.03, 0.02, 0.01])
 
 
@@ -228,6 +228,22 @@ def test_a_plan_that_was_checked_in_motion_is_followed_no_faster():
     settings, same = _as_slow_as_checked({"speed_m_s": 0.2, "acceleration_m_s2": 2.0},
                                          ExecuteSettings(speed=0.03), cell, Progress())
     assert settings.speed == 0.03 and same.limits == cell.limits and len(told) == 1
+
+
+def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folder, tmp_path,
+                                                                   monkeypatch):
+    """Solving the forces of a long path takes a minute; the plan's own poses tell the reach."""
+    from limber.stages import execute as stage
+
+    def solved(*_arguments: object) -> None:
+        raise AssertionError("forces were solved")
+    monkeypatch.setattr(stage, "_predicted", solved)
+    cell = standing_at(Branch.open(planned_folder), "127.0.0.97", fraction=FRACTION)
+    base = (cell.base.pose[0] + 3.0, *cell.base.pose[1:])
+    away = cell.model_copy(update={"base": cell.base.model_copy(update={"pose": base})})
+    with pytest.raises(NoPathError, match="out of the arm's reach"):
+        execute(planned_folder, "path", cell_file(away, tmp_path), ExecuteSettings(),
+                ExecuteOptions())
 
 
 def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):

@@ -150,6 +150,16 @@ def test_a_hard_fault_stops_while_paused(bench):
     assert bench.look(force=(25, 0, 0)).verdict == Verdict.STOP
 
 
+@pytest.mark.parametrize("wrench, told", [
+    ((0, 25, 0, 0, 0, 0), "hard force limit"), ((0, 0, 0, 0, 4, 0), "hard torque limit"),
+    ((np.nan, 0, 0, 0, 0, 0), "no number")])
+def test_a_force_between_two_samples_stops_by_the_hard_limits(bench, wrench, told):
+    assert bench.guard.feel(np.array([0.0, 15, 0, 0, 0, 0])).verdict == Verdict.GO
+    decision = bench.guard.feel(np.array(wrench, float))
+    assert decision.verdict == Verdict.STOP and told in decision.reason
+    assert bench.guard.state == State.STOPPED
+
+
 @pytest.mark.parametrize("rate", [125.0, 500.0])
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_frozen_sensor_is_seen_in_its_time(rate, row):

@@ -193,7 +193,7 @@ class Driver:
         self._stream.skip()
         while not self.ended:
             try:
-                samples = self._stream.read(quiet)
+                samples = self._stream.read(quiet, self._sensor.connections)
             except ConnectionError as error:
                 self._lost(str(error))
                 return
@@ -203,6 +203,7 @@ class Driver:
                 self._last = samples[-1]
             elif self._last is not None:
                 self._judge(self.guard.silence(time.monotonic() - self._last.arrived))
+                self._feel(self._last)
             self._take(orders)
             if samples and not self.ended:
                 self._move(len(samples) / self._stream.rate)
@@ -282,6 +283,19 @@ class Driver:
                             *(_NOTHING if doubt is None else doubt[:3, :3][_UPPER])])
         if self._tare_until is not None and sample.clock >= self._tare_until:
             self._end_tare()
+
+    def _feel(self, sample: Sample) -> None:
+        """A force that came between two samples need not wait for the next: hard limits stop."""
+        if not self._sensor.connections:
+            return
+        try:
+            reading = self._sensor.read(sample)
+        except ConnectionError as error:
+            # A closed connection always has something to read: it would never let us wait again.
+            self._sensor.connections = ()
+            self._judge(self.guard.event(str(error)))
+            return
+        self._judge(self.guard.feel(self._chain.between(sample, reading)))
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
                   pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

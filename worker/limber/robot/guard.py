@@ -260,7 +260,7 @@ class Guard:
         numbers = np.concatenate((wrench, sample.wrench, sample.pose, sample.joints, sample.speed))
         if not np.isfinite(numbers).all():
             return self._stop("a sensor shows no number")
-        memory, limits = self._memory, self._settings.limits
+        memory = self._memory
         # Turning a wrench to other axes and back leaves rounding in its last digits.
         if memory.raw is None or np.abs(raw - memory.raw).max(axis=1).min() > _SAME:
             memory.frozen_since = sample.clock
@@ -268,9 +268,16 @@ class Guard:
         if sample.clock - memory.frozen_since > self._settings.frozen_time:
             return self._stop("the force sensor is frozen [s]",
                               sample.clock - memory.frozen_since, self._settings.frozen_time)
+        return self.feel(wrench)
+
+    def feel(self, wrench: np.ndarray) -> Decision:
+        """Judge a force [6] by the hard limits alone: it came between two samples."""
+        limits = self._settings.limits
         if not self._is_tared:
             # Nothing moves yet, and what a sensor shows before its tare is its bias.
             return _GO
+        if np.isnan(wrench).any():
+            return self._stop("a sensor shows no number")
         force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
         if force > limits.hard_force_n:
             return self._stop("hard force limit [N]", float(force), limits.hard_force_n)

@@ -9,6 +9,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,19 +118,24 @@ class SampleStream:
         self._data += chunk
         self._queue += rtde.split_frames(self._data)
 
-    def read(self, timeout: float) -> list[Sample]:
+    def read(self, timeout: float, beside: Sequence[socket.socket] = ()) -> list[Sample]:
         """Return the next samples, waiting at most ``timeout`` [s] for the first.
 
         After a delay they come a few at a time, so that who reads them can act in between.
 
+        Args:
+            beside: Other connections: what comes there ends the wait as well, without samples.
+
         Raises:
             ConnectionError: the robot is gone.
         """
-        if not self._queue and select.select([self._socket], [], [], timeout)[0]:
-            try:
-                self._fill()
-            except (OSError, ValueError) as error:
-                raise ConnectionError(f"connection to {self.address} lost: {error}") from error
+        if not self._queue:
+            ready = select.select([self._socket, *beside], [], [], timeout)[0]
+            if self._socket in ready:
+                try:
+                    self._fill()
+                except (OSError, ValueError) as error:
+                    raise ConnectionError(f"connection to {self.address} lost: {error}") from error
         taken, self._queue = self._queue[:_MOST_AT_ONCE], self._queue[_MOST_AT_ONCE:]
         return [self._sample(body) for kind, body in taken if kind == rtde.DATA]
 

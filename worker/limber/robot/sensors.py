@@ -45,7 +45,13 @@ class Reading:
 
 
 class ForceTorqueSensor(Protocol):
-    """Where readings come from."""
+    """Where readings come from.
+
+    Attributes:
+        connections: Its own, over which readings come between the robot's samples.
+    """
+
+    connections: tuple[socket.socket, ...]
 
     def read(self, sample: Sample) -> Reading:
         """Return the newest reading at the time of a sample of the robot.
@@ -62,6 +68,8 @@ class ForceTorqueSensor(Protocol):
 
 class ControllerSensor:
     """The controller's own wrench at the tool's centre (in CB3 an estimate from currents)."""
+
+    connections = ()
 
     def __init__(self, cell: Cell):
         self._tool = frame_of(np.array(cell.tool.grasp_pose))
@@ -94,6 +102,7 @@ class Ft300Sensor:
                             "Check its cable and that its URCap is installed; or name another "
                             "sensor in the cell file.") from error
         self._socket.setblocking(False)
+        self.connections = (self._socket,)
         self._text = ""
         self._last: np.ndarray | None = None
         self._arrived = time.monotonic()
@@ -126,6 +135,8 @@ class ReplayedSensor:
 
     Time runs from the first sample on.
     """
+
+    connections = ()
 
     def __init__(self, cell: Cell, path: Path):
         from limber.recordings.streams import read_stream
@@ -235,17 +246,27 @@ class WrenchChain:
         raw = reading.wrench - self._weight(flange)
         if self._taring is not None:
             self._taring.append(raw)
+        now = self._on_branch(raw, reading, flange)
+        self._recent.append(now)
+        if len(self._recent) > self.count:
+            self._recent.popleft()
+        return now, np.mean(self._recent, axis=0)
+
+    def between(self, sample: Sample, reading: Reading) -> np.ndarray:
+        """Return the wrench of a reading that came after ``sample``, shape [6]; it is not
+        averaged.
+        """
+        flange = frame_of(sample.pose) @ self._from_tool
+        return self._on_branch(reading.wrench - self._weight(flange), reading, flange)
+
+    def _on_branch(self, raw: np.ndarray, reading: Reading, flange: np.ndarray) -> np.ndarray:
         entry = self.cell.sensor
         if (np.abs(reading.wrench[:3]).max() >= 0.999 * entry.force_range_n
                 or np.abs(reading.wrench[3:]).max() >= 0.999 * entry.torque_range_nm):
             raw = np.full(6, np.inf)
         rotation = self._base[:3, :3] @ flange[:3, :3]
         lever = -rotation @ self._tool[:3, 3]
-        now = -turned_wrench(rotation, raw - self.bias, lever)
-        self._recent.append(now)
-        if len(self._recent) > self.count:
-            self._recent.popleft()
-        return now, np.mean(self._recent, axis=0)
+        return -turned_wrench(rotation, raw - self.bias, lever)
 
     def _weight(self, flange: np.ndarray) -> np.ndarray:
         """The gripper's weight where the sensor does not take it away itself, flange frame."""

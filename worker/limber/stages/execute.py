@@ -26,6 +26,7 @@ from limber.store import Branch
 if TYPE_CHECKING:
     from limber.mechanics import BranchModel, Grasp, StaticResult
     from limber.planning.chance import YoungDoubt
+    from limber.planning.field.grasp_model import GraspModel
     from limber.robot.cell import Cell
     from limber.robot.execution import RobotMotion
     from limber.robot.expected import Predicted
@@ -106,13 +107,22 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     settings, cell = _as_slow_as_checked(told.get("in_motion"), settings, cell, progress)
     if options.arm:
         require_payload(cell)
-    progress(0.02, "forces along the path")
-    predicted, axis = _predicted(branch, name, settings, progress)
-    progress(0.4, "inverse kinematics")
     from limber.robot.execution import robot_motion
+    from limber.robot.expected import Predicted
+    from limber.stages.loading import load_grasp_model
 
-    motion = robot_motion(cell, predicted, axis, speed=settings.speed,
-                          rotation=settings.gripper_rotation)
+    progress(0.02, "inverse kinematics")
+    model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
+    asked = {"speed": settings.speed, "rotation": settings.gripper_rotation}
+    planned = _planned(branch, name, model.rest_position)
+    if np.isfinite(planned).all():
+        # By the plan's own poses: whether the arm reaches them is known at once, forces are not.
+        robot_motion(cell, Predicted.of_forces(planned, np.zeros((len(planned), 3))),
+                     model.reach.axis, **asked)
+    progress(0.05, "forces along the path")
+    predicted = _predicted(branch, model, planned[:, :3], progress)
+    progress(0.4, "inverse kinematics")
+    motion = robot_motion(cell, predicted, model.reach.axis, **asked)
     result = _summary(cell, motion)
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
     if not options.arm:
@@ -150,9 +160,9 @@ def _as_slow_as_checked(checked: dict[str, Any] | None, settings: ExecuteSetting
             cell.model_copy(update={"limits": limits}))
 
 
-def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: Progress,
-               ) -> tuple[Predicted, np.ndarray]:
-    """What the model predicts from rest to the path's end, and the branch's axis at the grasp.
+def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progress: Progress,
+               ) -> Predicted:
+    """What the model predicts from rest to the path's end, through ``positions`` [n, 3].
 
     The grasp goes through the plan's positions turned as the branch would turn by itself, close
     enough that straight lines between stretch nothing; the wrench is that of the branch clamped so.
@@ -161,15 +171,13 @@ def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: P
     from limber.mechanics.sensitivities import grasp_slopes
     from limber.planning.field.grasp_model import refusal
     from limber.robot.expected import Predicted
-    from limber.stages.loading import load_grasp_model
     from limber.stages.plan_doubt import estimated_doubt
 
-    model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
     doubt = estimated_doubt(branch, model)
     if doubt is None:
         progress.warn("How uncertain Young's modulus is, is not known (no estimate): the interval "
                       "of the predicted force leaves it out.")
-    positions = _closely(_positions(branch, name, model.rest_position))
+    positions = _closely(positions)
     clamped = replace(model.grasp, mode="clamped")
     poses, wrenches, stiffness, covariances = [], [], [], []
     state = held = model.rest.displacement
@@ -191,9 +199,9 @@ def _predicted(branch: Branch, name: str, settings: ExecuteSettings, progress: P
         stiffness.append(grasp_slopes(model.model, clamped, held).wrench)
         covariances.append(np.zeros((3, 3)) if doubt is None
                            else _by_young(model.model, clamped, result, doubt))
-        progress(0.02 + 0.38 * number / len(positions), "forces along the path")
+        progress(0.05 + 0.35 * number / len(positions), "forces along the path")
     return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
-                     np.array(covariances)), model.reach.axis
+                     np.array(covariances))
 
 
 def _by_young(model: BranchModel, grasp: Grasp, result: StaticResult, doubt: YoungDoubt,
@@ -229,23 +237,29 @@ def _closely(positions: np.ndarray) -> np.ndarray:
     return Akima1DInterpolator(places, positions, method="makima")(wanted)
 
 
-def _positions(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
-    """Return the way of the grasp from rest to the path's end [m], shape [n, 3].
+def _planned(branch: Branch, name: str, rest: np.ndarray) -> np.ndarray:
+    """Return the way of the grasp from rest to the path's end [m, rad], shape [n, 6].
 
-    Approach and path as planned; a path without a planned approach is led up to straight.
+    Rotations are the branch's own; NaN where the table has none. Approach and path as planned; a
+    path without a planned approach is led up to straight.
     """
+    from limber.recordings.recording import POSE_COLUMNS
+
     whole = branch.has(f"plans/{name}-motion.csv")
     path = branch.require(f"plans/{name}-motion.csv" if whole else f"plans/{name}.csv", "plan")
     table = read_columns(path, ("x_m", "y_m", "z_m"), "the table of a path")
-    planned = np.column_stack([table[column] for column in ("x_m", "y_m", "z_m")])
+    nothing = np.full(len(table["x_m"]), np.nan)
+    planned = np.column_stack([table.get(column, nothing) for column in POSE_COLUMNS])
     if whole:
         rows = csv.DictReader(read_text(path, "the table of a motion").splitlines())
         planned = planned[[row.get("phase") != "return" for row in rows]]
     if len(planned) < 2:
         raise InputError(f"{path} has {len(planned)} points.", "That is no path.", "Plan again.")
-    way = float(np.linalg.norm(planned[0] - rest))
-    leading = rest + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
-        planned[0] - rest)
+    # The grasped piece at rest is where it is and not turned.
+    start = np.r_[rest, np.zeros(3)]
+    way = float(np.linalg.norm(planned[0, :3] - rest))
+    leading = start + np.linspace(0, 1, max(int(np.ceil(way / 0.01)), 1) + 1)[:-1, None] * (
+        planned[0] - start)
     return np.vstack([leading, planned]) if way > 1e-4 else planned
 
 

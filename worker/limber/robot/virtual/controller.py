@@ -5,6 +5,7 @@ takes away what they ask for. One call of :meth:`Controller.step` is one step of
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Protocol
@@ -177,6 +178,8 @@ class Controller:
         self.load: Load = load or Nothing()
         self.fault = SensorFault()
         self.step_count, self.clock_offset = 0, 0.0
+        self.since_step: Callable[[], float] = lambda: 0.0
+        """Wall-clock seconds since the last step, where somebody steps it by the clock."""
         self.robot_mode, self.safety_mode = RobotMode.RUNNING, SafetyMode.NORMAL
         self.remote = True
         self.slider = 1.0
@@ -345,7 +348,7 @@ class Controller:
 
     def say(self, text: str) -> None:
         """Write to the controller's log."""
-        self.log.append(f"{self.clock:.3f} {text}")
+        self.log.append(f"{self.clock + self.since_step():.4f} {text}")
 
     # What clients write
 

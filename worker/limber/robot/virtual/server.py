@@ -99,7 +99,9 @@ class Server:
     async def run(self) -> None:
         """Step the controller by the wall clock until cancelled."""
         step = self.controller.seconds
-        due = time.perf_counter() + step
+        stepped = time.perf_counter()
+        self.controller.since_step = lambda: min(time.perf_counter() - stepped, step)
+        due = stepped + step
         while True:
             wait = due - time.perf_counter()
             if wait > 0:
@@ -110,6 +112,7 @@ class Server:
             else:
                 await asyncio.sleep(0)
             self.controller.step()
+            stepped = time.perf_counter()
             self._publish()
             due += step
 
