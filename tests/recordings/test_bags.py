@@ -269,3 +269,46 @@ def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
     again = read_pull(branch_folder / "pulls" / "run-7")
     assert np.allclose(again.wrenches[:, :3], pull.wrenches[:, :3], atol=1e-6)
     assert np.allclose(again.observations.positions, pull.observations.positions, atol=1e-7)
+    # How well its cell is known comes along: without it the interval would be that of any robot.
+    for part in ("calibration", "sensor", "grasp", "rest_points_m", "truth", "gravity_m_s2"):
+        assert getattr(again.entry, part) == getattr(pull.entry, part), part
+
+
+def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, bare_folder):
+    from limber.progress import Progress
+    from limber.recordings.calibration import CalibrationEntry
+    from limber.robot.cell import Cell, write_cell
+
+    with Written(tmp_path / "theirs.mcap") as bag:
+        pulled(bag)
+    said: list[str] = []
+    import_pull(bare_folder, tmp_path / "theirs.mcap", "unknown", ImportSettings(),
+                progress=Progress(on_warning=said.append))
+    assert any("how well gripper and force sensor" in line and "--cell" in line for line in said)
+    assert read_pull(bare_folder / "pulls" / "unknown").entry.calibration is None
+    write_cell(tmp_path / "cell.toml", Cell(
+        robot={"model": "ur5e", "pose_sigma_m": 2e-5}, base={
+            "pose": (0,) * 6, "position_sigma_m": 4e-4, "rotation_sigma_rad": 3e-3},
+        sensor={"force_sigma_n": 0.3, "drift_n_per_minute": 6.0}))
+    import_pull(bare_folder, tmp_path / "theirs.mcap", "known", ImportSettings(
+        cell=str(tmp_path / "cell.toml")))
+    entry = read_pull(bare_folder / "pulls" / "known").entry
+    assert entry.sensor.force_sigma_n == 0.3
+    assert entry.calibration.force_drift_sigma_n == pytest.approx(0.2, rel=1e-3)
+    assert entry.calibration.pose_sigma_m == 4e-4 and entry.calibration.pose_noise_m == 2e-5
+    # When the sensor was tared a bag does not say.
+    assert entry.calibration.force_bias_sigma_n == CalibrationEntry().force_bias_sigma_n
+
+
+def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_folder, plain_pull,
+                                                          monkeypatch):
+    from limber.progress import Progress
+    from limber.recordings.bags import writing
+
+    monkeypatch.setattr(writing, "entry_text", lambda entry: "grasp = {radius_m = -1}")
+    write_mcap(tmp_path / "odd.mcap", tmp_path / "spring", plain_pull)
+    said: list[str] = []
+    import_pull(bare_folder, tmp_path / "odd.mcap", "odd", ImportSettings(),
+                progress=Progress(on_warning=said.append))
+    assert any("odd.mcap, metadata limber" in line for line in said)
+    assert len(read_pull(bare_folder / "pulls" / "odd").times) == len(plain_pull.times)

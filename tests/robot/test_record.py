@@ -2,18 +2,25 @@
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from limber.errors import InputError, SafetyStop
+from limber.progress import SILENT
 from limber.recordings.recording import read_pull
-from limber.robot.recorder import PullRecorder
+from limber.robot.cell import Cell
+from limber.robot.kinematics import matrices
+from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
+from limber.stages.loading import load_skeleton
 from limber.stages.record import RecordOptions, RecordSettings, record
+from limber.stages.record_way import there_and_back, way_on_arc, way_through
 from limber.store import Branch
 
 pytest.importorskip("rtde_control")
@@ -24,7 +31,7 @@ MARKERS = 63400
 def sideways_pull(branch_folder, **changes) -> RecordSettings:
     direction = tuple(map(float, sideways(Branch.open(branch_folder))))
     return RecordSettings(**{"direction": direction, "distance": 0.012, "speed": 0.01,
-                             "pause": 0.2, **changes})
+                             "pause": 0.2, "shape": "straight", **changes})
 
 
 def recorded(branch_folder, tmp_path, address, name="robot-1", **options):
@@ -139,6 +146,90 @@ def test_the_piece_moves_with_the_gripper_as_one_body():
     assert rows[1, 1:7] == pytest.approx([-0.01, 0, 0.5, 0, 0, np.pi / 2], abs=1e-6)
     # Force 1 N along x at the gripper: about the piece, 10 mm beside it, 0.01 N m about z.
     assert rows[0, 7:] == pytest.approx([1, 0, 0, 0, 0, 0.01], abs=1e-9)
+
+
+def test_the_piece_stays_behind_by_what_gripper_and_arm_give_way():
+    recorder = PullRecorder(lines := Appended(), np.array([0.0, 0.0, 0.5]), compliance=1e-4)
+    sample = np.full((1, 37), np.nan)
+    sample[0, :19] = [5.0, 0, 0, 0.5, *(0,) * 15]
+    recorder.take(sample)
+    recorder.close_gripper()
+    pulled = sample.copy()
+    pulled[0, [0, 1, 7, 13]] = [5.5, 0.02, 6.0, 6.0]
+    recorder.take(pulled)
+    row = [float(x) for x in lines[-1].split(",")]
+    assert row[1:4] == pytest.approx([0.02 - 6e-4, 0, 0.5])
+
+
+class Appended(list):
+    """Lines of a stream."""
+
+
+def test_an_arc_stretches_nothing(branch_folder):
+    """It goes as far as asked across the branch, comes nearer to the root, and turns with it."""
+    branch = Branch.open(branch_folder)
+    skeleton = load_skeleton(branch)
+    point, way = skeleton.point_at(0.9), sideways(branch)
+    frames = way_on_arc(branch, point, way, 0.04, SILENT)
+    assert frames[0] == pytest.approx(np.eye(4), abs=1e-9)
+    moved = frames[:, :3, :3] @ point + frames[:, :3, 3]
+    away = moved - moved[0]
+    assert np.linalg.norm(away[-1]) == pytest.approx(0.04, rel=0.05)
+    assert away[-1] @ way == pytest.approx(np.linalg.norm(away[-1]), rel=0.05)
+    chord = np.linalg.norm(moved - skeleton.nodes[0], axis=1)
+    assert np.all(np.diff(chord) < 0)
+    turn = Rotation.from_matrix(frames[-1, :3, :3]).as_rotvec()
+    assert np.linalg.norm(turn) > 0.04 / np.linalg.norm(point - skeleton.nodes[0])
+    assert abs(turn @ way) < 0.3 * np.linalg.norm(turn)
+
+
+def test_way_points_begin_at_the_gripper(tmp_path):
+    path = tmp_path / "way.csv"
+    gripper = np.array([0.1, 0.0, 0.4, 0.0, 0.0, 0.2])
+    path.write_text("x_m,y_m,z_m\n0.101,0,0.4\n0.12,0,0.4\n0.12,0.02,0.39\n")
+    frames = way_through(path, gripper)
+    assert frames[:, :3, 3] == pytest.approx(np.array(
+        [[0.1, 0, 0.4], [0.12, 0, 0.4], [0.12, 0.02, 0.39]]))
+    assert frames[:, :3, :3] == pytest.approx(np.tile(frames[0, :3, :3], (3, 1, 1)))
+    with pytest.raises(InputError, match=r"10\.0 mm from the gripper"):
+        way_through(path, gripper + np.r_[-9e-3, np.zeros(5)])
+
+
+def test_out_and_back_takes_as_long_each_way():
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)})
+    frames = np.tile(matrices(np.array([0.0, 0.0, 0.5, 0, 1.2, 0])), (3, 1, 1))
+    frames[1, 0, 3], frames[2, 0, 3], frames[2, 1, 3] = 0.02, 0.02, 0.03
+    made = there_and_back(cell, frames, speed=0.03, cycles=2, pause=0.5)
+    ends = np.flatnonzero(np.diff(made.times) > 0.4)
+    assert len(ends) == 3
+    assert made.poses[ends[0]] == pytest.approx(made.poses[ends[0] + 1])
+    assert made.poses[-1] == pytest.approx(made.poses[0])
+    assert made.duration == pytest.approx(4 * made.times[ends[0]] + 3 * 0.5)
+
+
+def test_what_a_cell_leaves_open_of_a_recording():
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6, "position_sigma_m": 4e-4},
+                sensor={"drift_n_per_minute": 6.0}, tool={"grip_seconds": 2.0})
+    known = known_errors(cell, 30.0, tare_sigma=[0.4, 0.1, 0.1, 0.01, 0.02, 0.01])
+    assert known.force_drift_sigma_n == pytest.approx(3.0)
+    assert known.force_bias_sigma_n == pytest.approx(0.5)
+    assert known.torque_bias_sigma_nm == 0.02 and known.pose_sigma_m == 4e-4
+
+
+def test_a_tracker_on_the_base_is_turned_into_the_branchs_frame():
+    base = np.array([0.5, 0.1, -0.2, 0, 0, np.pi / 2])
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        stream = MarkerStream("127.0.0.1", server.getsockname()[1], base)
+        theirs, _ = server.accept()
+        with theirs:
+            theirs.sendall(b'{"t_s": 1.0, "frame": "base", "points_m": [[0.1, 0, 0]]}\n'
+                           b'{"t_s": 1.1, "points_m": [[0.1, 0, 0]]}\n')
+            frames = stream.read(1.0)
+        stream.close()
+    assert [time for time, _ in frames] == [1.0, 1.1]
+    assert frames[0][1] == pytest.approx(np.array([[0.5, 0.2, -0.2]]))
+    assert frames[1][1] == pytest.approx(np.array([[0.1, 0, 0]]))
 
 
 def test_its_schema_is_plain(capsys):

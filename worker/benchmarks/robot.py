@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 
 from benchmarks.robot_branches import FAULTS_OF_BRANCHES, followed_paths, lost_branches
 from benchmarks.robot_faults import (
@@ -20,6 +19,8 @@ from benchmarks.robot_faults import (
     restored,
     straight,
 )
+from benchmarks.robot_loop import closed_loops
+from benchmarks.robot_stream import recorded_stream
 from benchmarks.table import Row
 from limber.errors import LimberError
 from limber.progress import Progress
@@ -32,8 +33,8 @@ from limber.robot.trajectory import Trajectory, along, densely
 _ADDRESS = "127.0.0.71"
 
 
-def rows(quick: bool, progress: Progress, _out: Path | None, seed: int = 0) -> list[Row]:
-    """Measure; ``quick`` does each fault once, takes one branch and streams for 6 s."""
+def rows(quick: bool, progress: Progress, out: Path | None, seed: int = 0) -> list[Row]:
+    """Measure; ``quick`` does each fault once, takes one branch and records for 8 s."""
     table = [*_kinematics(seed)]
     progress(0.05, "stop times")
     for model in ("ur5", "ur5e"):
@@ -41,17 +42,14 @@ def rows(quick: bool, progress: Progress, _out: Path | None, seed: int = 0) -> l
     progress(0.15, "path")
     table.append(_path(seed))
     progress(0.2, "faults")
-    table.append(_faults(seed, 1 if quick else 20, progress.part(0.2, 0.75)))
-    progress(0.75, "branches")
+    table.append(_faults(seed, 1 if quick else 20, progress.part(0.2, 0.5)))
+    progress(0.5, "branches")
     table += followed_paths(seed, 1 if quick else 10, _ADDRESS)
     table.append(lost_branches(seed, 1 if quick else 20, _ADDRESS,
                                FAULTS_OF_BRANCHES[:1] if quick else FAULTS_OF_BRANCHES))
-    progress(0.9, "stream")
-    table.append(_stream(seed, 6.0 if quick else 600.0))
-    # Asked and not there: a row that says so is better than none.
-    table.append(Row("closed loop, ten branches: E in its interval, flower in its goal, limits",
-                     "88 to 99 %; all", "not there yet", False))
-    return table
+    progress(0.65, "stream")
+    table += recorded_stream(seed, 8.0 if quick else 600.0, _ADDRESS)
+    return table + closed_loops(seed, 1 if quick else 10, _ADDRESS, progress.part(0.75, 1.0), out)
 
 
 def _kinematics(seed: int) -> list[Row]:
@@ -170,21 +168,3 @@ def _faults(seed: int, runs: int, progress: Progress) -> Row:
     return Row(f"{len(FAULTS)} faults while moving, {runs} runs each: standstill and a report",
                "every one", f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s",
                not failed)
-
-
-def _stream(seed: int, seconds: float) -> Row:
-    clocks: list[np.ndarray] = []
-    with new_robot(_ADDRESS, "ur5e", seed) as robot, \
-            RobotLink(cell_for(_ADDRESS), lambda part: clocks.append(part[:, 0].copy())) as link:
-        process = psutil.Process(link.process.pid)
-        time.sleep(min(5.0, 0.3 * seconds))
-        begin = process.memory_info().rss
-        time.sleep(seconds)
-        grown = process.memory_info().rss - begin
-        lost_by_robot = robot.state["lost_seconds"]
-    steps = np.diff(np.concatenate(clocks))
-    lost = int(np.round(steps / 0.002).sum() - len(steps))
-    return Row(f"500 Hz for {seconds:.0f} s: samples lost, not ascending; driver's memory",
-               "0; flat", f"{lost} of {len(steps) + 1}, {int(np.sum(steps <= 0))}; "
-               f"{grown / 1e6:+.1f} MB (virtual clock stood still for {lost_by_robot:.2f} s)",
-               lost == 0 and bool(np.all(steps > 0)) and abs(grown) < 5e6)

@@ -66,9 +66,13 @@ class _Demo:
               help="True Young's modulus [Pa] at the control points of your CLOUD's pull.")
 @click.option("--seed", type=int, default=1, show_default=True,
               help="Of the generated branch, the sensor noise and the planner.")
+@click.option("--robot", is_flag=True, help="The whole loop instead, with a virtual robot that "
+              "scans, pulls and moves a generated branch, over loopback.")
 def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None, young: str,
-            seed: int, **wishes: tuple[float, ...] | None) -> dict[str, Any]:
+            seed: int, robot: bool, **wishes: tuple[float, ...] | None) -> dict[str, Any]:
     """The whole pipeline on one branch: a generated one with known truth, or your CLOUD."""
+    if robot:
+        return _closed_loop(run, cloud, output or Path("out") / "robot", seed)
     if cloud is not None and not cloud.is_file():
         raise InputError(f"There is no file {cloud}.", "The demo wants the scan of one branch.",
                          "Name a PLY, XYZ, TXT, CSV, PCD or LAS file, or none at all.")
@@ -88,6 +92,22 @@ def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None,
     if failure is not None:
         raise failure
     return summary
+
+
+def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[str, Any]:
+    if cloud is not None:
+        raise InputError(f"--robot is given with the scan {cloud}.",
+                         "The virtual robot scans a branch that it holds: a generated one.",
+                         "Leave one of them out.")
+    require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
+    from limber.closed_loop.loop import ClosedLoop, comparison
+
+    started = time.perf_counter()
+    run.say(f"Limber demo with a virtual robot, results in {folder}")
+    result = ClosedLoop(folder, seed, say=run.say, progress=run.progress).run()
+    for title, rows in comparison(result):
+        run.show(title, rows)
+    return result | {"demo_seconds": round(time.perf_counter() - started, 1)}
 
 
 def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None, young: str,

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from limber.geometry.cloud.apart import read_apart
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
 from limber.recordings.bags.pull import JointPoses, pull_of_bag
-from limber.recordings.bags.reading import is_bag, read_bag
-from limber.recordings.calibration import WITHOUT_GRIPPER
+from limber.recordings.bags.reading import LIMBER, Bag, is_bag, read_bag
+from limber.recordings.calibration import WITHOUT_GRIPPER, CalibrationEntry
 from limber.recordings.checks import clean
 from limber.recordings.force_slope import WHY_NO_MODULUS, force_slope, read_force_displacement
 from limber.recordings.frames import copy_clouds, copy_rgbd, moved_into
@@ -30,6 +31,7 @@ from limber.recordings.recording import (
     PullEntry,
     SensorEntry,
     SwingEntry,
+    entry_of_text,
     read_pull,
     write_entry,
     write_pull,
@@ -64,14 +66,29 @@ class BranchFrame:
     nodes: np.ndarray | None = None
 
 
+@dataclass(frozen=True)
+class RobotKnown:
+    """What is known of the robot that a recording was made with.
+
+    Attributes:
+        joint_poses: Where its gripper is by its joint angles.
+        noise: Of its force sensor.
+        errors: What is left open of a recording of so many seconds.
+    """
+
+    joint_poses: JointPoses
+    noise: SensorEntry
+    errors: Callable[[float], CalibrationEntry]
+
+
 def import_recording(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
                      branch: BranchFrame, progress: Progress = SILENT, *,
-                     joint_poses: JointPoses | None = None) -> dict[str, Any]:
+                     robot: RobotKnown | None = None) -> dict[str, Any]:
     """Bring a recording into ``folder`` in the pull format.
 
     Args:
         kind: What SOURCE is, as :func:`kind_of` tells.
-        joint_poses: Where a robot's gripper is by its joint angles, where that is known.
+        robot: What is known of the robot, where a cell says it.
 
     Returns:
         ``frame_count``, ``point_count``, ``time_offset_s``; under a steady
@@ -86,7 +103,7 @@ def import_recording(kind: str, source: Path, folder: Path, name: str, settings:
         return _import_force_table(source, folder, settings, progress)
     if settings.weight is not None or settings.load is not None:
         return _import_load(kind, source, folder, name, settings, branch, progress)
-    return _import_motion(kind, source, folder, name, settings, branch, joint_poses,
+    return _import_motion(kind, source, folder, name, settings, branch, robot,
                           progress.part(0.1, 1.0))
 
 
@@ -159,15 +176,17 @@ def _import_force_table(source: Path, folder: Path, settings: ImportSettings, pr
 
 
 def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
-                   branch: BranchFrame, joint_poses: JointPoses | None, progress: Progress,
+                   branch: BranchFrame, robot: RobotKnown | None, progress: Progress,
                    ) -> dict[str, Any]:
     if kind == "pull":
         shutil.copytree(source, folder, dirs_exist_ok=True)
         pull = read_pull(folder)
     else:
-        pull = (_of_bag(source, folder, name, settings, branch, joint_poses, progress)
+        pull = (_of_bag(source, folder, name, settings, branch, robot, progress)
                 if kind == "bag" else
                 _assembled(kind, source, folder, name, settings, branch, progress))
+        if kind in ("bag", "robot") and pull.entry.calibration is None:
+            pull = _of_known_robot(pull, robot, settings)
         write_pull(folder, pull)
     cleaned = clean(pull)
     for message in cleaned.warnings:
@@ -415,9 +434,38 @@ def _assembled(kind: str, source: Path, folder: Path, name: str, settings: Impor
     return Pull(name, entry, robot.times, poses, wrenches, observations, tuple(messages))
 
 
+def _of_known_robot(pull: Pull, robot: RobotKnown | None, settings: ImportSettings) -> Pull:
+    """The pull with what its robot's cell leaves open; without a cell it is said what is taken."""
+    if robot is None:
+        taken = CalibrationEntry()
+        return pull.warned(
+            f"{pull.name}: nothing says how well gripper and force sensor are known. Taken: the "
+            f"gripper's frame within {1e3 * taken.pose_sigma_m:g} mm and "
+            f"{np.degrees(taken.pose_sigma_rad):.1g} degrees, the force within "
+            f"{100 * taken.force_gain_sigma:g} %, its zero within {taken.force_bias_sigma_n:g} N "
+            f"and its drift within {taken.force_drift_sigma_n:g} N, all standard deviations; the "
+            "interval of an estimate is as wide. Give --cell with the robot's cell file.")
+    sensor = pull.entry.sensor.model_copy(update={
+        "force_range_n": robot.noise.force_range_n,
+        **({} if "force_sigma" in _given(settings) else {
+            "force_sigma_n": robot.noise.force_sigma_n}),
+        **({} if settings.torque_sigma is not None or pull.entry.sensor.torque_sigma_nm is None
+           else {"torque_sigma_nm": robot.noise.torque_sigma_nm})})
+    return replace(pull, entry=pull.entry.model_copy(update={
+        "sensor": sensor, "calibration": robot.errors(float(pull.times[-1] - pull.times[0]))}))
+
+
+def _given(settings: ImportSettings) -> set[str]:
+    """What of the settings is not as it is without being asked for."""
+    return {name for name, field in ImportSettings.model_fields.items()
+            if getattr(settings, name) != field.default}
+
+
 def _of_bag(source: Path, folder: Path, name: str, settings: ImportSettings, branch: BranchFrame,
-            joint_poses: JointPoses | None, progress: Progress) -> Pull:
-    found = pull_of_bag(read_bag(source), folder, settings, joint_poses, progress)
+            robot: RobotKnown | None, progress: Progress) -> Pull:
+    bag = read_bag(source)
+    found = pull_of_bag(bag, folder, settings, robot and robot.joint_poses, progress)
+    told, warnings = _told_by_limber(bag)
     poses, wrenches = found.robot.values[:, :6], found.robot.values[:, 6:]
     if settings.torque_sigma is None:
         settings = settings.model_copy(update={"torque_sigma": _torque_noise(wrenches[:, 3:])})
@@ -425,22 +473,66 @@ def _of_bag(source: Path, folder: Path, name: str, settings: ImportSettings, bra
     if seen is not None:
         placed = _registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)], name,
                              settings, branch)
-        used = placed.used if placed else np.flatnonzero(seen.visible[0])
+        known = told is not None and not placed and len(told.rest_points_m or ()) == (
+            seen.point_count)
+        used = placed.used if placed else np.flatnonzero(seen.visible[0] | known)
         if not len(used):
             raise InputError(f"{name}: no marker is seen in the first frame.",
                              "Where each is at rest is not known.",
                              "Record from before the pull, or give --nominal.")
         positions = seen.positions[:, used]
         seen = replace(seen, positions=placed.apply(positions) if placed else positions)
-        rest = seen.positions[0]
+        rest = np.array(told.rest_points_m) if known else seen.positions[0]
         if branch.nodes is not None:
             _require_near(rest, name, branch.nodes)
     grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
              else tuple(float(x) for x in poses[0, :3]))
     entry = _entry(found.observation, source, settings, branch, rest, drive=settings.drive,
                    mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
+    if told is not None:
+        entry = _as_told(entry, told, settings)
     _require_on_branch(entry.grasp, name, branch.nodes)
-    return Pull(name, entry, found.robot.times, poses, wrenches, seen, found.warnings)
+    return Pull(name, entry, found.robot.times, poses, wrenches, seen,
+                (*found.warnings, *warnings))
+
+
+def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
+    """What `limber export-pull` wrote of the pull beside its messages, and what was wrong with it.
+    """
+    if not bag.pull_toml:
+        return None, ()
+    try:
+        return entry_of_text(bag.pull_toml, f"{bag.path.name}, metadata {LIMBER}"), ()
+    except InputError as error:
+        return None, (f"{error} Grasp, noise and calibration are taken as of a bag that does not "
+                      "say them.",)
+
+
+def _as_told(entry: PullEntry, told: PullEntry, settings: ImportSettings) -> PullEntry:
+    """The entry of a bag that Limber wrote; what the settings ask for goes before."""
+    given = _given(settings)
+    kept = {"calibration": told.calibration, "weightless": told.weightless, "truth": told.truth,
+            "source": f"{entry.source} ({told.source})" if told.source else entry.source}
+    if "own_weight" not in given:
+        kept["gravity_m_s2"] = told.gravity_m_s2
+    kept |= {name: getattr(told, name) for name in ("drive", "motion") if name not in given}
+    grasp = {"mode": told.grasp.mode} if "grasp_mode" not in given else {}
+    if "grasp_radius" not in given:
+        grasp["radius_m"] = told.grasp.radius_m
+    if not given & {"grasp_point", "frame_pose", "cell"}:
+        grasp["point_m"] = told.grasp.point_m
+    sensor = {} if "position_sigma" in given else {
+        "position_sigma_m": told.sensor.position_sigma_m}
+    if "force_sigma" not in given:
+        sensor["force_sigma_n"] = told.sensor.force_sigma_n
+    if "torque_sigma" not in given:
+        sensor["torque_sigma_nm"] = told.sensor.torque_sigma_nm
+    return entry.model_copy(update=kept | {
+        "grasp": entry.grasp.model_copy(update=grasp),
+        "sensor": told.sensor.model_copy(update={
+            "position_sigma_m": entry.sensor.position_sigma_m,
+            "force_sigma_n": entry.sensor.force_sigma_n,
+            "torque_sigma_nm": entry.sensor.torque_sigma_nm} | sensor)})
 
 
 def _torque_noise(torques: np.ndarray) -> float | None:

@@ -188,13 +188,30 @@ def read_entry(path: Path) -> PullEntry:
         InputError: missing, not TOML, or an entry that makes no sense (named).
     """
     content = read_toml(path, "the description of a pull (`limber import-pull` makes one)")
+    return _checked(content, str(path))
+
+
+def entry_of_text(text: str, where: str) -> PullEntry:
+    """Return what the text of a ``pull.toml`` says; ``where`` it stands is for messages.
+
+    Raises:
+        InputError: as :func:`read_entry`.
+    """
+    try:
+        content = tomlkit.parse(text).unwrap()
+    except (tomlkit.exceptions.TOMLKitError, RecursionError) as error:
+        raise InputError(f"{where} holds no TOML ({error}).", "", "Export it again.") from error
+    return _checked(content, where)
+
+
+def _checked(content: dict[str, Any], where: str) -> PullEntry:
     try:
         return PullEntry.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {place}: {first['msg']}.", "The pull cannot be read without it.",
-                         "Correct the entry.") from error
+        raise InputError(f"{where}: {place}: {first['msg']}.",
+                         "The pull cannot be read without it.", "Correct the entry.") from error
 
 
 def write_entry(path: Path, entry: PullEntry) -> None:

@@ -49,6 +49,7 @@ class RobotLink:
                  python: str | None = None):
         self._on_samples = on_samples
         self._news = threading.Condition()
+        self._sampled = threading.Event()
         self._events: list[dict[str, Any]] = []
         self.warnings: list[str] = []
         self._ended = False
@@ -71,6 +72,17 @@ class RobotLink:
 
     def __exit__(self, *_exception: object) -> None:
         self.close()
+
+    def wait_for_samples(self, seconds: float = 5.0) -> None:
+        """Return when the next samples have come.
+
+        Raises:
+            WorkError: none come.
+        """
+        self._sampled.clear()
+        if not self._sampled.wait(seconds):
+            raise WorkError(f"The robot's driver sends no samples in {seconds:.0f} s.",
+                            "A port may be silent.", "Look at the robot.")
 
     def tare(self, seconds: float = 0.5) -> dict[str, Any]:
         """Take the present force as nothing; the gripper hangs free and still."""
@@ -200,6 +212,7 @@ class RobotLink:
                     rows = [[np.nan if x is None else x for x in row]
                             for row in content["samples"]]
                     self._on_samples(np.array(rows, float))
+                self._sampled.set()
                 continue
             with self._news:
                 self._events.append(content)

@@ -3,12 +3,15 @@
 import json
 import select
 import socket
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 
 from limber.errors import WorkError
-from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS
+from limber.recordings.calibration import CalibrationEntry
+from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, SensorEntry
+from limber.robot.cell import Cell
 from limber.robot.kinematics import inverted, matrices, pose_vectors
 
 HEADER = ",".join(("t_s", *POSE_COLUMNS, *WRENCH_COLUMNS))
@@ -34,8 +37,12 @@ class PullRecorder:
         last: The last sample taken, shape [37] as in :data:`limber.robot.link.COLUMNS`.
     """
 
-    def __init__(self, lines: Lines, point: np.ndarray):
+    def __init__(self, lines: Lines, point: np.ndarray, compliance: float = 0.0):
+        """Begin a recording of the piece at ``point`` [3]; arm, fingers and bark give way by
+        ``compliance`` [m/N], so much it stays behind the gripper.
+        """
         self._lines, self._point = lines, np.asarray(point, float)
+        self._compliance = compliance
         self._offset: np.ndarray | None = None
         self.first: float | None = None
         self.count, self.peak_force = 0, 0.0
@@ -58,6 +65,7 @@ class PullRecorder:
         if self.first is None:
             self.first = float(samples[0, 0])
         pieces = matrices(samples[:, 1:7]) @ self._offset
+        pieces[:, :3, 3] -= self._compliance * np.nan_to_num(samples[:, 13:16])
         wrench = samples[:, 7:13].copy()
         # The torque about the piece's middle instead of the gripper's.
         wrench[:, 3:] += np.cross(samples[:, 1:4] - pieces[:, :3, 3], wrench[:, :3])
@@ -69,16 +77,53 @@ class PullRecorder:
                               float(np.nanmax(np.linalg.norm(wrench[:, :3], axis=1))))
 
 
+def known_noise(cell: Cell) -> SensorEntry:
+    """What a cell says of its force sensor's single readings."""
+    return SensorEntry(
+        force_sigma_n=cell.sensor.force_sigma_n, torque_sigma_nm=cell.sensor.torque_sigma_nm,
+        force_range_n=cell.sensor.force_range_n)
+
+
+def known_errors(cell: Cell, seconds: float, *, tare_sigma: Sequence[float] | None = None,
+                 ) -> CalibrationEntry:
+    """What a cell leaves open of a recording of ``seconds`` [s].
+
+    Args:
+        tare_sigma: Standard error of the tare before it [N, N m], shape [6]; without one the zero
+            is as unknown as after a tare at some earlier time.
+    """
+    usual = CalibrationEntry()
+    minutes = seconds / 60.0
+    drift = cell.sensor.drift_n_per_minute
+    known = {"force_drift_sigma_n": drift * minutes}
+    if tare_sigma is not None:
+        # It drifts on while the gripper closes.
+        since = drift * (cell.tool.grip_seconds + 1.0) / 60.0
+        known |= {"force_bias_sigma_n": float(np.hypot(max(tare_sigma[:3]), since)),
+                  "torque_bias_sigma_nm": float(max(tare_sigma[3:]))}
+    return usual.model_copy(update={
+        "pose_sigma_m": cell.base.position_sigma_m, "pose_sigma_rad": cell.base.rotation_sigma_rad,
+        "pose_noise_m": max(cell.robot.pose_sigma_m, 1e-6),
+        # A tracker on the robot's base is where the base is.
+        "camera_sigma_m": max(cell.base.position_sigma_m, usual.camera_sigma_m),
+        "camera_sigma_rad": max(cell.base.rotation_sigma_rad, usual.camera_sigma_rad), **known})
+
+
 class MarkerStream:
     """Tracked points from another program: JSON lines ``{"t_s", "points_m"}`` over TCP.
 
-    Times are on the robot's clock, points in the branch's frame.
+    Times are on the robot's clock. With ``"frame": "base"`` the points are in the robot's base
+    frame, else in the branch's.
+
+    Args:
+        base: The robot's base in the branch's frame [m, rad], shape [6].
 
     Raises:
         WorkError: nothing answers.
     """
 
-    def __init__(self, address: str, port: int, timeout: float = 3.0):
+    def __init__(self, address: str, port: int, base: np.ndarray, timeout: float = 3.0):
+        self._base = matrices(np.asarray(base, float))
         try:
             self._socket = socket.create_connection((address, port), timeout)
         except OSError as error:
@@ -88,7 +133,7 @@ class MarkerStream:
         self._data = b""
 
     def read(self, timeout: float = 0.0) -> list[tuple[float, np.ndarray]]:
-        """Return the frames that have come: time [s], points [n, 3].
+        """Return the frames that have come: time [s], points [n, 3] in the branch's frame.
 
         Raises:
             WorkError: the tracker is gone.
@@ -103,7 +148,10 @@ class MarkerStream:
         frames = []
         for line in lines:
             content = json.loads(line)
-            frames.append((float(content["t_s"]), np.array(content["points_m"], float)))
+            points = np.array(content["points_m"], float)
+            if content.get("frame") == "base":
+                points = points @ self._base[:3, :3].T + self._base[:3, 3]
+            frames.append((float(content["t_s"]), points))
         return frames
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.errors import Cancelled, LimberError
+from limber.errors import Cancelled, InputError, LimberError
 from limber.estimation.settings import EstimateSettings
 from limber.files import file_digest
 from limber.plain import plain
@@ -33,12 +33,14 @@ _BASES = ".reduced-*.npz"
 class EstimateOptions(RunOptions):
     """How an estimate is run."""
 
-    groups: ClassVar[Groups] = {"input": ("bag",), "running": ("resume", "follow", "pace")}
+    groups: ClassVar[Groups] = {"input": ("bag", "cell"), "running": ("resume", "follow", "pace")}
 
     bag: Path | None = Field(
         None, description="Import this recording first (MCAP, rosbag2, RTDE log) as the pull of "
         "its name, and estimate from it; `limber import-pull` where more has to be said.")
-
+    cell: Path | None = Field(
+        None, description="With --bag: cell file of the robot, which says where its base stands "
+        "and how well gripper and force sensor are known.")
     resume: bool = Field(False, json_schema_extra={"switch": True}, description=(
         "Start at the best that a stopped run found; otherwise what it left behind does not "
         "count."))
@@ -222,15 +224,18 @@ def run(inputs: BranchInputs, settings: EstimateSettings, options: EstimateOptio
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     if options.bag is not None:
-        settings = _with_bag(inputs.branch_folder, options.bag, settings, progress)
+        settings = _with_bag(inputs.branch_folder, options.bag, options.cell, settings, progress)
+    elif options.cell is not None:
+        raise InputError("--cell is given without --bag.", "A pull that is in the folder says for "
+                         "itself how well its robot is known.", "Leave --cell out.")
     if options.follow:
         return follow(inputs.branch_folder, settings, pace=options.pace, progress=progress)
     return estimate(inputs.branch_folder, settings, force=options.force, resume=options.resume,
                     progress=progress)
 
 
-def _with_bag(branch_folder: Path, bag: Path, settings: EstimateSettings, progress: Progress,
-              ) -> EstimateSettings:
+def _with_bag(branch_folder: Path, bag: Path, cell: Path | None, settings: EstimateSettings,
+              progress: Progress) -> EstimateSettings:
     """Bring a recording in; the estimate's pulls are those asked for and this one."""
     import re
 
@@ -238,7 +243,8 @@ def _with_bag(branch_folder: Path, bag: Path, settings: EstimateSettings, progre
     from limber.stages.import_pull import import_pull
 
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", bag.stem).strip("-.") or "bag"
-    import_pull(branch_folder, bag, name, ImportSettings(), progress=progress.part(0.0, 0.05))
+    import_pull(branch_folder, bag, name, ImportSettings(cell=None if cell is None else str(cell)),
+                progress=progress.part(0.0, 0.05))
     return settings.model_copy(update={"pull": tuple(dict.fromkeys((*settings.pull, name)))})
 
 

@@ -19,8 +19,7 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.recordings.bags.pull import JointPoses
-    from limber.recordings.importing import BranchFrame
+    from limber.recordings.importing import BranchFrame, RobotKnown
 
 _JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
@@ -51,7 +50,7 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
     if not source.exists():
         raise InputError(f"There is no {source}.", "A recording was expected.", "Check the path.")
     kind = kind_of(source) if settings.kind == "auto" else settings.kind
-    settings, joint_poses = _of_cell(settings)
+    settings, robot = _of_cell(settings)
     branch = (Branch.create if kind == "force-displacement" else Branch.open)(branch_folder)
     key, digests = f"pull:{name}", {"source": _digest(source)}
     for key_of, named in (("robot", settings.robot), ("nominal", settings.nominal),
@@ -67,17 +66,19 @@ def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSe
         folder = stage.path(prefix + "pull.toml").parent
         stage.result.update(import_recording(kind, source, folder, name, settings,
                                              _frame(branch, kind, settings), progress,
-                                             joint_poses=joint_poses))
+                                             robot=robot))
         stage.result |= {"pull": name, "kind": kind}
     return stage.result
 
 
-def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, JointPoses | None]:
-    """The settings with the cell's base, and where its joints take the gripper."""
+def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, RobotKnown | None]:
+    """The settings with the cell's base, and what the cell says of its robot."""
     if settings.cell is None:
         return settings, None
+    from limber.recordings.importing import RobotKnown
     from limber.robot.cell import read_cell
     from limber.robot.kinematics import forward, matrices, pose_vectors
+    from limber.robot.recorder import known_errors, known_noise
 
     cell = read_cell(Path(settings.cell))
     tool = matrices(np.array(cell.tool.grasp_pose))
@@ -93,7 +94,8 @@ def _of_cell(settings: ImportSettings) -> tuple[ImportSettings, JointPoses | Non
 
     if settings.frame_pose is None:
         settings = settings.model_copy(update={"frame_pose": cell.base.pose})
-    return settings, joint_poses
+    return settings, RobotKnown(joint_poses, known_noise(cell),
+                                lambda seconds: known_errors(cell, seconds))
 
 
 def _frame(branch: Branch, kind: str, settings: ImportSettings) -> BranchFrame:

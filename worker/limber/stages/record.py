@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -36,17 +36,24 @@ class RecordInputs(BranchInputs):
 
 
 class RecordSettings(Settings):
-    """A predefined pull: straight out along a direction, the gripper not turned, and back.
+    """A predefined pull, out and back.
 
     A branch that is pulled far sideways without following its arc is stretched: its force then
     rises steeply, and the guard pauses.
     """
 
-    groups: ClassVar[Groups] = {"pull": ("direction", "distance", "speed", "cycles", "pause")}
+    groups: ClassVar[Groups] = {
+        "pull": ("direction", "distance", "shape", "waypoints", "speed", "cycles", "pause")}
 
     direction: tuple[float, float, float] = Field(
         (1.0, 0.0, 0.0), description="Where to pull, branch frame; its length does not count.")
     distance: float = Field(0.05, gt=0, le=0.5, description="How far [m].")
+    shape: Literal["arc", "straight"] = Field(
+        "arc", description="arc: as the branch's model goes when it is pulled along --direction, "
+        "the gripper turning with it; straight: a line, the gripper not turned.")
+    waypoints: str | None = Field(
+        None, description="CSV of the gripper's way instead: x_m,y_m,z_m, and rx_rad,ry_rad,rz_rad "
+        "where it turns; branch frame, from where the gripper is.")
     speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
     cycles: int = Field(1, ge=1, le=20, description="Times out and back.")
     pause: float = Field(0.5, ge=0, le=10, description="Standing still at each end [s].")
@@ -122,21 +129,26 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
     stream = branch.stream(f"pulls/{name}/robot.csv")
     entry_lines = branch.stream(f"pulls/{name}/pull.toml")
     marker_lines = branch.stream(f"pulls/{name}/markers.csv") if options.markers else None
-    tracker = MarkerStream(cell.robot.address, options.markers) if options.markers else None
+    tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
+               if options.markers else None)
     try:
         progress(0.02, "connecting")
         recorders: list[PullRecorder] = []
         with RobotLink(cell, lambda rows: recorders[0].take(rows) if recorders else None) as link:
             point = _grasp_point(branch, cell, link)
-            recorder = PullRecorder(stream, point)
+            recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
-            progress(0.05, "taring: keep the gripper free")
+            link.wait_for_samples()
+            # Before the tare: what takes long would be drift.
+            trajectory = _pull(branch, cell, point, recorder.last[1:7], settings,
+                               progress.part(0.02, 0.1))
+            progress(0.1, "taring: keep the gripper free")
             tared = link.tare(1.0)
             grip(cell, link, close=True)
             time.sleep(0.5)
-            _write_entry(entry_lines, cell, point, tared, tracker, recorder, marker_lines)
+            _write_entry(entry_lines, cell, point, tared, trajectory.duration, tracker,
+                         marker_lines)
             recorder.close_gripper()
-            trajectory = _pull(cell, recorder.last[1:7], settings)
             link.start(trajectory)
             event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
             ended = {"ended": "reached" if event["event"] == "reached" else event["reason"],
@@ -175,7 +187,7 @@ def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None
             link.stop()
             raise
         _write_markers(tracker, lines, recorder)
-        progress(0.1 + 0.85 * min((time.monotonic() - begin) / trajectory.duration, 1.0),
+        progress(0.15 + 0.8 * min((time.monotonic() - begin) / trajectory.duration, 1.0),
                  "pulling", force_n=recorder.peak_force)
 
 
@@ -189,34 +201,30 @@ def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
                                    *(f"{value:.6g}" for value in points.ravel())]))
 
 
-def _pull(cell: Cell, pose: np.ndarray, settings: RecordSettings) -> Trajectory:
-    from limber.robot.joint_path import joint_path
-    from limber.robot.kinematics import inverted, matrices, pose_vectors
-    from limber.robot.trajectory import Trajectory, along, densely
+def _pull(branch: Branch, cell: Cell, point: np.ndarray, gripper: np.ndarray,
+          settings: RecordSettings, progress: Progress) -> Trajectory:
+    """The motion of the gripper, which is at ``gripper`` [6], branch frame."""
+    from limber.robot.kinematics import matrices
+    from limber.stages.record_way import there_and_back, way_on_arc, way_through
 
     direction = np.array(settings.direction, float)
     length = np.linalg.norm(direction)
-    if length < 1e-9:
+    if length < 1e-9 and settings.waypoints is None:
         raise InputError("--direction 0 0 0.", "It points nowhere.", "Give a direction.")
     if settings.speed > cell.limits.speed_m_s:
         raise InputError(f"--speed {settings.speed:g} is over the cell's "
                          f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
                          "Ask for less, or raise limits.speed_m_s in the cell file.")
-    frames = matrices(np.array([pose, pose]))
-    frames[1, :3, 3] += settings.distance * direction / length
-    out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
-    joint_path(cell.arm, matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose))),
-               joint_limits=cell.joint_limits, singularity_margin=cell.limits.singularity,
-               joint_margin=cell.limits.joint_margin_rad)
-    times, poses, begin = [], [], 0.0
-    for _ in range(settings.cycles):
-        for leg in (out, out[::-1]):
-            passed = begin + along(leg, settings.speed, cell.limits.acceleration_m_s2)
-            # The last pose of a leg is the first of the next, after the pause.
-            times.append(passed)
-            poses.append(leg)
-            begin = float(passed[-1]) + max(settings.pause, 0.02)
-    return Trajectory(np.concatenate(times), np.concatenate(poses))
+    here = matrices(gripper)
+    if settings.waypoints is not None:
+        frames = way_through(Path(settings.waypoints), gripper)
+    elif settings.shape == "arc":
+        frames = way_on_arc(branch, point, direction, settings.distance, progress) @ here
+    else:
+        frames = np.array([here, here])
+        frames[1, :3, 3] += settings.distance * direction / length
+    return there_and_back(cell, frames, speed=settings.speed, cycles=settings.cycles,
+                          pause=settings.pause)
 
 
 def _grasp_point(branch: Branch, cell: Cell, link: RobotLink) -> np.ndarray:
@@ -251,10 +259,12 @@ def _tool_pose(cell: Cell, link: RobotLink) -> np.ndarray:
 
 
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],
-                 tracker: MarkerStream | None, recorder: PullRecorder,
-                 marker_lines: Stream | None) -> None:
+                 seconds: float, tracker: MarkerStream | None, marker_lines: Stream | None,
+                 ) -> None:
     """Write ``pull.toml`` first of all: what a kill leaves can be read with it."""
-    from limber.recordings.recording import GraspEntry, PullEntry, SensorEntry, entry_text
+    from limber.recordings.recording import GraspEntry, PullEntry, entry_text
+    from limber.robot.recorder import known_errors, known_noise
+    from limber.stages.record_way import GRASP_RADIUS_M
 
     rest = None
     if tracker is not None and marker_lines is not None:
@@ -266,10 +276,9 @@ def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, 
         marker_lines.append(",".join(("t_s", *names)))
     entry = PullEntry(
         observation="markers" if rest else "none", grasp=GraspEntry(
-            point_m=tuple(map(float, point)), radius_m=0.012),
-        sensor=SensorEntry(
-            force_sigma_n=cell.sensor.force_sigma_n, torque_sigma_nm=cell.sensor.torque_sigma_nm,
-            force_range_n=cell.sensor.force_range_n),
+            point_m=tuple(map(float, point)), radius_m=GRASP_RADIUS_M),
+        sensor=known_noise(cell),
+        calibration=known_errors(cell, seconds, tare_sigma=tared["sigma"]),
         rest_points_m=rest,
         source=f"limber record, {cell.arm.name}, {cell.sensor.kind}; tare within "
         f"{max(tared['sigma'][:3]):.2g} N")

@@ -16,6 +16,10 @@ from limber.geometry.cloud.apart import read_apart
 from limber.optional import require_extra
 
 SUFFIXES = (".mcap", ".db3", ".bag")
+LIMBER, PULL_TOML = "limber", "pull.toml"
+"""Name of the MCAP metadata record of an exported pull, and its entry with ``pull.toml``."""
+
+_MOST_TEXT = 1_000_000
 _MOST_BROKEN = 0.1
 _SEPARATOR = "|"
 
@@ -53,12 +57,14 @@ class Bag:
             to the topics that hold such messages.
         others: Topics with messages of other types, as ``topic (type)``.
         broken: Messages that could not be decoded.
+        pull_toml: What Limber says of the pull, where it wrote the bag; else empty.
     """
 
     path: Path
     kinds: dict[str, tuple[Topic, ...]]
     others: tuple[str, ...]
     broken: int
+    pull_toml: str = ""
 
     def of(self, kind: str) -> tuple[Topic, ...]:
         """Return the topics of a kind."""
@@ -93,7 +99,8 @@ def read_bag(path: Path) -> Bag:
         raise InputError(f"{path}: {broken} of {read + broken} messages cannot be decoded.",
                          "What is left would be no recording.", "Record or export it again.")
     others = tuple(str(entry) for entry in arrays["others"])
-    return Bag(path, {kind: tuple(topics) for kind, topics in kinds.items()}, others, broken)
+    return Bag(path, {kind: tuple(topics) for kind, topics in kinds.items()}, others, broken,
+               str(arrays["pull_toml"]))
 
 
 @dataclass
@@ -139,7 +146,8 @@ def bag_arrays(path: Path) -> dict[str, np.ndarray]:
                 topic.values.append(values)
     arrays: dict[str, np.ndarray] = {
         "topic_count": np.array(len(found)), "read": np.array(read), "broken": np.array(broken),
-        "others": np.array(others, "U200"), "points": np.zeros((0, 3))}
+        "others": np.array(others, "U200"), "points": np.zeros((0, 3)),
+        "pull_toml": np.array(_pull_toml(path))}
     for number, (name, topic) in enumerate(found.items()):
         arrays[f"{number}_names"] = np.array(_SEPARATOR.join(
             part.replace(_SEPARATOR, "/") for part in (name, topic.kind, topic.frame,
@@ -154,6 +162,24 @@ def bag_arrays(path: Path) -> dict[str, np.ndarray]:
         else:
             arrays[f"{number}_values"] = np.stack(topic.values)
     return arrays
+
+
+def _pull_toml(path: Path) -> str:
+    """The description that `limber export-pull` writes beside the messages; empty without one."""
+    if path.suffix.lower() != ".mcap":
+        return ""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    try:
+        with open(path, "rb") as stream:
+            for record in make_reader(stream).iter_metadata():
+                if record.name == LIMBER:
+                    return record.metadata.get(PULL_TOML, "")[:_MOST_TEXT]
+    except (McapError, OSError, ValueError):
+        # Cut off before its end, where such records are listed; the messages were read.
+        return ""
+    return ""
 
 
 _Entry = tuple[str, str, Any, np.ndarray, tuple[str, ...]]

@@ -17,6 +17,7 @@ from limber.geometry.cloud.files import read_points
 from limber.geometry.cloud.pixels import read_pixels
 from limber.optional import require_extra
 from limber.recordings.bags.pull import BRANCH_FRAME
+from limber.recordings.bags.reading import LIMBER, PULL_TOML
 from limber.recordings.recording import Pull, entry_text
 
 _GRIPPER, _CAMERA = "gripper", "camera"
@@ -42,7 +43,7 @@ def write_mcap(path: Path, folder: Path, pull: Pull) -> dict[str, int]:
     with open(path, "wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2", library="limber")
-        writer.add_metadata("limber", {"pull": pull.name, "pull.toml": entry_text(pull.entry)})
+        writer.add_metadata(LIMBER, {"pull": pull.name, PULL_TOML: entry_text(pull.entry)})
         channels: dict[str, int] = {}
         every = sorted([*_of_robot(messages, pull), *_of_points(messages, pull),
                         *_of_frames(messages, folder, pull)], key=lambda entry: entry[0])

@@ -5,7 +5,7 @@ takes away what they ask for. One call of :meth:`Controller.step` is one step of
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Protocol
@@ -76,7 +76,7 @@ class Load(Protocol):
         ...
 
     def seen(self) -> list[list[float]]:
-        """Return where the points are that a tracker sees [m]."""
+        """Return where the points are that a tracker sees, base frame [m]."""
         ...
 
     @property
@@ -286,10 +286,15 @@ class Controller:
         """Turn the button back and switch the arm on again."""
         self.safety_mode, self.robot_mode, self.motion = SafetyMode.NORMAL, RobotMode.RUNNING, None
 
-    def go_home(self) -> None:
-        """Stand at the home pose at once, without a way there."""
-        self.stop_program("set to its home pose")
-        self.joints, self.speeds, self.motion = np.array(HOME), np.zeros(6), None
+    def stand(self, joints: Sequence[float] = HOME) -> None:
+        """Stand with joints [rad] at once, without a way there, as if guided by hand."""
+        wanted = np.array(joints, float)
+        if wanted.shape != (6,) or not np.isfinite(wanted).all():
+            raise InputError(f"Joint angles {joints}.", "Six finite numbers [rad] are needed.",
+                             "Give one angle a joint.")
+        self.stop_program("set to a pose")
+        self.load.release()
+        self.joints, self.speeds, self.motion = wanted, np.zeros(6), None
         self._update_tool()
 
     def set_remote(self, remote: bool) -> None:

@@ -246,8 +246,8 @@ class HeldBranch:
         self._pipe.close()
 
     def seen(self) -> list[list[float]]:
-        """Return where the seen points are [m]."""
-        return self.points.tolist()
+        """Return where a tracker on the robot's base sees the points, base frame [m]."""
+        return ((self.points - self._base[:3, 3]) @ self._base[:3, :3]).tolist()
 
     def look(self, camera: dict[str, Any]) -> None:
         """Ask for a depth image; it is in ``picture`` when the solver has found time for it.

@@ -239,6 +239,7 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "release": lambda server: server.controller.load.release(),
     "break": lambda server: server.controller.load.lose("broken"),
     "slip": lambda server, part: server.controller.load.slide(part),
-    "home": lambda server: server.controller.go_home(),
+    "home": lambda server: server.controller.stand(),
+    "stand": lambda server, joints: server.controller.stand(joints),
     "stop_program": lambda server: server.controller.stop_program("test"),
 }

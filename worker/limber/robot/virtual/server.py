@@ -205,7 +205,7 @@ class Server:
             points = points + _MARKER_SIGMA_M * rng.standard_normal(points.shape)
             seen_at = self.controller.clock
             if seen_at > last + 1e-9:
-                line = json.dumps({"t_s": seen_at, "points_m": points.tolist()})
+                line = json.dumps({"t_s": seen_at, "frame": "base", "points_m": points.tolist()})
                 self.send(writer, f"{line}\n".encode())
                 last = seen_at
             await asyncio.sleep(_MARKER_SECONDS)

@@ -1,0 +1,86 @@
+"""A recording at 500 Hz for minutes, ended by kill -9: what of it is there afterwards."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from benchmarks.robot_branches import FRACTION, random_branch
+from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from benchmarks.table import Row
+from limber.recordings.streams import read_stream
+from limber.stages.record import RecordOptions, RecordSettings, record
+from limber.store import Branch
+
+_DISTANCE_M = 0.01
+_LONGEST_S = 120.0  # for connecting, the arc and the tare
+
+
+def recorded_stream(seed: int, seconds: float, address: str) -> list[Row]:
+    """Record for ``seconds`` [s] with `limber record`, kill it, and take over what is left."""
+    with tempfile.TemporaryDirectory() as place:
+        branch, young = random_branch(Path(place, "stream.branch"), seed)
+        cell = standing_at(branch, address, fraction=FRACTION)
+        path = cell_file(cell, Path(place))
+        with robot_holding(branch, cell, Path(place), seed=seed, young=young) as robot:
+            process = _started(branch, path)
+            try:
+                begin, memory, grown, killed = _watched(robot, process, seconds)
+            finally:
+                # A driver of its own ends with its pipe.
+                process.kill()
+                process.wait()
+            lost_by_robot = robot.state["lost_seconds"]
+        record(branch.folder, path, "stream", RecordSettings(), RecordOptions(recover=True))
+        times = read_stream(Branch.open(branch.folder).path("pulls/stream/robot.csv")).times
+    steps = np.diff(times)
+    lost = int(np.round(steps / 0.002).sum() - len(steps))
+    missing = (killed - begin) - float(times[-1])
+    return [
+        Row(f"500 Hz recorded for {times[-1]:.0f} s: samples lost, not ascending; memory of "
+            "recorder and driver", "0; flat", f"{lost} of {len(times)}, "
+            f"{int(np.sum(steps <= 0))}; {memory / 1e6:.0f} MB {grown / 1e6:+.1f} MB (virtual "
+            f"clock stood still for {lost_by_robot:.2f} s)",
+            lost == 0 and bool(np.all(steps > 0)) and abs(grown) < 0.05 * memory),
+        Row("the same: lost by kill -9, at most", "1 s", f"{max(missing, 0.0):.2f} s",
+            missing <= 1.0)]
+
+
+def _started(branch: Branch, path: Path) -> subprocess.Popen:
+    way = [str(value) for value in sideways(branch, FRACTION)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "limber", "record", str(branch.folder), "--cell", str(path),
+         "--name", "stream", "--confirm", "stream", "--direction", *way, "--distance",
+         str(_DISTANCE_M), "--speed", "0.002", "--cycles", "20", "--pause", "10"],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _watched(robot, process: subprocess.Popen, seconds: float,
+             ) -> tuple[float, int, int, float]:
+    """Return the clock when rows began, memory after a tenth of the time and how it has grown
+    since, and the clock of the kill."""
+    end = time.monotonic() + _LONGEST_S
+    while np.linalg.norm(robot.state["tool_speed"][:3]) < 5e-4:
+        if process.poll() is not None or time.monotonic() > end:
+            raise RuntimeError("the recording did not begin")
+        time.sleep(0.05)
+    # Rows begin when the gripper has closed, a moment before it moves.
+    begin = robot.state["clock"]
+    time.sleep(0.1 * seconds)
+    before = _memory(process.pid)
+    time.sleep(0.9 * seconds)
+    grown = _memory(process.pid) - before
+    killed = robot.state["clock"]
+    os.kill(process.pid, signal.SIGKILL)
+    return begin, before, grown, killed
+
+
+def _memory(pid: int) -> int:
+    parent = psutil.Process(pid)
+    return sum(each.memory_info().rss for each in (parent, *parent.children(recursive=True)))

@@ -1,0 +1,317 @@
+"""Scan, reconstruct, record, estimate, plan, execute: each a process, over loopback.
+
+A branch is generated and stands, on a mesh of its own and with moduli that only it knows, beside a
+virtual robot. Everything after that uses what a user has: the camera's pictures, touched points,
+the robot's ports and Limber's own commands. At the end both sides are compared.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.closed_loop.places import base_beside, bending_modulus, gripper_at, write_touched
+from limber.closed_loop.watching import Watch
+from limber.errors import InputError, SafetyStop, WorkError
+from limber.estimation.gripper_path import force_for_travel
+from limber.estimation.settings import VirtualPullSettings
+from limber.estimation.virtual_pull import TrueBranch, true_branch
+from limber.geometry.generated import read_truth
+from limber.geometry.skeleton.files import read_swc
+from limber.jobs.process import run_stage
+from limber.mechanics import solve_static
+from limber.plain import plain
+from limber.progress import SILENT, Progress
+from limber.robot.arms import arm_named
+from limber.robot.cell import Cell, read_cell, write_cell
+from limber.robot.kinematics import matrices
+from limber.robot.virtual.held_branch import BranchSetting
+from limber.robot.virtual.launch import VirtualRobot
+from limber.robot.virtual.server import MARKER_PORT
+from limber.stages.loading import load_grasp_model, load_skeleton
+from limber.store import Branch
+
+GRASP_FRACTION = 0.85
+FLOWER, PLAN, PULL = "flower", "to-light", "pull-1"
+GOAL_TOLERANCE_M = 0.01
+
+_LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
+_PEAK_N, _TRAVEL_M = 6.0, 0.04
+_GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
+_TOUCH_SIGMA_M = 3e-4
+_SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8
+_PULL_SPEED_M_S = 0.02
+_PLAN_SPEED_M_S = 0.03
+_OVERLOAD = np.array([0.0, 0.0, 60.0, 0.0, 0.0, 0.0])
+_DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16, "target": 0.17,
+         "record": 0.27, "estimate": 0.5, "energy": 0.6, "plan": 0.68, "dry run": 0.75,
+         "execute": 0.88, "overload": 1.0}
+
+
+@dataclass
+class ClosedLoop:
+    """One turn of the loop on a branch of its own.
+
+    Args:
+        folder: Where everything goes.
+        seed: Of the branch, the sensors' noise and the touching.
+        address: Loopback address of the virtual robot.
+        model: Its arm.
+        say: Gets a line for each part.
+
+    Attributes:
+        seconds: What each part took.
+    """
+
+    folder: Path
+    seed: int = 1
+    address: str = "127.0.0.1"
+    model: str = "ur5e"
+    say: Callable[[str], None] = lambda line: None
+    progress: Progress = SILENT
+    seconds: dict[str, float] = field(default_factory=dict)
+    _done: float = 0.0
+
+    @property
+    def branch(self) -> Path:
+        """The branch folder that the loop makes."""
+        return self.folder / "loop.branch"
+
+    @property
+    def cell_file(self) -> Path:
+        return self.folder / "cell.toml"
+
+    def run(self) -> dict[str, Any]:
+        """Go once around.
+
+        Returns:
+            What :meth:`_compared` tells.
+
+        Raises:
+            LimberError: a part failed; the robot is gone then, what was made stays.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.branch.exists():
+            raise InputError(f"{self.branch} is there already.", "A loop begins with a new branch.",
+                             "Choose another folder with -o.")
+        truth = self._grown()
+        cell = self._cell(truth)
+        setting = BranchSetting.of_truth(truth, cell, self.folder / "truth.vtu")
+        file = self.folder / "truth.json"
+        file.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}),
+                        encoding="utf-8")
+        with VirtualRobot(self.model, self.address,
+                          ["--branch", file, "--seed", self.seed]) as robot:
+            moved = self._reconstructed(truth, cell)
+            estimated = self._estimated(robot)
+            goal, plan = self._planned()
+            executed, watch = self._executed(robot)
+            stopped = self._overloaded(robot, executed)
+        return self._compared(truth, moved, estimated, goal, plan, executed, watch, stopped)
+
+    # Parts
+
+    def _grown(self) -> TrueBranch:
+        scan = self.folder / "grown"
+        shape = ["--length", _LENGTH_M, "--fork-count", 0, "--seed", self.seed]
+        self._part("generate", "a branch grows", "generate", scan, *shape)
+        skeleton = read_swc(scan / "truth_skeleton.swc")
+        young = bending_modulus(skeleton, GRASP_FRACTION, _PEAK_N, _TRAVEL_M)
+        known = read_truth(scan / "truth.json")
+        shares = np.array(known["young_pa"]) / np.exp(np.mean(np.log(known["young_pa"])))
+        return true_branch(skeleton, VirtualPullSettings(young=tuple(young * shares)),
+                           fractions=tuple(known["fractions"]))
+
+    def _cell(self, truth: TrueBranch) -> Cell:
+        """Put the robot beside the branch; returns its true cell in the scan's frame."""
+        point, axis = _grasp_of(truth.skeleton)
+        arm = arm_named(self.model)
+        base = base_beside(arm, matrices(np.array(_GRASP_POSE)), point, axis)
+        return Cell(
+            robot={"model": self.model, "address": self.address},
+            base={"pose": tuple(map(float, base))},
+            tool={"grasp_pose": _GRASP_POSE, "gripper": "digital_output", "mass_kg": 0.0,
+                  "grip_seconds": 4.0},
+            limits={"soft_force_n": 20.0, "hard_force_n": 30.0, "hard_torque_nm": 6.0})
+
+    def _reconstructed(self, truth: TrueBranch, cell: Cell) -> np.ndarray:
+        """Scan, reconstruct, calibrate, name the flower; returns what takes the scan's frame to
+        the branch's [m], shape [3]."""
+        nodes = truth.mesh.nodes
+        middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
+        scan = self.folder / "scan.ply"
+        self._part("scan", "scanned by the virtual camera", "robot", "scan", "--address",
+                   self.address, "-o", scan, "--middle", *middle, "--distance", _SCAN_DISTANCE_M,
+                   "--views", _SCAN_VIEWS)
+        self._part("reconstruct", "scan to tetrahedra", "reconstruct", scan, "-o", self.branch,
+                   "--root", *truth.skeleton.nodes[0], "--grasp-fraction", GRASP_FRACTION)
+        alignment = Branch.open(self.branch).manifest.alignment
+        moved = alignment.apply(np.zeros((1, 3)))[0]
+        assert np.allclose(np.array(alignment.rotation), np.eye(3)), "the scan is upright"
+        # Somebody has measured roughly where the base stands; touching tells it.
+        base = np.array(cell.base.pose) + np.r_[moved, 0, 0, 0]
+        write_cell(self.cell_file, cell.model_copy(update={
+            "base": cell.base.model_copy(update={"pose": tuple(map(float, base))})}))
+        rng = np.random.default_rng([self.seed, 7])
+        on_axis = np.array([truth.skeleton.point_at(part) for part in (0.3, 0.6, 0.85)])
+        write_touched(self.folder / "touched.csv", np.array(cell.base.pose), moved, on_axis,
+                      _TOUCH_SIGMA_M, rng)
+        self._part("calibrate", "base calibrated by touching", "robot", "calibrate",
+                   self.cell_file, self.branch, "--points", self.folder / "touched.csv")
+        tip = truth.skeleton.nodes[truth.skeleton.main_path()[-1]] + moved
+        self._part("target", "the flower at its tip is named", "target", self.branch, FLOWER,
+                   "--at", *tip)
+        return moved
+
+    def _estimated(self, robot: VirtualRobot) -> dict[str, Any]:
+        branch = Branch.open(self.branch)
+        point, axis = _grasp_of(load_skeleton(branch))
+        joints, _rotation = gripper_at(read_cell(self.cell_file), point, axis)
+        robot.ask("stand", joints=list(map(float, joints)))
+        self._part("record", "a pull along the branch's arc", "record", self.branch, "--cell",
+                   self.cell_file, "--name", PULL, "--confirm", PULL, "--markers", MARKER_PORT,
+                   "--direction", *_sideways(point)[0], "--distance", _TRAVEL_M,
+                   "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
+        return self._part("estimate", "Young's modulus from the pull", "estimate", self.branch)
+
+    def _planned(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """Energy field and path; returns where the flower is to come, branch frame [m]."""
+        self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed", self.seed)
+        goal = self._flower_goal()
+        plan = self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
+                          PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
+                          "--goal-tolerance", GOAL_TOLERANCE_M, "--speed", _PLAN_SPEED_M_S,
+                          "--seed", self.seed)
+        return goal, plan
+
+    def _flower_goal(self) -> np.ndarray:
+        """A place that somebody wishes the flower at: where a pull to the other side takes it."""
+        model = load_grasp_model(Branch.open(self.branch), gravity=True)
+        way = _sideways(model.rest_position)[1]
+        size = force_for_travel(model.model, model.grasp, way, _TRAVEL_M)
+        state = solve_static(model.model, grasp=model.grasp, grasp_force=size * way).require()
+        return model.branch.target_positions(state.displacement)[0]
+
+    def _executed(self, robot: VirtualRobot) -> tuple[dict[str, Any], Watch]:
+        dry = self._part("dry run", "the path checked for the arm", "execute", self.branch,
+                         "--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S)
+        robot.ask("stand", joints=dry["start_joints_rad"])
+        with Watch(robot) as watch:
+            result = self._part("execute", "the path followed, armed", "execute", self.branch,
+                                *self._armed(dry))
+        return dry | result, watch
+
+    def _overloaded(self, robot: VirtualRobot, executed: dict[str, Any]) -> tuple[str, Watch]:
+        """Follow the path again and overload the sensor on the way; returns what stopped it."""
+        robot.ask("stand", joints=executed["start_joints_rad"])
+        with Watch(robot, overload=_OVERLOAD) as watch:
+            try:
+                self._part("overload", "the path again, with an overload", "execute", self.branch,
+                           *self._armed(executed))
+            except SafetyStop as stop:
+                return stop.seen, watch
+        raise WorkError("The overload stopped nothing.", f"{_OVERLOAD[2]:.0f} N were added to the "
+                        "sensor while the branch was led.", "See the robot's log.")
+
+    def _armed(self, dry: dict[str, Any]) -> list[object]:
+        return ["--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S, "--arm",
+                "--confirm", PLAN, "--after-stop", "hold", "--gripper-rotation",
+                *dry["gripper_rotation"]]
+
+    # Both sides
+
+    def _compared(self, truth: TrueBranch, moved: np.ndarray, estimated: dict[str, Any],
+                  goal: np.ndarray, plan: dict[str, Any], executed: dict[str, Any], watch: Watch,
+                  stopped: tuple[str, Watch]) -> dict[str, Any]:
+        """Return recovered against true E, force along the path, the flower, the overload."""
+        seen = watch.at_the_end()
+        flower = None if seen is None else seen[-1] + moved
+        off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
+        interval = np.array(estimated["young_interval_pa"], float)
+        reason, second = stopped
+        overload = second.overloaded
+        return plain({
+            "seed": self.seed, "branch": self.branch, "young_true_pa": truth.young,
+            "young_pa": estimated["young_pa"], "young_interval_pa": interval,
+            "covered": (interval[:, 0] <= truth.young) & (truth.young <= interval[:, 1]),
+            "force_within_share": executed["force_within_share"],
+            "force_error_of_peak": executed["force_error_of_peak"],
+            "predicted_peak_force_n": executed["predicted_peak_force_n"],
+            "predicted_force_sigma_n": executed["predicted_force_sigma_n"],
+            "peak_force_n": executed["peak_force_n"], "path_error_m": executed["path_error_m"],
+            "limit_broken": bool(executed["peak_force_n"]
+                                 > read_cell(self.cell_file).limits.soft_force_n),
+            "flower_goal_m": goal, "flower_planned_m": plan.get("target_end_m"),
+            "flower_m": flower, "flower_off_m": None if flower is None else off,
+            "flower_in_goal": off <= GOAL_TOLERANCE_M,
+            "overload_reason": reason,
+            "overload_way_m": overload.way if overload else None,
+            "overload_standstill_s": overload.standstill if overload else None,
+            "extrapolation_error_n": max(watch.extrapolation_error, second.extrapolation_error),
+            "part_seconds": self.seconds})
+
+    def _part(self, name: str, title: str, *arguments: object) -> dict[str, Any]:
+        """Run a command as a process; show its progress and its time."""
+        with self._timed(name, title) as progress:
+            result = run_stage([str(a) for a in arguments], progress)
+        for warning in result.get("warnings", []):
+            self.progress.warn(f"{name}: {warning}")
+        return result
+
+    @contextmanager
+    def _timed(self, name: str, title: str) -> Iterator[Progress]:
+        began = time.perf_counter()
+        progress = self.progress.part(self._done, _DONE[name])
+        progress(0.0, title)
+        try:
+            yield progress
+        finally:
+            self._done = _DONE[name]
+            self.seconds[name] = round(time.perf_counter() - began, 1)
+            self.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
+
+
+def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
+    """Return titles and tables of what a loop found, for a terminal."""
+    from limber.report.tables import modulus_rows
+
+    force = [["force along the path", ""],
+             ["predicted peak", f"{result['predicted_peak_force_n']:.2f} N"],
+             ["measured peak", f"{result['peak_force_n']:.2f} N"],
+             ["within 5 % of the peak or its interval",
+              f"{100 * result['force_within_share']:.1f} % of the path"],
+             ["difference, 95 % of the path below",
+              f"{100 * result['force_error_of_peak']:.1f} % of the peak"],
+             ["the virtual branch's own force off by at most",
+              f"{result['extrapolation_error_n']:.2f} N"]]
+    places = [["", "x [mm]", "y [mm]", "z [mm]"]]
+    for title, key in (("flower's goal", "flower_goal_m"), ("as planned", "flower_planned_m"),
+                       ("where it came to", "flower_m")):
+        if result[key] is not None:
+            places.append([title, *(f"{1000 * value:.1f}" for value in result[key])])
+    way, still = result["overload_way_m"], result["overload_standstill_s"]
+    stop = [["a provoked overload", ""], ["stopped by", result["overload_reason"]],
+            ["way after it", "-" if way is None else f"{1000 * way:.1f} mm"],
+            ["until standstill", "-" if still is None else f"{1000 * still:.0f} ms"]]
+    return [("Young's modulus", modulus_rows(result, result)),
+            ("Predicted against measured", force), ("The flower", places), ("Safety", stop)]
+
+
+def _grasp_of(skeleton: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The grasp's point [m] and the branch's axis there, shape [3] each."""
+    point = skeleton.point_at(GRASP_FRACTION)
+    axis = point - skeleton.point_at(GRASP_FRACTION - 0.05)
+    return point, axis / np.linalg.norm(axis)
+
+
+def _sideways(point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two directions across the line from the root, the origin, to ``point`` [3]."""
+    axis = point / np.linalg.norm(point)
+    first = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)

@@ -1,0 +1,109 @@
+"""The virtual robot as seen from beside it, while another process drives it."""
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from limber.robot.virtual.launch import VirtualRobot
+
+STILL_M_S = 1e-4
+_LED_M = 0.015  # from the grasp's rest: the branch is led
+_LED_M_S = 0.01
+_AT_END_M = 5e-4
+_EVERY_SECONDS, _CLOSELY_SECONDS = 0.05, 0.004
+
+
+@dataclass(frozen=True)
+class Overload:
+    """What a provoked overload led to.
+
+    Attributes:
+        standstill: From the overload until the arm stood still [s].
+        way: What the gripper still moved [m].
+    """
+
+    standstill: float
+    way: float
+
+
+@dataclass
+class Watch:
+    """Notes what the robot and its branch do, in a thread; a context manager.
+
+    Args:
+        robot: Nobody else may ask it meanwhile.
+        overload: Wrench on the sensor from when the branch is led [N, N m], shape [6], or None.
+
+    Attributes:
+        states: As :attr:`VirtualRobot.state` told them.
+        overloaded: What the overload led to; None where it never came to one.
+    """
+
+    robot: VirtualRobot
+    overload: np.ndarray | None = None
+    states: list[dict[str, Any]] = field(default_factory=list)
+    overloaded: Overload | None = None
+
+    def __enter__(self) -> "Watch":
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="watch", daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        if self.overload is not None:
+            self.robot.ask("added_wrench", wrench=[0.0] * 6)
+
+    @property
+    def extrapolation_error(self) -> float:
+        """By how much the virtual branch's own force was off, at most [N]."""
+        return max((state.get("extrapolation_error_n", 0.0) for state in self.states), default=0.0)
+
+    def at_the_end(self) -> np.ndarray | None:
+        """Return where the branch's seen points were at the end of the way [m], shape [n, 3].
+
+        That is where it was held still, farthest from where it was taken hold of.
+        """
+        held = [state for state in self.states if state["branch"] == "held"]
+        still = [state for state in held if _speed(state) < STILL_M_S]
+        if not still:
+            return None
+        places = np.array([state["pose"][:3] for state in still])
+        away = np.linalg.norm(places - held[0]["pose"][:3], axis=1)
+        there = np.linalg.norm(places - places[away.argmax()], axis=1) < _AT_END_M
+        return np.mean([state["points"] for state, is_there in zip(still, there, strict=True)
+                        if is_there], axis=0)
+
+    def _run(self) -> None:
+        start: np.ndarray | None = None
+        while not self._ended.wait(_EVERY_SECONDS):
+            state = self.robot.state
+            self.states.append(state)
+            place = np.array(state["pose"][:3])
+            if state["branch"] != "held":
+                start = None
+                continue
+            start = place if start is None else start
+            is_led = np.linalg.norm(place - start) > _LED_M and _speed(state) > _LED_M_S
+            if self.overload is not None and self.overloaded is None and is_led:
+                self._overload()
+
+    def _overload(self) -> None:
+        assert self.overload is not None
+        before = self.robot.ask("added_wrench", wrench=list(map(float, self.overload)))
+        began = time.monotonic()
+        while not self._ended.wait(_CLOSELY_SECONDS):
+            state = self.robot.state
+            if _speed(state) < STILL_M_S:
+                way = np.subtract(state["pose"][:3], before["pose"][:3])
+                self.overloaded = Overload(time.monotonic() - began, float(np.linalg.norm(way)))
+                return
+
+
+def _speed(state: dict[str, Any]) -> float:
+    return float(np.linalg.norm(state["tool_speed"][:3]))
