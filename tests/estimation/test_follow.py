@@ -4,6 +4,7 @@ import threading
 import time
 
 import numpy as np
+import pytest
 
 from limber.estimation.online import follow
 from limber.recordings.recording import write_pull
@@ -47,3 +48,25 @@ def test_a_replay_keeps_its_pace(tmp_path, plain_pull):
             break
     assert len(frames) == 60
     assert 0.17 < time.monotonic() - started < 3.0
+
+
+def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
+    """A recorder's lines stand beside the folder's files until it has ended."""
+    from limber.estimation.settings import EstimateSettings
+    from limber.stages.estimate import _followed
+
+    settings = EstimateSettings(pull=("live",))
+    with bare_branch.stream("pulls/live/pull.toml") as lines:
+        lines.append("# growing")
+        name, folder = _followed(bare_branch, settings)
+    assert name == "live" and (folder / "pull.toml").read_text() == "# growing\n"
+    with bare_branch.stage("record:live") as stage:
+        stage.adopt("pulls/live/pull.toml")
+    assert _followed(bare_branch, settings)[1] == bare_branch.folder / "pulls" / "live"
+
+
+@pytest.fixture
+def bare_branch(tmp_path):
+    from limber.store import Branch
+
+    return Branch.create(tmp_path / "bare.branch")

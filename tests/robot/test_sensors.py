@@ -191,6 +191,20 @@ def test_a_replayed_file_runs_with_the_robots_clock(tmp_path):
     assert sensor.read(sample_at(np.zeros(6), clock=103.0)).age > 2
 
 
+def test_a_replay_is_for_the_virtual_robot_alone(tmp_path):
+    path = tmp_path / "ft.csv"
+    path.write_text("t_s,fx,fy,fz,tx,ty,tz\n0,1,0,0,0,0,0\n0.5,2,0,0,0,0,0\n")
+    cell = cell_with(kind="replay", file=str(path))
+    assert isinstance(open_sensor(cell), ReplayedSensor)
+    real = cell.model_copy(update={"robot": cell.robot.model_copy(
+        update={"address": "192.168.0.10"})})
+    with pytest.raises(InputError, match="would not feel the branch"):
+        open_sensor(real)
+    for wrong in ({"kind": "replay"}, {"kind": "ft300", "file": "ft.csv"}):
+        with pytest.raises(ValueError, match="goes with nothing else"):
+            cell_with(**wrong)
+
+
 def test_without_a_sensor_nothing_is_moved():
     with pytest.raises(InputError, match="cannot feel"):
         open_sensor(cell_with(kind="none"))

@@ -113,13 +113,22 @@ class ApproachEntry(_Entry):
 class SensorEntry(_Entry):
     """The force-torque sensor that the guard and recordings use."""
 
-    kind: Literal["controller", "ft300", "none"] = "controller"
+    kind: Literal["controller", "ft300", "replay", "none"] = Field(
+        "controller", description="replay: what a file holds, for the virtual robot alone.")
+    file: str | None = Field(None, description="CSV of a replay: t_s and six columns, in the "
+                             "sensor's frame.")
     pose: Pose = Field((0.0,) * 6, description="The sensor's frame in the flange's.")
     force_range_n: float = Field(100.0, gt=0)
     torque_range_nm: float = Field(10.0, gt=0)
     force_sigma_n: float = Field(0.15, gt=0)
     torque_sigma_nm: float = Field(0.02, gt=0)
     drift_n_per_minute: float = Field(0.8, ge=0)
+
+    @model_validator(mode="after")
+    def _has_its_file(self) -> "SensorEntry":
+        if (self.kind == "replay") != (self.file is not None):
+            raise ValueError("file is the CSV of kind = \"replay\", and goes with nothing else")
+        return self
 
 
 class LimitsEntry(_Entry):

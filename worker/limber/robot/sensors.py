@@ -162,15 +162,21 @@ class ReplayedSensor:
         """Nothing is open."""
 
 
-def open_sensor(cell: Cell, replay: Path | None = None) -> ForceTorqueSensor:
+def open_sensor(cell: Cell) -> ForceTorqueSensor:
     """Return the cell's sensor.
 
     Raises:
-        InputError: the cell names none, or a CB3's own estimate, which is no sensor.
+        InputError: the cell names none, or a CB3's own estimate, which is no sensor, or a replay
+            for a robot that is not the virtual one.
         WorkError: it does not answer.
     """
-    if replay is not None:
-        return ReplayedSensor(cell, replay)
+    if cell.sensor.kind == "replay":
+        if not cell.robot.address.startswith("127."):
+            raise InputError(f"The cell replays forces from {cell.sensor.file} at robot "
+                             f"{cell.robot.address}.", "The guard would not feel the branch that "
+                             "is there.", "Replay at the virtual robot (127.0.0.x), or name the "
+                             "sensor that is mounted.")
+        return ReplayedSensor(cell, Path(cell.sensor.file))
     if cell.sensor.kind == "none":
         raise InputError("The cell names no force sensor.",
                          "The guard does not move a branch that it cannot feel.",
@@ -205,7 +211,7 @@ class WrenchChain:
         self._base = frame_of(np.array(self.cell.base.pose))
         self._tool = frame_of(np.array(self.cell.tool.grasp_pose))
         self._from_tool = inverse_of(self._tool)
-        self._own_weight = self.cell.sensor.kind == "ft300"
+        self._own_weight = self.cell.sensor.kind != "controller"
 
     def delay(self, rate: float) -> float:
         """Return by how much the smoothed wrench is late [s]."""

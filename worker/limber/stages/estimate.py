@@ -173,10 +173,10 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     from limber.stages.loading import load_subject
 
     branch = Branch.open(branch_folder)
-    name = _followed(branch, settings)
+    name, folder = _followed(branch, settings)
     subject = load_subject(branch, settings)
     result, history = follow_pull(
-        branch.path(f"pulls/{name}"), name, subject, settings, pace=pace,
+        folder, name, subject, settings, pace=pace,
         training_count=training_count, progress=progress,
         axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
     with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
@@ -186,13 +186,16 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     return stage.result
 
 
-def _followed(branch: Branch, settings: EstimateSettings) -> str:
-    """The pull to follow; one that a recorder writes is not in the branch's manifest."""
+def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Path]:
+    """The pull to follow and its folder; one that is being recorded is not in the manifest."""
     from limber.stages.loading import pull_names
 
-    if settings.pull and (branch.folder / "pulls" / settings.pull[0] / "pull.toml").is_file():
-        return settings.pull[0]
-    return pull_names(branch, settings)[0]
+    name = settings.pull[0] if settings.pull else None
+    if name is not None and (growing := branch.growing(f"pulls/{name}")) is not None:
+        return name, growing
+    if name is None or not (branch.folder / "pulls" / name / "pull.toml").is_file():
+        name = pull_names(branch, settings)[0]
+    return name, branch.path(f"pulls/{name}")
 
 
 def _cloud(branch: Branch) -> np.ndarray | None:

@@ -231,6 +231,12 @@ class Branch:
         """
         return Stream(self.folder / _STREAMS / checked_name(name))
 
+    def growing(self, prefix: str) -> Path | None:
+        """Return the folder of the streams below ``prefix``, which may grow; None without one."""
+        folder = self.folder / _STREAMS / checked_name(prefix)
+        return folder if folder.is_dir() and any(
+            path.is_file() and not path.name.startswith(".") for path in folder.iterdir()) else None
+
     def streams(self) -> list[str]:
         """Return the names of the streams that no stage has taken over yet, sorted."""
         folder = self.folder / _STREAMS
