@@ -1,0 +1,127 @@
+"""The closed loop's own parts; the whole of it takes minutes and is a row of `scripts/bench robot`.
+"""
+
+import numpy as np
+import pytest
+
+from limber import cli
+from limber.closed_loop.loop import ClosedLoop, comparison
+from limber.closed_loop.places import base_beside, bending_modulus, gripper_at, write_touched
+from limber.closed_loop.watching import Watch
+from limber.commands.robot import _points
+from limber.errors import InputError, NoPathError
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.robot.arms import arm_named
+from limber.robot.calibration import fit_base
+from limber.robot.cell import Cell
+from limber.robot.kinematics import forward, matrices
+
+TOOL = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
+
+
+def test_the_bending_modulus_is_the_cantilevers():
+    """F L^3 / (3 E I) of a round rod, held at three quarters of it."""
+    nodes = np.zeros((41, 3))
+    nodes[:, 2] = np.linspace(0, 0.4, 41)
+    rod = Skeleton.from_edges(nodes, np.arange(41) - 1, np.full(41, 0.005))
+    young = bending_modulus(rod, 0.75, 6.0, 0.04)
+    moment = np.pi / 4 * 0.005**4
+    assert 6.0 * 0.3**3 / (3 * young * moment) == pytest.approx(0.04, rel=1e-4)
+
+
+def test_the_arm_stands_beside_the_branch_and_its_gripper_on_it():
+    point, axis = np.array([0.05, -0.02, 0.34]), np.array([0.2, -0.1, 0.97])
+    arm = arm_named("ur5e")
+    base = base_beside(arm, matrices(np.array(TOOL)), point, axis)
+    assert base[3:5] == pytest.approx([0, 0]), "it stands upright"
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": tuple(base)}, tool={"grasp_pose": TOOL})
+    joints, rotation = gripper_at(cell, point, axis)
+    grasp = cell.grasp_frames(forward(arm, joints))
+    assert grasp == pytest.approx(matrices(np.r_[point, rotation]), abs=1e-9)
+    away = cell.model_copy(update={"base": cell.base.model_copy(
+        update={"pose": (3.0, 0, 0, 0, 0, 0)})})
+    with pytest.raises(NoPathError, match="does not reach"):
+        gripper_at(away, point, axis)
+
+
+def test_touched_marks_tell_where_the_base_stands(tmp_path):
+    base, moved = np.array([0.6, -0.2, 0.1, 0, 0, 1.2]), np.array([0.01, 0.0, -0.02])
+    on_axis = np.array([[0.02, 0.01, 0.2], [0.05, 0.0, 0.35]])
+    write_touched(tmp_path / "touched.csv", base, moved, on_axis, 1e-4, np.random.default_rng(2))
+    names, on_branch, touched = _points(tmp_path / "touched.csv")
+    assert names[0] == "rim-1" and names[-1] == "branch-2"
+    fit = fit_base(touched, on_branch)
+    # Known best where it was touched, farther off by what the turn is off.
+    middle = np.r_[touched.mean(axis=0), 1.0]
+    off = matrices(fit.pose) @ middle - (matrices(base) @ middle + np.r_[moved, 0])
+    assert np.linalg.norm(off) < 3e-4
+    assert np.abs(fit.pose[3:] - base[3:]).max() < 3e-3
+
+
+class Beside:
+    """A robot whose states are told one after the other."""
+
+    def __init__(self, states):
+        self._states, self._last = iter(states), states[-1]
+        self.asked: list[str] = []
+
+    @property
+    def state(self):
+        return next(self._states, self._last)
+
+    def ask(self, action, **_values):
+        self.asked.append(action)
+        return self._last
+
+
+def told(branch, place, speed=0.0, flower=0.0):
+    return {"branch": branch, "pose": [place, 0, 0, 0, 0, 0], "tool_speed": [speed] + [0] * 5,
+            "points": [[0, 0, 0], [flower, 0, 0.4]], "extrapolation_error_n": 0.1 * flower}
+
+
+def test_the_flower_is_where_it_was_held_still_farthest_away():
+    states = [told("free", 0.0), told("held", 0.1), told("held", 0.12, 0.03, 0.02),
+              told("held", 0.15, 0.0, 0.05), told("held", 0.15, 0.0, 0.06),
+              told("held", 0.12, 0.03, 0.02), told("held", 0.1), told("free", 0.1)]
+    watch = Watch(Beside(states))
+    assert watch.at_the_end() is None
+    watch.states = states
+    assert watch.at_the_end()[-1] == pytest.approx([0.055, 0, 0.4])
+    assert watch.extrapolation_error == pytest.approx(0.006)
+
+
+def test_the_overload_comes_while_the_branch_is_led_and_is_taken_away():
+    states = [told("held", 0.0), told("held", 0.01, 0.03), told("held", 0.02, 0.03),
+              told("held", 0.021, 0.03), told("held", 0.022)]
+    robot = Beside(states)
+    with Watch(robot, overload=np.array([0, 0, 60.0, 0, 0, 0])) as watch:
+        for _ in range(200):
+            if watch.overloaded is not None:
+                break
+            watch._ended.wait(0.02)
+    assert robot.asked == ["added_wrench", "added_wrench"]
+    assert watch.overloaded.way == pytest.approx(0.0)
+
+
+def test_a_loop_writes_over_nothing(tmp_path):
+    (tmp_path / "loop.branch").mkdir()
+    with pytest.raises(InputError, match="is there already"):
+        ClosedLoop(tmp_path).run()
+
+
+def test_the_demo_takes_a_scan_or_a_robot(tmp_path):
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    assert cli.call(["demo", str(scan), "--robot"]) == 2
+
+
+def test_what_is_compared_fits_a_terminal():
+    result = {"young_pa": [1e9], "young_interval_pa": [[8e8, 1.2e9]], "young_true_pa": [1.1e9],
+              "predicted_peak_force_n": 6.0, "peak_force_n": 6.1, "force_within_share": 0.97,
+              "force_error_of_peak": 0.03, "extrapolation_error_n": 0.1,
+              "flower_goal_m": [0.1, 0, 0.4], "flower_planned_m": None, "flower_m": [0.1, 0, 0.4],
+              "overload_way_m": 0.002, "overload_standstill_s": 0.08, "overload_reason": "limit"}
+    tables = dict(comparison(result))
+    assert tables["Young's modulus"][1][-1] == "yes"
+    assert ["way after it", "2.0 mm"] in tables["Safety"]
+    assert [row[0] for row in tables["The flower"]] == ["", "flower's goal", "where it came to"]
