@@ -246,6 +246,24 @@ def test_a_base_out_of_reach_is_refused_before_any_force_is_solved(planned_folde
                 ExecuteOptions())
 
 
+def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder, tmp_path,
+                                                                  monkeypatch):
+    """A box around the grasp, and a gripper with a shape: refused before any force is solved."""
+    from limber.stages import execute as stage
+
+    monkeypatch.setattr(stage, "_predicted", lambda *_: pytest.fail("forces were solved"))
+    branch = Branch.open(planned_folder)
+    cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)
+    place = tuple(map(float, load_skeleton(branch).point_at(FRACTION)))
+    finger = {"start_m": (0, 0, 0), "end_m": (0, 0, 0.15), "radius_m": 0.01}
+    box = {"kind": "box", "name": "shelf", "size_m": (0.1, 0.1, 0.1), "pose": (*place, 0, 0, 0)}
+    blocked = Cell.model_validate(cell.model_dump() | {
+        "tool": cell.tool.model_dump() | {"parts": [finger]}, "obstacles": [box]})
+    with pytest.raises(NoPathError, match="inside shelf"):
+        execute(planned_folder, "path", cell_file(blocked, tmp_path), ExecuteSettings(),
+                ExecuteOptions())
+
+
 def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):
     branch = Branch.open(planned_folder)
     cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)

@@ -18,7 +18,7 @@ from limber.progress import Progress
 from limber.robot.arms import arm_named
 from limber.robot.belonging import check_branch
 from limber.robot.cell import BoxEntry, Cell, read_cell
-from limber.robot.execution import robot_motion
+from limber.robot.execution import RobotMotion, robot_motion
 from limber.robot.expected import Predicted
 from limber.robot.kinematics import inverse, inverted, matrices
 from limber.store import Branch
@@ -127,9 +127,19 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
     there = np.array(motion.phases) != "return"
     predicted = Predicted.of_forces(motion.poses[there], motion.forces[there])
     found = robot_motion(cell, predicted, axis, speed=speed)
+    require_clear(cell, found, obstacles)
+    return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
+            "gripper_rotation": found.rotation,
+            "duration_s": found.approach.duration + found.path.duration,
+            "singularity_distance": found.joints.singularity,
+            "joint_limit_margin_rad": found.joints.limit_margin}
+
+
+def require_clear(cell: Cell, motion: RobotMotion, obstacles: tuple[Obstacle, ...]) -> None:
+    """Raise NoPathError where the gripper's shape would be inside an obstacle; says where."""
     base = matrices(np.array(cell.base.pose))
     tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
-    flange = base @ matrices(np.vstack([found.approach.poses, found.path.poses])) @ tool
+    flange = base @ matrices(np.vstack([motion.approach.poses, motion.path.poses])) @ tool
     share = np.linspace(0.0, 1.0, _CAPSULE_POINTS)[:, None]
     for part in cell.tool.parts:
         start, end = np.array(part.start_m), np.array(part.end_m)
@@ -142,8 +152,3 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
                 f"({', '.join(f'{x:.3f}' for x in where)}) m.",
                 "Paths are checked against obstacles, and not yet led around them.",
                 "Choose another goal, or a workspace that keeps clear of it.")
-    return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
-            "gripper_rotation": found.rotation,
-            "duration_s": found.approach.duration + found.path.duration,
-            "singularity_distance": found.joints.singularity,
-            "joint_limit_margin_rad": found.joints.limit_margin}
