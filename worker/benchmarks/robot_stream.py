@@ -19,6 +19,7 @@ from limber.stages.record import RecordOptions, RecordSettings, record
 from limber.store import Branch
 
 _DISTANCE_M = 0.01
+_BEGUN_M_S, _APART = 5e-4, 20  # samples over which a speed is taken
 _LONGEST_S = 120.0  # for connecting, the arc and the tare
 
 
@@ -38,10 +39,14 @@ def recorded_stream(seed: int, seconds: float, address: str) -> list[Row]:
                 process.wait()
             lost_by_robot = robot.state["lost_seconds"]
         record(branch.folder, path, "stream", RecordSettings(), RecordOptions(recover=True))
-        times = read_stream(Branch.open(branch.folder).path("pulls/stream/robot.csv")).times
+        rows = read_stream(Branch.open(branch.folder).path("pulls/stream/robot.csv"))
+    times, places = rows.times, rows.values[:, :3]
     steps = np.diff(times)
     lost = int(np.round(steps / 0.002).sum() - len(steps))
-    missing = (killed - begin) - float(times[-1])
+    # Both clocks from when it began to move.
+    way = np.linalg.norm(places[_APART:] - places[:-_APART], axis=1)
+    first = int(np.argmax(way > _BEGUN_M_S * (times[_APART:] - times[:-_APART])))
+    missing = (killed - begin) - float(times[-1] - times[first])
     return [
         Row(f"500 Hz recorded for {times[-1]:.0f} s: samples lost, not ascending; memory of "
             "recorder and driver", "0; flat", f"{lost} of {len(times)}, "
@@ -63,14 +68,13 @@ def _started(branch: Branch, path: Path) -> subprocess.Popen:
 
 def _watched(robot, process: subprocess.Popen, seconds: float,
              ) -> tuple[float, int, int, float]:
-    """Return the clock when rows began, memory after a tenth of the time and how it has grown
+    """Return the clock when it began to move, memory after a tenth of the time and how it has grown
     since, and the clock of the kill."""
     end = time.monotonic() + _LONGEST_S
-    while np.linalg.norm(robot.state["tool_speed"][:3]) < 5e-4:
+    while np.linalg.norm(robot.state["tool_speed"][:3]) < _BEGUN_M_S:
         if process.poll() is not None or time.monotonic() > end:
             raise RuntimeError("the recording did not begin")
-        time.sleep(0.05)
-    # Rows begin when the gripper has closed, a moment before it moves.
+        time.sleep(0.01)
     begin = robot.state["clock"]
     time.sleep(0.1 * seconds)
     before = _memory(process.pid)
