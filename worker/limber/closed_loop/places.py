@@ -48,9 +48,9 @@ def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray)
         NoPathError: from nowhere around.
     """
     best: tuple[float, np.ndarray] | None = None
-    for turn in np.arange(8) * np.pi / 4:
+    for turn in np.arange(6) * np.pi / 3:
         aside = np.array([np.cos(turn), np.sin(turn), 0.0])
-        for distance in (0.55, 0.7, 0.85):
+        for distance in (0.6, 0.8):
             for below in (0.15, 0.3):
                 pose = np.r_[point + distance * arm.reach * aside - [0, 0, below], 0, 0, turn]
                 held = _held(arm, pose, tool, point, axis)
