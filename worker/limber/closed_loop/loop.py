@@ -39,9 +39,13 @@ from limber.store import Branch
 GRASP_FRACTION = 0.85
 FLOWER, PLAN, PULL = "flower", "to-light", "pull-1"
 GOAL_TOLERANCE_M = 0.01
+"""So near its goal the flower is in it."""
+PLANNED_TOLERANCE_M = 0.006
+"""So near it is planned: a path ends where the region begins, and the model is off by something."""
 
 _LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
+_MOST_FORCE_N = 10.0  # of the gripper on the planned path: a branch that is bent, not stretched
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 _TOUCH_SIGMA_M = 3e-4
 _SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8
@@ -185,8 +189,8 @@ class ClosedLoop:
         goal = self._flower_goal()
         plan = self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
                           PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
-                          "--goal-tolerance", GOAL_TOLERANCE_M, "--speed", _PLAN_SPEED_M_S,
-                          "--seed", self.seed)
+                          "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", _MOST_FORCE_N,
+                          "--speed", _PLAN_SPEED_M_S, "--seed", self.seed)
         return goal, plan
 
     def _flower_goal(self) -> np.ndarray:
