@@ -87,6 +87,8 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     page = (orchard / "results/jobs.html").read_text()
     assert "2 done" in page and page.count("<svg class=sketch viewBox") == 4
     assert "href=" not in page, "no branch has a report"
+    told = (orchard / "results/jobs.log").read_text()
+    assert "two target:flower failed" in told and "one virtual-pull:pull-2 done after" in told
 
 
 def test_a_killed_batch_goes_on(orchard, monkeypatch):
@@ -119,6 +121,32 @@ def test_two_batches_exclude_each_other(orchard):
     damaged = first.path.read_text() + '{"branch": "one"}\nno json\n[' + "[" * 9999 + "\n"
     first.path.write_text(damaged)
     assert Records(jobs).of(jobs.branches[0], jobs.branches[0].tasks[0]).status == "waiting"
+
+
+def test_records_and_log_stay_short(orchard, monkeypatch):
+    """Of many runs each task's last line is kept; the log's oldest lines go."""
+    from limber.batch import log, records
+
+    jobs = read_jobs(orchard / "jobs.toml")
+    held, branch = Records(jobs), jobs.branches[0]
+    with held.writing():
+        for number in range(40):
+            held.end(branch, branch.tasks[0], records.Record("done", seconds=float(number)))
+        held.begin(branch, branch.tasks[1])
+    assert len(held.path.read_text().splitlines()) == 41
+    monkeypatch.setattr(records, "_LEAST_LINES", 10)
+    again = Records(jobs)
+    with again.writing():
+        assert len(held.path.read_text().splitlines()) == 2
+    assert Records(jobs).of(branch, branch.tasks[0]).seconds == 39.0
+    monkeypatch.setattr(log, "MOST_BYTES", 500)
+    with log.BatchLog(jobs) as lines:
+        for number in range(100):
+            lines.tell("one", f"line {number}\nof %s text")
+    files = sorted(jobs.out.glob("jobs.log*"))
+    assert [path.name for path in files] == ["jobs.log", *(f"jobs.log.{n}" for n in (1, 2, 3))]
+    assert all(path.stat().st_size <= 500 for path in files)
+    assert files[0].read_text().splitlines()[-1].endswith("one line 99 of %s text")
 
 
 def test_text_of_files_is_no_page_and_no_formula(orchard, capsys):

@@ -8,13 +8,18 @@ from typing import Any, Protocol
 
 from limber.batch.cluster import Cluster, ClusterLostError
 from limber.batch.job_file import BranchJob, JobFile, StageTask
+from limber.batch.log import BatchLog
 from limber.batch.records import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
+from limber.batch.staging import AT_ONCE, Staging
 from limber.batch.task import run_task
 from limber.errors import Cancelled, LimberError
 from limber.jobs import Pool, worker_count
 from limber.progress import SILENT, Progress
+from limber.version import VERSION
 
 _TICK_SECONDS = 0.2
+_FETCH = -1
+"""Before a branch's first task: what it needs is brought from its addresses."""
 _MEMORY_MB_EACH = 1000.0
 """What a stage may need; the pool starts no more processes than memory has room for."""
 
@@ -46,8 +51,10 @@ def run_jobs(jobs: JobFile, records: Records, *, retry_failed: bool = False,
     kind = None if scheduler else cluster or jobs.cluster
     with records.writing(), (
             Cluster(jobs, kind, address=scheduler, workers=workers, progress=progress)
-            if kind or scheduler else _ThisProcess(jobs, workers)) as machines:
-        _Course(jobs, records, machines, progress, retry_failed=retry_failed).run()
+            if kind or scheduler else _ThisProcess(jobs, workers)) as machines, (
+            Staging(jobs)) as staging, BatchLog(jobs) as log:
+        log.tell(f"{jobs.path.name}: {len(jobs.branches)} branches, Limber {VERSION}")
+        _Course(jobs, records, machines, staging, log, progress, retry_failed=retry_failed).run()
 
 
 class Machines(Protocol):
@@ -84,13 +91,17 @@ class _ThisProcess:
 
 
 class _Course:
-    def __init__(self, jobs: JobFile, records: Records, machines: Machines, progress: Progress, *,
-                 retry_failed: bool):
+    """The way of all branches through their tasks; each may be fetched before and put after."""
+
+    def __init__(self, jobs: JobFile, records: Records, machines: Machines, staging: Staging,
+                 log: BatchLog, progress: Progress, *, retry_failed: bool):
         self.jobs, self.records, self.machines, self.progress = jobs, records, machines, progress
-        self.retry_failed = retry_failed
+        self.staging, self.log, self.retry_failed = staging, log, retry_failed
         self.waiting = deque(jobs.branches)
         self.running: dict[Future, tuple[BranchJob, int, float]] = {}
         self.ended = 0
+        # While some are moved others are computed.
+        self.ahead = AT_ONCE if any(branch.is_moved for branch in jobs.branches) else 0
 
     def run(self) -> None:
         total = max(len(self.jobs.branches), 1)
@@ -98,52 +109,102 @@ class _Course:
         try:
             while self.waiting or self.running:
                 # A branch is brought to its end before another is begun: results come early.
-                while self.waiting and len(self.running) < self.machines.count:
-                    self.submit(self.waiting.popleft(), 0)
+                while self.waiting and len(self.running) < self.machines.count + self.ahead:
+                    self.begin(self.waiting.popleft())
                 done, _ = wait(self.running, _TICK_SECONDS, FIRST_COMPLETED)
                 for future in done:
                     self.take(future)
                 self.report(total, time.monotonic() - started)
-        except BaseException:
+        except BaseException as error:
             self.machines.cancel()
+            self.log.tell(f"stopped: {error!r}")
             raise
+        self.log.tell(f"{self.ended} branches ended in {time.monotonic() - started:.0f} s")
 
     def report(self, total: int, seconds: float) -> None:
         numbers: dict[str, Any] = {"branches_done": self.ended}
         if self.ended and seconds > 1:
             numbers["remaining_s"] = round(seconds * (total - self.ended) / self.ended)
-        at = ", ".join(f"{branch.name} {branch.tasks[number].label}"
+        at = ", ".join(f"{branch.name} {_step(branch, number)}"
                        for branch, number, _ in list(self.running.values())[:3])
         self.progress(self.ended / total, at, **numbers)
+
+    def begin(self, branch: BranchJob) -> None:
+        """Have a branch fetched, or its first task run."""
+        if not branch.is_moved or self.is_given_up(branch, 0):
+            self.submit(branch, 0)
+        else:
+            self.running[self.staging.fetch(branch)] = branch, _FETCH, time.monotonic()
+
+    def is_given_up(self, branch: BranchJob, number: int) -> bool:
+        """Whether a task has failed before and is not to be tried again."""
+        failed = self.records.of(branch, branch.tasks[number]).status == FAILED
+        return failed and not self.retry_failed
 
     def submit(self, branch: BranchJob, number: int) -> None:
         """Have the branch's task of this number run, or end the branch."""
         if number == len(branch.tasks):
+            self.end(branch)
+            return
+        if self.is_given_up(branch, number):
             self.ended += 1
             return
         task = branch.tasks[number]
-        before = self.records.of(branch, task)
-        if before.status == FAILED and not self.retry_failed:
-            self.ended += 1
-            return
         self.records.begin(branch, task)
         future = self.machines.submit(task, branch.folder)
         self.running[future] = branch, number, time.monotonic()
 
+    def end(self, branch: BranchJob) -> None:
+        """Have what came of a branch put where it belongs, or count it as ended."""
+        if branch.home or self.jobs.home:
+            self.running[self.staging.put(branch)] = (
+                branch, len(branch.tasks), time.monotonic())
+        else:
+            self.ended += 1
+
     def take(self, future: Future) -> None:
         branch, number, since = self.running.pop(future)
+        if number in (_FETCH, len(branch.tasks)):
+            self.moved(future, branch, number, time.monotonic() - since)
+            return
         task = branch.tasks[number]
-        record = self.outcome(future, time.monotonic() - since)
+        record = self.outcome(future, branch, time.monotonic() - since)
         self.records.end(branch, task, record)
+        self.log.tell(branch.name, task.label, f"{record.status} after {record.seconds or 0:.1f} s",
+                      f"with {record.memory_mb:.0f} MB" if record.memory_mb else "")
         for warning in record.warnings:
-            self.progress.warn(f"{branch.name} {task.label}: {warning}")
+            self.warn(f"{branch.name} {task.label}: {warning}")
         if record.has_succeeded:
             self.submit(branch, number + 1)
         else:
-            self.progress.warn(f"{branch.name} {task.label} failed: {record.error}")
+            self.warn(f"{branch.name} {task.label} failed: {record.error}")
+            self.end(branch)
+
+    def warn(self, message: str) -> None:
+        self.progress.warn(message)
+        self.log.tell(message)
+
+    def moved(self, future: Future, branch: BranchJob, number: int, seconds: float) -> None:
+        """Go on after a branch was fetched, or end with it; a failure is that of the next task,
+        or of the last."""
+        try:
+            future.result()
+        except LimberError as error:
+            if isinstance(error, Cancelled):
+                raise
+            task = branch.tasks[0 if number == _FETCH else -1]
+            told = f"{_step(branch, number)}: {error}"
+            self.warn(f"{branch.name} {told}")
+            if self.records.of(branch, task).status != FAILED:
+                self.records.end(branch, task, Record(FAILED, told, round(seconds, 3)))
+            self.ended += 1
+            return
+        if number == _FETCH:
+            self.submit(branch, 0)
+        else:
             self.ended += 1
 
-    def outcome(self, future: Future, seconds: float) -> Record:
+    def outcome(self, future: Future, branch: BranchJob, seconds: float) -> Record:
         try:
             told = future.result()
         except (Cancelled, ClusterLostError):
@@ -154,11 +215,17 @@ class _Course:
         except Exception as error:
             # A bug of ours in a stage: it costs this branch, not the night's work.
             notes = " ".join(getattr(error, "__notes__", ()))
-            return Record(FAILED, f"internal error: {error!r}; please report it. {notes}",
-                          round(seconds, 3))
+            return Record(FAILED, f"internal error: {error!r}; please report it (`limber "
+                          f"bug-report {branch.folder}`). {notes}", round(seconds, 3))
         status = FAILED if told["error"] else KEPT if told["is_kept"] else DONE
         return Record(status, told["error"], told["seconds"], told["memory_mb"],
                       tuple(told["warnings"]), numbers_of(told["result"]))
+
+
+def _step(branch: BranchJob, number: int) -> str:
+    if number == _FETCH:
+        return "fetching"
+    return branch.tasks[number].label if number < len(branch.tasks) else "putting"
 
 
 def plan_of(jobs: JobFile, records: Records, *, retry_failed: bool = False,

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.batch.lines import line_of_task
+from limber.errors import InputError
 from limber.files import write_atomically
 
 KINDS = ("slurm", "snakemake")
@@ -24,7 +25,15 @@ def emitted(jobs: JobFile, kind: str) -> str:
 
 
 def write_script(jobs: JobFile, kind: str) -> Path:
-    """Write the script into the job file's results folder, as JOBS.slurm or JOBS.smk."""
+    """Write the script into the job file's results folder, as JOBS.slurm or JOBS.smk.
+
+    Raises:
+        InputError: inputs or results are at addresses.
+    """
+    if jobs.home or any(branch.is_moved for branch in jobs.branches):
+        raise InputError(f"{jobs.path} has addresses.", "A script runs stages on files here; what "
+                         "is elsewhere is fetched and put by the batch itself.",
+                         "Run it without --emit, or fetch the files first.")
     jobs.out.mkdir(parents=True, exist_ok=True)
     path = jobs.out / f"{jobs.path.stem}.{'slurm' if kind == 'slurm' else 'smk'}"
     write_atomically(path, emitted(jobs, kind))

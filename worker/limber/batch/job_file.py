@@ -5,6 +5,7 @@
     out = "results"                       # where the branch folders, the table and the page go
     time_limit = "1 h"                    # of each stage; memory_limit = "4 GB"
     cluster = "slurm"                     # or "local", "pbs" ...; default: this process's pool
+    work = "/scratch/night"               # where to work if out is an address: "s3://bucket/night"
 
     [[job]]
     scans = ["scans/*.ply"]               # a branch each; or folders = ["old/*.branch"]
@@ -25,7 +26,8 @@
     "reconstruct.mesh_spacing" = [2.0, 3.0]
 
 It is checked whole against the stages' settings before anything runs. Nothing in it is executed;
-what it makes stays in ``out``, or in the folders that it names.
+what it makes stays in ``out``, or in the folders that it names. Scans, folders, inputs and ``out``
+may be addresses, as fsspec knows them (:mod:`limber.batch.staging`).
 """
 
 import difflib
@@ -40,6 +42,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from limber.batch.addresses import is_address
+from limber.batch.job_addresses import JobAddresses
 from limber.batch.toml_lines import Place, line_of, toml_lines
 from limber.batch.units import in_unit
 from limber.errors import InputError
@@ -49,6 +53,7 @@ from limber.plain import plain
 from limber.reading import read_text, read_toml
 from limber.settings import Settings
 from limber.stages.registry import stage_description, stage_schema, stage_summaries
+from limber.store.manifest import MANIFEST
 
 NOT_IN_BATCHES = {
     "record": "It moves a robot: somebody has to stand beside it.",
@@ -56,7 +61,7 @@ NOT_IN_BATCHES = {
     "generate": "It makes a scan, not a branch: run it before, and name its cloud under scans."}
 CLUSTERS = ("local", "slurm", "pbs", "lsf", "sge", "oar", "moab", "htcondor")
 """Where a batch may run beside this process's own pool: a Dask cluster here, or of a queue."""
-_KEYS = ("out", "workers", "cluster", "time_limit", "memory_limit", "job")
+_KEYS = ("out", "work", "workers", "cluster", "time_limit", "memory_limit", "job")
 _JOB_KEYS = ("scans", "folders", "stage", "sweep")
 _PLACEHOLDER = re.compile(r"\{([^{}]*)\}")
 _MOST_BRANCHES = 100_000
@@ -87,17 +92,28 @@ class StageTask:
 
 @dataclass(frozen=True)
 class BranchJob:
-    """What is run on one branch, in this order; ``sweep`` says which values are its own."""
+    """What is run on one branch, in this order; ``sweep`` says which values are its own.
+
+    ``fetched`` has the addresses of its inputs and where those go here, ``home`` the address that
+    the branch folder itself has, or nothing.
+    """
 
     name: str
     folder: Path
     tasks: tuple[StageTask, ...]
     sweep: dict[str, Any] = field(default_factory=dict)
+    fetched: tuple[tuple[str, Path], ...] = ()
+    home: str = ""
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether it, or what it needs, is elsewhere."""
+        return bool(self.fetched or self.home)
 
 
 @dataclass(frozen=True)
 class JobFile:
-    """A checked job file; ``limits`` hold for each stage."""
+    """A checked job file; ``limits`` hold for each stage, ``home`` is the address of results."""
 
     path: Path
     out: Path
@@ -105,6 +121,7 @@ class JobFile:
     workers: int | None = None
     cluster: str | None = None
     limits: Limits = field(default_factory=Limits)
+    home: str = ""
 
 
 def read_jobs(path: Path) -> JobFile:
@@ -129,13 +146,14 @@ class _Reader:
         self.path, self.content, self.lines = path, content, lines
         self.problems: list[tuple[int, str]] = []
         self.out = path.parent / path.stem
+        self.home = ""
+        self.addresses = JobAddresses(self.problem)
 
     def read(self) -> JobFile:
         content = self.content
         self.check_keys(content, _KEYS, ())
-        out = self.typed(content, "out", str, (), "")
-        if out:
-            self.out = self.path.parent / out
+        self.read_out(self.typed(content, "out", str, (), ""),
+                      self.typed(content, "work", str, (), ""))
         workers = self.typed(content, "workers", int, (), None)
         if workers is not None and workers < 1:
             self.problem(("workers",), "workers is at least 1.")
@@ -151,7 +169,19 @@ class _Reader:
             branches += self.job(job, ("job", number))
         self.check_folders(branches)
         self.stop_on_problems()
-        return JobFile(self.path, self.out, tuple(branches), workers, cluster, limits)
+        return JobFile(self.path, self.out, tuple(branches), workers, cluster, limits,
+                       self.home)
+
+    def read_out(self, out: str, work: str) -> None:
+        """Results go to a folder; or to an address, and are worked on in a folder here."""
+        if work and (is_address(work) or not is_address(out)):
+            self.problem(("work",), "work is a folder here, for results that go to an address.")
+        elif is_address(out):
+            self.home = self.addresses.checked(out, ("out",))
+            if work:
+                self.out = self.path.parent / work
+        elif out:
+            self.out = self.path.parent / out
 
     def problem(self, place: Place, text: str) -> None:
         self.problems.append((line_of(self.lines, place), text))
@@ -213,10 +243,14 @@ class _Reader:
                 name += "".join(f"-{key.split('.')[-1]}-{_plain_name(value)}"
                                 for key, value in sweep.items())
             folder = self.out / f"{name}.branch" if is_scan else source
+            home = self.addresses.of(folder)
+            if is_scan and self.home:
+                home = f"{self.home}/{name}.branch"
             reader = _TaskReader(self, source, is_scan, folder, sweep)
             tasks = [task for number, stage in enumerate(stages)
                      for task in reader.tasks(stage, (*place, "stage", number))]
-            found.append(BranchJob(name, folder, tuple(tasks), sweep))
+            found.append(BranchJob(name, folder, tuple(tasks), sweep,
+                                   self.fetched(tasks, folder), home))
             if len(found) > _MOST_BRANCHES:
                 self.problem(place, f"The job has over {_MOST_BRANCHES} branches.")
                 break
@@ -233,19 +267,36 @@ class _Reader:
             if not isinstance(pattern, str):
                 self.problem((*place, key), f"{pattern!r} is no path.")
                 continue
-            matches = self.matches(pattern)
             if key == "folders":
-                matches = [path for path in matches if (path / "branch.json").is_file()]
+                matches = self.folders(pattern, (*place, key))
+            else:
+                matches = self.matches(pattern, (*place, key))
             if not matches:
                 what = "branch folder" if key == "folders" else "file"
                 self.problem((*place, key), f"No {what} is {pattern!r}.")
             found += [(path, key == "scans") for path in matches]
         return found
 
-    def matches(self, pattern: str) -> list[Path]:
-        """Return the paths that a pattern names, from the job file's folder, sorted."""
+    def matches(self, pattern: str, place: Place) -> list[Path]:
+        """Return the paths that a pattern names, from the job file's folder, sorted.
+
+        What is at an address gets a path here, where it goes before it is read.
+        """
+        if is_address(pattern):
+            return self.addresses.files(pattern, self.out, place)
         return [Path(self.path.parent, name) for name in sorted(
             glob.glob(pattern, root_dir=self.path.parent, recursive=True))]
+
+    def folders(self, pattern: str, place: Place) -> list[Path]:
+        if is_address(pattern):
+            return self.addresses.folders(pattern, self.out, place)
+        return [path for path in self.matches(pattern, place) if (path / MANIFEST).is_file()]
+
+    def fetched(self, tasks: list[StageTask], folder: Path) -> tuple[tuple[str, Path], ...]:
+        """Return the addresses of what tasks read beside the branch, and where each goes."""
+        return self.addresses.among([
+            value for task in tasks for part in (task.inputs, task.settings, task.options)
+            for value in vars(part).values() if isinstance(value, Path) and value != folder])
 
     def sweeps(self, job: dict[str, Any], stages: list[dict[str, Any]], place: Place,
                ) -> list[dict[str, Any]]:
@@ -365,18 +416,28 @@ class _TaskReader:
             if about["group"] == "output":
                 found = [each | {key: self.inside(value, (*place, key))} for each in found]
             elif glob.has_magic(value):
-                matches = self.reader.matches(value)
+                matches = self.reader.matches(value, (*place, key))
                 if not matches:
                     self.reader.problem((*place, key), f"{key}: no file is {value!r}.")
                 found = [each | {key: path, "": path.stem} for each in found for path in matches]
             else:
-                found = [each | {key: self.reader.path.parent / value} for each in found]
+                path = self.literal(value, (*place, key))
+                found = [each | {key: path} for each in found]
         return [_with_file(each) for each in found]
+
+    def literal(self, value: str, place: Place) -> Path:
+        reader = self.reader
+        if not is_address(value):
+            return reader.path.parent / value
+        address = reader.addresses.checked(value, place)
+        return reader.addresses.file(address, reader.out, place) if address else reader.out
 
     def inside(self, value: str, place: Place) -> Path:
         """Return where a file goes: in the branch's own folder of files, never outside ``out``."""
         path = (self.reader.out / value).resolve()
-        if not path.is_relative_to(self.reader.out.resolve()):
+        if is_address(value):
+            self.reader.problem(place, f"{value!r} is an address; what stages write goes to `out`.")
+        elif not path.is_relative_to(self.reader.out.resolve()):
             self.reader.problem(place, f"{value!r} leads out of {self.reader.out}.")
         return path
 

@@ -12,6 +12,8 @@ from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.owner import is_alive
 from limber.store.streams import Stream, stream_lines
 
+_LEAST_LINES, _MOST_TIMES = 2000, 4
+"""The file is shortened when it has so many lines, and so many times those that still count."""
 WAITING, RUNNING, DONE, KEPT, FAILED = "waiting", "running", "done", "up to date", "failed"
 
 
@@ -48,7 +50,7 @@ class Records:
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Take the right to append; another batch of this job file is refused meanwhile."""
-        with Stream(self.path) as self._stream:
+        with Stream(self.path, _last_of_each) as self._stream:
             yield
         self._stream = None
 
@@ -82,6 +84,21 @@ class Records:
             # A line that was damaged tells nothing: its task is run again, and kept if it is done.
             return
         self._found[key] = record
+
+
+def _last_of_each(lines: Iterator[str]) -> list[str] | None:
+    """The last line of each task, where there are many more; a night's runs leave thousands."""
+    last: dict[tuple[str, str], str] = {}
+    count = 0
+    for line in lines:
+        count += 1
+        try:
+            told = json.loads(line)
+            last[str(told["branch"]), str(told["task"])] = line
+        except (ValueError, KeyError, TypeError, RecursionError):
+            # Damaged: as when it is read, it tells nothing.
+            continue
+    return list(last.values()) if count > max(_LEAST_LINES, _MOST_TIMES * len(last)) else None
 
 
 def numbers_of(result: dict[str, Any], longest: int = 12) -> dict[str, float]:

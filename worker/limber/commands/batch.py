@@ -46,6 +46,10 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     [job.sweep]                         # a branch for each combination
     "reconstruct.mesh_spacing" = [2.0, 3.0]
 
+    Scans, folders, inputs and out may be addresses that fsspec knows (s3://bucket/scans/*.ply):
+    fetched before a branch is begun, its results put there after it; work = "/scratch" says where
+    they are worked on.
+
     A number may have its unit: grasp_radius = "8 mm". The whole file is checked before anything
     runs. Run it again after a stop, or after inputs have changed: what is up to date is kept.
     The results stand in OUT/JOBS.csv, one row a branch, and OUT/JOBS.html.
@@ -53,6 +57,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     from limber.batch.course import plan_of, run_jobs
     from limber.batch.job_file import read_jobs
     from limber.batch.records import Records, path_of_page, path_of_table
+    from limber.batch.staging import put_summary
     from limber.batch.summary import counts, failures, write_page, write_table
     from limber.errors import InputError, WorkError
 
@@ -78,6 +83,7 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
         if jobs.out.is_dir():
             write_table(jobs, records)
             write_page(jobs, records)
+    put_summary(jobs)
     failed = failures(jobs, records)
     if failed:
         first = ": ".join(failed[0])

@@ -27,6 +27,8 @@ PARTS = [
     ("pypcd4", "pypcd4", "PCD scans"),
     ("ezc3d", "ezc3d", "C3D motion capture"),
     ("distributed", "distributed", "work on more than one machine (pip install 'limber[cluster]')"),
+    ("fsspec", "fsspec", "addresses in job files, s3:// and such (pip install 'limber[remote]')"),
+    ("h5py", "h5py", "MAT files of version 7.3 (pip install 'limber[matlab]')"),
     ("rosbags", "rosbags", "MCAP, rosbag2 and ROS 1 bags (pip install 'limber[bags]')"),
     ("mcap", "mcap", "`limber export-pull` (pip install 'limber[bags]')"),
     ("matplotlib", "matplotlib", "`limber report` (pip install 'limber[report]')"),

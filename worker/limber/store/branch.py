@@ -354,6 +354,18 @@ def _begin(folder: Path, manifest: Manifest) -> None:
         ) from error
 
 
+def settled_manifest(folder: Path) -> Manifest:
+    """Return the manifest of a branch folder, once what a killed program left is finished.
+
+    For those who carry a folder elsewhere and read nothing of it.
+
+    Raises:
+        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`.
+    """
+    _finish_pending(folder)
+    return read_manifest(folder)
+
+
 def _finish_pending(folder: Path) -> None:
     if journal.is_pending(folder):
         with commit_lock(folder):

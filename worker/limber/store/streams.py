@@ -7,17 +7,19 @@ line that was cut off in the middle is cut away when the stream is taken over.
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from limber.errors import BranchFolderError, InputError, WorkError
-from limber.files import flush_folder
+from limber.files import flush_folder, write_atomically
 
 _WRITE_SECONDS = 0.25
 _FLUSH_SECONDS = 0.75
 _TAIL_BYTES = 1 << 16
+
+Shorten = Callable[[Iterator[str]], list[str] | None]
 
 
 class Stream:
@@ -27,12 +29,14 @@ class Stream:
 
     Args:
         path: The file; its folder is made.
+        shorten: Asked, while nobody else appends, for the lines to keep of those that are there;
+            None keeps all.
 
     Raises:
         BranchFolderError: another program appends to it, or it cannot be written.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, shorten: Shorten | None = None):
         self.path = Path(path)
         self._lock = FileLock(self.path.with_name(f".{self.path.name}.lock"), timeout=0,
                               thread_local=False)
@@ -40,6 +44,9 @@ class Stream:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
             self.cut_bytes = _cut_torn_line(self.path)
+            kept = shorten(stream_lines(self.path)) if shorten and self.path.exists() else None
+            if kept is not None:
+                write_atomically(self.path, "".join(f"{line}\n" for line in kept))
             self._file = open(self.path, "ab", buffering=0)
             flush_folder(self.path.parent)
         except Timeout as error:

@@ -1,0 +1,39 @@
+"""What a batch did, line by line, for whoever looks in the morning: a text file of bounded size."""
+
+import logging
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+
+from limber.batch.job_file import JobFile
+
+MOST_BYTES = 1_000_000
+KEPT = 3
+"""Older files that are kept beside the newest: ``JOBS.log.1`` ..."""
+
+
+def path_of_log(jobs: JobFile) -> Path:
+    """Return where the newest lines go."""
+    return jobs.out / f"{jobs.path.stem}.log"
+
+
+class BatchLog:
+    """Appends lines with their time to a batch's log; use it in a ``with``.
+
+    A line that cannot be written, on a full disk, is told on standard error and costs no work.
+    """
+
+    def __init__(self, jobs: JobFile):
+        self._handler = RotatingFileHandler(path_of_log(jobs), maxBytes=MOST_BYTES,
+                                            backupCount=KEPT, encoding="utf-8", delay=True)
+        self._handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+
+    def tell(self, *parts: str) -> None:
+        """Append a line of these parts."""
+        text = " ".join(" ".join(filter(None, parts)).split())
+        self._handler.handle(logging.makeLogRecord({"msg": "%s", "args": (text,)}))
+
+    def __enter__(self) -> "BatchLog":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._handler.close()
