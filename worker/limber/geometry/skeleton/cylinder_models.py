@@ -4,7 +4,8 @@
 ``.mat``                TreeQSM: a struct ``QSM`` with ``cylinder`` (radius, length, start, axis,
                         parent, extension, branch, BranchOrder, PositionInBranch, added).
                         SmartQSM writes the same struct; its radius is that of a cone's thin end,
-                        UnmodRadius that of the thick one (its ``parameterize_and_export``)
+                        UnmodRadius that of the thick one (its ``parameterize_and_export``).
+                        Version 7.3 by :mod:`limber.geometry.skeleton.mat_v73`
 ``.csv``                rTwig's minimum: id, parent, start_x ... end_z, radius; SimpleForest: ID,
                         parentID, startX ... endZ, radius
 ======================  ===========================================================================
@@ -16,9 +17,13 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError
+from limber.geometry.cloud.apart import read_apart
+from limber.geometry.skeleton.mat_v73 import is_hdf5, struct_arrays
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.optional import require_extra
 
 TREEQSM_FIELDS = ("radius", "start", "axis", "length", "parent")
+_THICK = "UnmodRadius"
 
 
 def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
@@ -32,28 +37,17 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
         which is the same where the file does not tell it.
 
     Raises:
-        InputError: it cannot be read (v7.3 files are HDF5 and not read), or has no cylinders.
+        InputError: it cannot be read, or has no cylinders.
+        MissingDependencyError: it is of version 7.3, and h5py is not installed.
     """
-    from scipy.io import loadmat
-
-    try:
-        content = loadmat(path, squeeze_me=True, struct_as_record=False)
-    except NotImplementedError as error:
-        raise InputError(f"{path} is a MAT file of version 7.3.", "It is HDF5, which is not read.",
-                         "Save it in Matlab with -v7.") from error
-    except MemoryError:
-        raise
-    except Exception as error:  # scipy's reader raises whatever its parser raises
-        raise InputError(f"{path} cannot be read as a MAT file ({error}).",
-                         "A TreeQSM model was expected.", "Save it again.") from error
-    cylinder = _cylinder_struct(content)
-    if cylinder is None:
+    found = _fields(Path(path))
+    if not found:
         raise InputError(f"{path} has no struct with {', '.join(TREEQSM_FIELDS)}.",
                          "A TreeQSM model was expected.", "Save the QSM of TreeQSM itself.")
     try:
-        radius, length, parent = (np.atleast_1d(np.asarray(getattr(cylinder, name), float)).ravel()
+        radius, length, parent = (np.asarray(found[name], float).ravel()
                                   for name in ("radius", "length", "parent"))
-        start, axis = (np.atleast_2d(np.asarray(getattr(cylinder, name), float))
+        start, axis = (np.atleast_2d(np.asarray(found[name], float))
                        for name in ("start", "axis"))
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: {error}.", "A cylinder's fields are numbers.",
@@ -64,17 +58,53 @@ def read_treeqsm(path: Path) -> dict[str, np.ndarray]:
                          "Save it again.")
     return {"id": np.arange(1.0, count + 1), "parent": np.where(parent > 0, parent, -1.0),
             "start": start, "end": start + axis * length[:, None], "radius": radius,
-            "start_radius": _thick_ends(content, cylinder, radius)}
+            "start_radius": _thick_ends(found, radius)}
 
 
-def _thick_ends(content: dict[str, Any], cylinder: Any, radius: np.ndarray) -> np.ndarray:
-    """SmartQSM keeps a cone's other radius where TreeQSM has the one before its corrections."""
-    creator = getattr(getattr(content.get("QSM"), "rundata", None), "creator", "")
+def _fields(path: Path) -> dict[str, Any]:
+    """The fields of the cylinders and ``creator``; nothing where there are no cylinders."""
     try:
-        thick = np.atleast_1d(np.asarray(getattr(cylinder, "UnmodRadius", ()), float)).ravel()
+        is_new = is_hdf5(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}).",
+                         "A TreeQSM model was expected.", "Check the path.") from error
+    if is_new:
+        require_extra("matlab", ("h5py",), f"{path} is a MAT file of version 7.3, which "
+                      "(unless you save it in Matlab with -v7)")
+        return read_apart(f"{__name__}:mat_v73_fields", path)
+    return _older_fields(path)
+
+
+def mat_v73_fields(path: Path) -> dict[str, np.ndarray]:
+    """Return the fields of the cylinders of a MAT file of version 7.3."""
+    return struct_arrays(path, TREEQSM_FIELDS, (_THICK,))
+
+
+def _older_fields(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    try:
+        content = loadmat(path, squeeze_me=True, struct_as_record=False)
+    except MemoryError:
+        raise
+    except Exception as error:  # scipy's reader raises whatever its parser raises
+        raise InputError(f"{path} cannot be read as a MAT file ({error}).",
+                         "A TreeQSM model was expected.", "Save it again.") from error
+    cylinder = _cylinder_struct(content)
+    if cylinder is None:
+        return {}
+    creator = getattr(getattr(content.get("QSM"), "rundata", None), "creator", "")
+    return {name: getattr(cylinder, name) for name in (*TREEQSM_FIELDS, _THICK)
+            if hasattr(cylinder, name)} | {"creator": creator}
+
+
+def _thick_ends(found: dict[str, Any], radius: np.ndarray) -> np.ndarray:
+    """SmartQSM keeps a cone's other radius where TreeQSM has the one before its corrections."""
+    try:
+        thick = np.asarray(found.get(_THICK, ()), float).ravel()
     except (TypeError, ValueError):
         return radius
-    fits = str(creator) == "SmartQSM" and thick.shape == radius.shape
+    fits = str(found["creator"]) == "SmartQSM" and thick.shape == radius.shape
     return thick if fits and (np.isfinite(thick) & (thick > 0)).all() else radius
 
 
