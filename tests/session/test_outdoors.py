@@ -1,17 +1,22 @@
 """Weather and cuts in a session: as `limber load` has them, on the branch that is held."""
 
+from concurrent.futures import Future
+from threading import Event
+
 import numpy as np
 import pytest
 
-from limber.errors import InputError
+from limber.errors import Cancelled, InputError, WorkError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.added import PointMass
+from limber.mechanics.load_effects import load_effects
 from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
 from limber.session import protocol
+from limber.session.effects import EffectsTeller
 from limber.session.held import HeldBranch
 from limber.session.loading import load_held
 from limber.session.settings import SessionSettings
-from limber.stages.loading import load_branch
+from limber.stages.loading import load_branch, load_skeleton
 from limber.store import Branch
 
 AXIS = Skeleton.from_edges(np.column_stack([np.zeros((21, 2)), np.linspace(0, 0.2, 21)]),
@@ -58,6 +63,69 @@ def test_what_is_cut_off_is_told_and_comes_back(held):
 def test_without_axes_it_is_said(branch_folder):
     with pytest.raises(InputError, match="no axes"):
         load_held(branch_folder, SessionSettings()).set_outdoors(Outdoors(wind=(1.0, 0.0, 0.0)))
+
+
+@pytest.fixture()
+def with_axes(branch_folder):
+    with Branch.open(branch_folder).stage("axes") as stage:
+        AXIS.write_swc(stage.path("skeleton.swc"))
+    return branch_folder
+
+
+class Said:
+    """Keeps events, and waits for one."""
+
+    def __init__(self):
+        self.lines, self.over = [], Event()
+
+    def say(self, **line):
+        self.lines.append(line)
+        self.over.set()
+
+
+def test_what_loads_do_is_told(with_axes):
+    """As `limber load` tells it, of the branch as it is now; one question at a time."""
+    held = load_held(with_axes, SessionSettings())
+    said = Said()
+    teller = EffectsTeller(with_axes, SessionSettings(), said)
+    question = protocol.parse_command(b'{"command": "effects", "id": 7, "limit_load": true}')
+    with pytest.raises(InputError, match="neither wind"):
+        teller.ask(question, held)
+    loads = Outdoors(wind=(3.0, 0.0, 0.0), snow=0.5)
+    held.set_outdoors(loads)
+    held.set_young(2.0 * held.young)
+    try:
+        teller.ask(question, held)
+        with pytest.raises(InputError, match="One question"):
+            teller.ask(question, held)
+        assert said.over.wait(120)
+    finally:
+        teller.close()
+    (reply,) = said.lines
+    branch = Branch.open(with_axes)
+    model = load_branch(branch).model
+    _, told = load_effects(
+        LoadedOutdoors(model.with_young(2.0 * model.young), load_skeleton(branch), loads),
+        strain_limit=0.01, deviation=None, most=50.0)
+    assert (reply["event"], reply["id"], reply["command"]) == ("reply", 7, "effects")
+    for name in ("sag_m", "greatest_strain", "bears_times"):
+        assert reply[name] == pytest.approx(told[name], rel=1e-6), name
+    assert reply["held_by"] == told["held_by"] and reply["sag_interval_m"] is None
+    held.set_gravity(False)
+    with pytest.raises(InputError, match="switched off"):
+        held.outdoors()
+
+
+def test_what_cannot_be_told_is_an_error(tmp_path):
+    """The reason goes to who asked, whatever it is; a session that ends says nothing."""
+    question = protocol.parse_command(b'{"command": "effects", "id": 7}')
+    for error, told in ((WorkError("It finds no rest."), "It finds no rest."),
+                        (ValueError("odd"), "ValueError: odd"), (Cancelled(), None)):
+        said, asked = Said(), Future()
+        asked.set_exception(error)
+        EffectsTeller(tmp_path, SessionSettings(), said).tell(question, asked)
+        assert [line["message"] for line in said.lines] == ([told] if told else [])
+        assert all(line["event"] == "error" and line["id"] == 7 for line in said.lines)
 
 
 def test_the_command_is_checked():

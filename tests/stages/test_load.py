@@ -6,8 +6,11 @@ from pathlib import Path
 import pytest
 
 from limber.errors import InputError
+from limber.mechanics.added import PointMass
+from limber.mechanics.load_effects import load_effects
+from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
 from limber.stages.load import LoadSettings, load
-from limber.stages.loading import load_skeleton
+from limber.stages.loading import load_branch, load_skeleton
 from limber.store import Branch
 
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
@@ -29,8 +32,24 @@ def test_a_fruit_with_interval_and_limit(tip):
     assert result["frequencies_hz"][0] < result["frequencies_before_hz"][0]
     assert result["added_mass_kg"] == pytest.approx(0.005)
     assert result["bears_times"] > 1 and result["held_by"] in ("strain", "equilibrium")
+    weak, strong = result["bears_times_interval"]
+    assert weak < result["bears_times"] < strong
+    least, most = result["greatest_strain_interval"]
+    assert least < result["greatest_strain"] < most
     strains = [row["strain"] for row in result["along"]]
     assert max(strains) <= result["greatest_strain"]
+
+
+def test_the_limit_is_where_the_strain_is(tip):
+    """At that share of a load that is too much the greatest strain is the limit's."""
+    branch = Branch.open(EXAMPLE)
+    outdoors = LoadedOutdoors(load_branch(branch).model, load_skeleton(branch),
+                              Outdoors(fruit=(PointMass(tip, 0.5),)))
+    _, told = load_effects(outdoors, strain_limit=0.004, deviation=None, most=200.0)
+    assert told["held_by"] == "strain" and 0 < told["bears_times"] < 1
+    assert told["bears_times_interval"] is None and told["sag_interval_m"] is None
+    at = outdoors.greatest_strain(outdoors.rest(told["bears_times"]))
+    assert at == pytest.approx(0.004, rel=0.02)
 
 
 def test_a_load_is_needed_and_lies_on_the_branch(tip):

@@ -102,6 +102,11 @@ class LoadedOutdoors:
         self.cut_mass = float(lost.sum())
 
     @property
+    def hanging(self) -> BranchModel:
+        """The branch as it hangs, without these loads."""
+        return self._plain
+
+    @property
     def dead_forces(self) -> np.ndarray:
         """All of it as forces on the nodes that keep their direction [N], shape [node_count, 3]."""
         added = self._model_under(1.0).mass_load - self._model.mass_load

@@ -39,6 +39,7 @@ class LoadFile(BaseModel):
     sag_m: float
     sag_interval_m: _Interval | None = None
     greatest_strain: float
+    greatest_strain_interval: _Interval | None = None
     strain_over_limit: float
     frequencies_hz: list[float] = Field(min_length=1)
     frequencies_before_hz: list[float] = Field(min_length=1)
@@ -47,6 +48,7 @@ class LoadFile(BaseModel):
     added_mass_kg: float
     cut_mass_kg: float
     bears_times: float | None = None
+    bears_times_interval: _Interval | None = None
     held_by: str | None = None
     gusts: Gusts | None = None
 
@@ -70,15 +72,17 @@ def load_rows(load: LoadFile) -> list[list[str]]:
             ["the tip moves by [mm]", f"{tip:.1f}", ""],
             ["of that down [mm]", f"{1e3 * load.sag_m:.1f}",
              _between(load.sag_interval_m, 1e3, 1)],
-            ["greatest strain", f"{load.greatest_strain:.5f}", ""],
+            ["greatest strain", f"{load.greatest_strain:.5f}",
+             _between(load.greatest_strain_interval, 1.0, 5)],
             ["of what the wood bears", f"{100 * load.strain_over_limit:.0f} %", ""],
             ["first frequency [Hz]", f"{load.frequencies_hz[0]:.3f}",
              _between(load.first_frequency_interval_hz, 1.0, 3)],
             ["first frequency before [Hz]", f"{load.frequencies_before_hz[0]:.3f}", ""]]
     if load.bears_times is not None:
-        ended = {"strain": "then the wood fails", "equilibrium": "then it finds no rest"}.get(
+        ended = {"strain": "until the wood fails", "equilibrium": "until it finds no rest"}.get(
             load.held_by or "", "more was not tried")
-        rows.append(["bears these loads so many times", f"{load.bears_times:.2f}", ended])
+        rows.append([f"bears these loads so many times ({ended})", f"{load.bears_times:.2f}",
+                     _between(load.bears_times_interval, 1.0, 2)])
     if load.gusts is not None:
         mean = 1e3 * float(np.linalg.norm(load.gusts.mean_tip_displacement_m))
         rows += [["mean wind [m/s]", f"{load.gusts.mean_speed_m_s:.2f}", ""],

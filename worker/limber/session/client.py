@@ -134,6 +134,17 @@ class InteractiveSession:
         """
         return self.request("outdoors", **loads)
 
+    def effects(self, *, seconds: float = 120.0, **question: Any) -> dict[str, Any]:
+        """Return what :meth:`set_outdoors` does to the branch: sag, strain over strength,
+        frequencies and, with ``limit_load=True``, how many times as much it bears; intervals where
+        an estimate has left them. Takes seconds; the branch can be moved meanwhile.
+
+        Raises:
+            InputError: there is nothing outdoors, or the branch finds no rest under it.
+            WorkError: it was not told within ``seconds``.
+        """
+        return self.request("effects", seconds, **question)
+
     def set_dynamics(self, on: bool) -> dict[str, Any]:
         """Let the branch move in time, or answer with equilibria; return the reply."""
         return self.request("dynamics", on=on)

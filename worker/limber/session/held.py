@@ -68,10 +68,14 @@ class HeldBranch:
     Args:
         loaded: The branch as it hangs, with its targets.
         skeleton: Its axes, for wind, snow and cuts.
+        young_deviation: Standard deviation of log E, where something has told it.
     """
 
-    def __init__(self, loaded: LoadedBranch, skeleton: Skeleton | None = None):
+    def __init__(self, loaded: LoadedBranch, skeleton: Skeleton | None = None,
+                 young_deviation: float | None = None):
         self.loaded, self._skeleton = loaded, skeleton
+        self.young_deviation = young_deviation
+        self._outdoors: Outdoors | None = None
         self.model = model = loaded.model
         self.displacement = np.zeros_like(model.mesh.nodes)
         self.weights, self.young = as_control_points(model)
@@ -195,10 +199,25 @@ class HeldBranch:
             raise InputError("The branch has no axes.", "Wind, snow and cuts go by them.",
                              "Make it from a scan (limber reconstruct).")
         made = LoadedOutdoors(self.model, self._skeleton, loads)
+        self._outdoors = loads
         forces = made.dead_forces
         self._weather = forces if forces.any() else None
         self._is_gone = made.is_gone
         return made
+
+    def outdoors(self) -> Outdoors:
+        """Return the wind, snow, fruit and cuts that act.
+
+        Raises:
+            InputError: there are none, or the branch's weight is switched off.
+        """
+        if self._outdoors is None:
+            raise InputError("There is neither wind nor snow, fruit or a cut.", "",
+                             "Send `outdoors` first.")
+        if not self.gravity_on and self.model.hanging is not None:
+            raise InputError("The branch's weight is switched off.",
+                             "What loads do is told of a branch that hangs.", "Switch it on.")
+        return self._outdoors
 
     def vertices_gone(self) -> np.ndarray:
         """Return the surface's vertices that are cut off, numbers [k]."""

@@ -7,7 +7,7 @@ from limber.mechanics.reduced.training import TrainingSettings
 from limber.progress import SILENT, Progress
 from limber.session.held import HeldBranch
 from limber.session.settings import SessionSettings
-from limber.stages.loading import load_branch, load_skeleton
+from limber.stages.loading import load_branch, load_skeleton, young_deviation
 from limber.store import Branch
 
 
@@ -27,4 +27,5 @@ def load_held(folder: Path, settings: SessionSettings,
     """
     branch = Branch.open(folder)
     axes = load_skeleton(branch) if branch.has("skeleton.swc") else None
-    return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes)
+    return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes,
+                      young_deviation(branch))

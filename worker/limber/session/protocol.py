@@ -136,6 +136,15 @@ class Weather(_Command):
     cuts: list[_Vector] = Field([], max_length=1000)
 
 
+class Effects(_Command):
+    """Ask what wind, snow, fruit and cuts do to the branch, as `limber load` tells it."""
+
+    command: Literal["effects"]
+    strain_limit: float = Field(0.01, gt=0, lt=1)
+    limit_load: bool = False
+    most: float = Field(50.0, gt=1, le=1e4)
+
+
 class Status(_Command):
     """Ask for grasps, gravity and who answers."""
 
@@ -148,8 +157,8 @@ class Close(_Command):
     command: Literal["close"]
 
 
-Command = (Hello | Grab | Release | Move | Gravity | Dynamics | Young | Loads | Weather | Status
-           | Close)
+Command = (Hello | Grab | Release | Move | Gravity | Dynamics | Young | Loads | Weather | Effects
+           | Status | Close)
 _COMMANDS: TypeAdapter[Command] = TypeAdapter(Annotated[Command, Field(discriminator="command")])
 
 

@@ -23,6 +23,11 @@ Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each 
   [x, y, z], "mass_kg": 0.2}], "cuts": [[x, y, z]]}``: wind, snow, fruit and cuts, instead of those
   before; places are on the branch as it was scanned [m]. The reply says ``added_mass_kg``,
   ``cut_mass_kg``, ``wind_force_n`` and ``gone``, the vertices that are cut off.
+- ``{"command": "effects", "strain_limit": 0.01, "limit_load": true, "most": 50}``: what those do to
+  the branch that nothing holds. The reply comes seconds later, between others, and says what
+  `limber load` does: ``sag_m``, ``greatest_strain``, ``strain_over_limit``, ``along``,
+  ``frequencies_hz``, ``bears_times`` and ``held_by``, with intervals where an estimate has left
+  them.
 - ``{"command": "gravity", "on": false}``: let the branch bear its weight, or not. It hangs where it
   was scanned; without weight it rises from there.
 - ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points; the
@@ -76,6 +81,7 @@ from limber.mechanics.reduced.strain import compile_kernels
 from limber.progress import Progress
 from limber.session import protocol
 from limber.session.answering import Answering
+from limber.session.effects import EffectsTeller
 from limber.session.events import Events
 from limber.session.frames import FrameWriter
 from limber.session.held import Answer
@@ -104,6 +110,7 @@ class Session:
         self.held = load_held(folder, settings, Progress(
             on_warning=lambda message: self.events.say(event="warning", message=message)))
         self.answering = Answering(folder, settings, self.held, self.inbox.put, self.events.say)
+        self.effects = EffectsTeller(folder, settings, self.events)
         if settings.grasp:
             self.answering.hold_marked(settings.mode)
         path = settings.positions
@@ -130,6 +137,7 @@ class Session:
                 self._answer()
         finally:
             self._ended.set()
+            self.effects.close()
             self.answering.close()
             self.frames.close()
             self.events.close()
@@ -163,9 +171,10 @@ class Session:
             self.events.say(event="error", id=command.id, command=command.command,
                             message=f"{type(error).__name__}: {error}")
             return
-        if not isinstance(command, protocol.Hello | protocol.Status):
+        if not isinstance(command, protocol.Hello | protocol.Status | protocol.Effects):
             self._asked = (max(command.id, self._asked[0]), received.at)
-        if not isinstance(command, protocol.Move):
+        # Effects are told when they are known.
+        if not isinstance(command, protocol.Move | protocol.Effects):
             self.events.say(event="reply", id=command.id, command=command.command, **reply)
 
     def _act(self, command: protocol.Command) -> dict[str, Any]:
@@ -191,6 +200,8 @@ class Session:
                 made = answering.set_outdoors(_outdoors(command))
                 return {"added_mass_kg": made.added_mass, "cut_mass_kg": made.cut_mass,
                         "wind_force_n": made.wind_force, "gone": self.held.vertices_gone()}
+            case protocol.Effects():
+                self.effects.ask(command, self.held)
             case protocol.Dynamics(on=on):
                 answering.set_dynamics(on)
             case protocol.Status():

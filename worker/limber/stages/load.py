@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.errors import InputError, WorkError
+from limber.errors import InputError
 from limber.progress import SILENT, Progress
 from limber.reading import read_columns
 from limber.settings import Groups, Settings
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from limber.mechanics.materials import RayleighDamping
     from limber.mechanics.model import BranchModel
     from limber.mechanics.outdoors import Bent, LoadedOutdoors
-    from limber.mechanics.statics.result import StaticResult
 
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
@@ -78,24 +77,28 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
     the branch as scanned, and at rest under the loads. Else it writes nothing.
 
     Returns:
-        ``tip_displacement_m`` [3] and ``sag_m`` (its way along gravity) with ``sag_interval_m``;
-        ``greatest_strain``, ``strain_over_limit``, ``along``: the greatest strain in ten parts of
-        the main path; ``frequencies_hz`` and ``first_frequency_interval_hz``,
-        ``frequencies_before_hz``; ``wind_force_n``, ``added_mass_kg``, ``cut_mass_kg``; with
-        ``limit_load`` ``bears_times`` and ``held_by`` (``strain``, ``equilibrium`` or ``nothing``).
-        Intervals are None where nothing has told how sure the moduli are. With gusts all of it
-        is of their peak, and ``gusts`` has ``factor`` (peak load over mean load), ``deviation``,
-        ``peak_factor``, ``crossing_hz``, ``dynamic`` (over a branch that follows at once),
-        ``damping`` of the first mode, ``mean_tip_displacement_m`` and ``mean_speed_m_s``.
+        What :func:`~limber.mechanics.load_effects.load_effects` tells (sag, greatest strain and
+        strain along the main path, frequencies; with ``limit_load`` how many times the loads it
+        bears; each with its interval, None where nothing has told how sure the moduli are), and
+        ``frequencies_before_hz``. With gusts all of it is of their peak, and ``gusts`` has
+        ``factor`` (peak load over mean load), ``deviation``, ``peak_factor``, ``crossing_hz``,
+        ``dynamic`` (over a branch that follows at once), ``damping`` of the first mode,
+        ``mean_tip_displacement_m`` and ``mean_speed_m_s``.
 
     Raises:
         InputError: no load, one off the branch, or gusts without wind. WorkError: it finds no
             rest under it.
     """
     from limber.mechanics.added import PointMass
+    from limber.mechanics.load_effects import load_effects
     from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
     from limber.mechanics.vibration import lowest_modes
-    from limber.stages.loading import known_damping, load_branch, load_skeleton
+    from limber.stages.loading import (
+        known_damping,
+        load_branch,
+        load_skeleton,
+        young_deviation,
+    )
 
     record = _record(settings)
     if not (settings.wind or settings.snow or settings.fruit or settings.cut):
@@ -113,31 +116,16 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
     loads = Outdoors(wind, settings.drag, settings.snow, tuple(
         PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
     outdoors = LoadedOutdoors(hanging, skeleton, loads)
-    tip = _tip(outdoors, hanging.mesh.nodes)
     gusts: dict[str, Any] | None = None
     if record is not None or settings.gust is not None:
         progress(0.1, "gusts")
-        gusts = _gusts(outdoors, settings, record, tip, known_damping(branch, progress))
+        gusts = _gusts(outdoors, settings, record, known_damping(branch, progress))
         outdoors = outdoors.with_gusts(gusts["factor"])
-    progress(0.2, "rest under the loads")
-    bent = _at_rest(outdoors)
-    down = hanging.gravity / max(float(np.linalg.norm(hanging.gravity)), 1e-300)
-    moved = bent.displacement[tip]
-    progress(0.5, "interval")
-    spread = _deviation(branch)
-    intervals = _intervals(outdoors, spread, tip, down)
-    result = {
-        "tip_displacement_m": moved, "sag_m": float(moved @ down),
-        "greatest_strain": float(bent.strains.max()),
-        "strain_over_limit": float(bent.strains.max() / settings.strain_limit),
-        "along": outdoors.along(bent.strains), "frequencies_hz": bent.frequencies,
-        "frequencies_before_hz": lowest_modes(hanging, len(bent.frequencies)).frequencies,
-        "wind_force_n": outdoors.wind_force, "cut_mass_kg": outdoors.cut_mass,
-        "added_mass_kg": outdoors.added_mass, "young_deviation": spread, "gusts": gusts,
-        **intervals}
-    if settings.limit_load:
-        progress(0.7, "limit load")
-        result |= _limit(outdoors, settings, progress.part(0.7, 1.0))
+    bent, result = load_effects(
+        outdoors, strain_limit=settings.strain_limit, deviation=young_deviation(branch),
+        most=settings.most if settings.limit_load else None, progress=progress.part(0.2, 1.0))
+    result |= {"frequencies_before_hz": lowest_modes(hanging, len(bent.frequencies)).frequencies,
+               "gusts": gusts}
     if settings.name is not None:
         _keep(branch, settings, hanging, bent, result)
     return result
@@ -168,19 +156,6 @@ def _keep(branch: Branch, settings: LoadSettings, hanging: BranchModel, bent: Be
                                           for state in states]}), encoding="utf-8")
         stage.result.update({key: value for key, value in plain(result).items()
                              if key != "along"})
-
-
-def _at_rest(outdoors: LoadedOutdoors) -> Bent:
-    return outdoors.bent(_rest(outdoors))
-
-
-def _rest(outdoors: LoadedOutdoors) -> StaticResult:
-    found = outdoors.rest()
-    if not found.converged:
-        raise WorkError(f"The branch finds no rest under these loads ({found.message}).",
-                        f"It followed {100 * found.reached:.0f} % of them.",
-                        "They may be more than it can carry: see --limit-load with smaller ones.")
-    return found
 
 
 def _record(settings: LoadSettings) -> tuple[np.ndarray, np.ndarray] | None:
@@ -227,12 +202,13 @@ def _mean_speed(record: tuple[np.ndarray, np.ndarray]) -> float:
 
 
 def _gusts(outdoors: LoadedOutdoors, settings: LoadSettings,
-           record: tuple[np.ndarray, np.ndarray] | None, tip: int, damping: RayleighDamping,
+           record: tuple[np.ndarray, np.ndarray] | None, damping: RayleighDamping,
            ) -> dict[str, Any]:
     """What gusts make of the mean load, by how the tip sways."""
     from limber.mechanics.gusts import recorded, turbulent
+    from limber.mechanics.load_effects import required_rest, tip_node
 
-    mean = _rest(outdoors)
+    mean, tip = required_rest(outdoors), tip_node(outdoors)
     sway = outdoors.sways(mean, tip, damping)
     if record is not None:
         speed = float(record[1].mean())
@@ -247,71 +223,12 @@ def _gusts(outdoors: LoadedOutdoors, settings: LoadSettings,
             "mean_tip_displacement_m": mean.displacement[tip]}
 
 
-def _tip(outdoors: LoadedOutdoors, nodes: np.ndarray) -> int:
-    """The node at the outermost place of the main path that is left."""
-    path = [node for node in outdoors.skeleton.main_path() if not outdoors.gone[node]]
-    return int(np.linalg.norm(nodes - outdoors.skeleton.nodes[path[-1]], axis=1).argmin())
-
-
 def _require_near(nodes: np.ndarray, places: list[_Place]) -> None:
     for place in places:
         distance = float(np.linalg.norm(nodes - np.array(place), axis=1).min())
         if not distance < 0.1:
             raise InputError(f"A fruit at {place} m is {distance:.3g} m off the branch.",
                              "It hangs on the branch.", "Check frame and unit.")
-
-
-def _deviation(branch: Branch) -> float | None:
-    """Standard deviation of log E that the last estimate or swing left, taken as one for all."""
-    if not branch.has("estimate.json"):
-        return None
-    from limber.estimation.estimate_file import read_estimate
-
-    known = read_estimate(branch.path("estimate.json"))
-    total = [value for value in (known.get("young_deviation") or {}).get("total") or []
-             if value is not None]
-    return float(np.mean(total)) if total else None
-
-
-def _intervals(outdoors: LoadedOutdoors, deviation: float | None, tip: int, down: np.ndarray,
-               ) -> dict[str, Any]:
-    """95 % intervals: the branch softer and stiffer throughout, which is the widest."""
-    none: dict[str, Any] = {"sag_interval_m": None, "first_frequency_interval_hz": None}
-    if deviation is None:
-        return none
-    sags, firsts = [], []
-    for sign in (-1.96, 1.96):
-        other = outdoors.with_young(float(np.exp(sign * deviation)))
-        found = other.rest()
-        if not found.converged:
-            return none
-        bent = other.bent(found)
-        sags.append(float(bent.displacement[tip] @ down))
-        firsts.append(float(bent.frequencies[0]))
-    return {"sag_interval_m": sorted(sags), "first_frequency_interval_hz": sorted(firsts)}
-
-
-def _limit(outdoors: LoadedOutdoors, settings: LoadSettings, progress: Progress,
-           ) -> dict[str, Any]:
-    """Bisect the share of the loads at which the wood fails or no rest is found."""
-    def trouble(share: float) -> str:
-        found = outdoors.rest(share)
-        if not found.converged:
-            return "equilibrium"
-        return "strain" if outdoors.greatest_strain(found) > settings.strain_limit else ""
-    low, high, why = 0.0, 1.0, ""
-    while not (why := trouble(high)) and high < settings.most:
-        low, high = high, min(2 * high, settings.most)
-    if not why:
-        return {"bears_times": settings.most, "held_by": "nothing"}
-    for number in range(8):
-        progress(number / 8, "limit load")
-        middle = (low + high) / 2
-        if found := trouble(middle):
-            high, why = middle, found
-        else:
-            low = middle
-    return {"bears_times": low, "held_by": why}
 
 
 def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:

@@ -5,6 +5,7 @@ computation comes through here.
 """
 
 import hashlib
+import math
 from dataclasses import replace
 from typing import Annotated, Any
 
@@ -170,6 +171,31 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
         return RayleighDamping(*map(float, values))
     progress.warn("No swing has told the damping; that of simulations is taken.")
     return DEFAULT_DAMPING
+
+
+def young_deviation(branch: Branch) -> float | None:
+    """Return the standard deviation of log E that the last estimate, swing or ringing left, taken
+    as one for all moduli; None where nothing has told it.
+
+    Raises:
+        InputError: ``estimate.json`` is damaged.
+    """
+    told = {key: branch.manifest.stages[key] for key in ("estimate", "swing", "vibration")
+            if key in branch.manifest.stages}
+    last = max(told, key=lambda key: told[key].finished, default=None)
+    if last in ("swing", "vibration"):
+        interval = told[last].result.get("young_interval_pa")
+        if isinstance(interval, list) and len(interval) == 2 and all(
+                isinstance(end, int | float) and end > 0 for end in interval):
+            return abs(math.log(interval[1] / interval[0])) / (2 * 1.96)
+    if not branch.has("estimate.json"):
+        return None
+    from limber.estimation.estimate_file import read_estimate
+
+    known = read_estimate(branch.path("estimate.json"))
+    total = [value for value in (known.get("young_deviation") or {}).get("total") or []
+             if value is not None]
+    return float(np.mean(total)) if total else None
 
 
 def load_model(branch: Branch, **overrides: object) -> BranchModel:

@@ -1,0 +1,89 @@
+"""What loads outdoors do to the held branch, worked out beside the frames in a process of its own.
+
+It takes seconds: meanwhile the branch is moved on. The answer is of the branch as its folder has
+it, with the moduli and the loads that the session had when it was asked.
+"""
+
+from concurrent.futures import CancelledError, Future
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.errors import Cancelled, InputError, LimberError
+from limber.jobs import Pool
+from limber.mechanics.load_effects import load_effects
+from limber.mechanics.outdoors import Outdoors
+from limber.progress import Progress
+from limber.session.events import Events
+from limber.session.held import HeldBranch
+from limber.session.loading import load_held
+from limber.session.protocol import Effects
+from limber.session.settings import SessionSettings
+
+
+class EffectsTeller:
+    """Answers one question at a time.
+
+    Args:
+        folder, settings: Of the session.
+        events: Where answers go.
+    """
+
+    def __init__(self, folder: Path, settings: SessionSettings, events: Events):
+        self._folder, self._settings, self._events = folder, settings, events
+        self._pool: Pool | None = None
+        self._asked: Future | None = None
+
+    def ask(self, question: Effects, held: HeldBranch) -> None:
+        """Have a question answered: its ``reply``, or its ``error``, comes when that is known.
+
+        Raises:
+            InputError: another one is being answered, no load acts, or the weight is off.
+        """
+        if self._asked is not None and not self._asked.done():
+            raise InputError("The effects of loads are being worked out.",
+                             "One question is answered at a time.", "Wait for its reply.")
+        loads = held.outdoors()
+        # It stays for the next question: most of the first one's time is its beginning.
+        self._pool = self._pool or Pool(1, name="the effects of loads")
+        self._asked = self._pool.submit(effects_of, self._folder, self._settings, held.young,
+                                        loads, question)
+        self._asked.add_done_callback(partial(self.tell, question))
+
+    def close(self) -> None:
+        """Give up what is being answered."""
+        if self._pool is not None:
+            self._pool.close()
+
+    def tell(self, question: Effects, asked: Future) -> None:
+        """Tell what came of a question."""
+        about: dict[str, Any] = {"id": question.id, "command": question.command}
+        try:
+            told = asked.result()
+        except (Cancelled, CancelledError):
+            return
+        except LimberError as error:
+            self._events.say(event="error", **about, message=str(error))
+        except Exception as error:
+            # As all that a command sets off: the branch is still held.
+            self._events.say(event="error", **about, message=f"{type(error).__name__}: {error}")
+        else:
+            self._events.say(event="reply", **about, **told)
+
+
+def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads: Outdoors,
+               question: Effects, progress: Progress) -> dict[str, Any]:
+    """Return what loads do to a branch with these moduli at its control points [Pa].
+
+    Raises:
+        LimberError: it cannot be loaded, or finds no rest.
+    """
+    held = load_held(folder, settings, progress)
+    held.set_young(young)
+    _, told = load_effects(
+        held.set_outdoors(loads), strain_limit=question.strain_limit,
+        deviation=held.young_deviation, most=question.most if question.limit_load else None,
+        progress=progress)
+    return told
