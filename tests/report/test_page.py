@@ -10,6 +10,7 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.skeleton.files import write_cylinders
 from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
 from limber.geometry.tets.cylinder_mesh import straight_beam
+from limber.report import swings
 from limber.report.page import draw_page
 from limber.report.tables import (
     cause_rows,
@@ -18,7 +19,6 @@ from limber.report.tables import (
     held_out_rows,
     held_sentence,
     modulus_rows,
-    swing_rows,
 )
 from limber.stages.report import write_report
 from limber.store import Branch
@@ -180,8 +180,9 @@ def test_a_swing_has_a_section(meshed):
              "release_deviation_s": 0.01, "frequency_hz": 3.2, "relative_residual": 0.012,
              "warnings": ["a word"], "times_s": times.tolist(), "seen_m": (track + 1e-4).tolist(),
              "simulated_m": track.tolist()}
-    assert swing_rows(swing)[1] == ["Young's modulus, mean [MPa]", "2.5", "2.4 to 2.7"]
-    assert swing_rows(swing)[3][2] == "0.3804 to 0.4196"
+    rows = swings.swing_rows(swings.SwingFile(**swing))
+    assert rows[1] == ["Young's modulus, mean [MPa]", "2.5", "2.4 to 2.7"]
+    assert rows[3][2] == "0.3804 to 0.4196"
     with meshed.stage("swing") as stage:
         stage.path("swing.json").write_text(json.dumps(swing), encoding="utf-8")
     page, sections = draw_page(meshed)

@@ -189,20 +189,6 @@ def force_over_time(pull: dict[str, Any]) -> Any:
     return figure
 
 
-def swing_over_time(swing: dict[str, Any]) -> Any:
-    """Seen and simulated displacement of the marker that swings most, along its way."""
-    figure, axes = _figure(5.2, 3.0)
-    seen, simulated = _numbers(swing["seen_m"]), _numbers(swing["simulated_m"])
-    most = int(np.argmax(np.ptp(simulated, axis=0).max(axis=1)))
-    way = np.linalg.svd(simulated[:, most] - simulated[:, most].mean(axis=0))[2][0]
-    time = np.array(swing["times_s"])
-    axes.plot(time, 1e3 * seen[:, most] @ way, ".", ms=4, color=OBSERVED, label="seen")
-    axes.plot(time, 1e3 * simulated[:, most] @ way, color=SIMULATED, label="simulated")
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel("displacement [mm]")
-    axes.legend(frameon=False)
-    return figure
-
 
 def _interval_caption(estimate: dict[str, Any]) -> str:
     parts = estimate.get("young_deviation") or {}

@@ -21,8 +21,8 @@ from limber.mechanics.frames import read_frames_file
 from limber.optional import require_extra
 from limber.planning.field.energy_field import EnergyField
 from limber.progress import SILENT, Progress
-from limber.reading import read_arrays, read_json
-from limber.report import figures, loads
+from limber.reading import read_arrays
+from limber.report import figures, loads, swings
 from limber.report.ringing import vibration_rows
 from limber.report.tables import (
     caliper_rows,
@@ -35,7 +35,6 @@ from limber.report.tables import (
     modulus_rows,
     order_rows,
     share_rows,
-    swing_rows,
 )
 from limber.stages.loading import load_skeleton, load_targets
 from limber.store import Branch
@@ -264,12 +263,10 @@ def _estimate(branch: Branch) -> Section:
 
 
 def _swing(branch: Branch) -> Section:
-    from limber.report import estimate_figures
-
-    swing = read_json(branch.path("swing.json"), "a swing")
-    section = Section(f"Swing {swing['pull']}", text=list(swing.get("warnings", [])),
-                      tables=[("", swing_rows(swing))])
-    section.draw(estimate_figures.swing_over_time(swing),
+    swing = swings.read_swing(branch.path("swing.json"))
+    section = Section(f"Swing {swing.pull}", text=swing.warnings,
+                      tables=[("", swings.swing_rows(swing))])
+    section.draw(swings.swing_over_time(swing),
                  "The marker that swings most, along its way: seen (dots) and simulated.")
     return section
 

@@ -107,29 +107,6 @@ def held_out_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     return rows
 
 
-def swing_rows(swing: Mapping[str, Any]) -> list[list[str]]:
-    """Return what a free swing told, a row a quantity: value and 95 % interval.
-
-    Args:
-        swing: Content of a branch's ``swing.json``.
-    """
-    frequency = swing["frequency_hz"]
-    release = [swing["release_s"] + side * 1.96 * swing["release_deviation_s"]
-               for side in (-1, 1)]
-    rows = [["what", "value", "95 % interval"]]
-    for label, value, interval, form, scale in (
-            ("Young's modulus, mean [MPa]", swing["young_pa"], swing["young_interval_pa"],
-             ".4g", 1e-6),
-            ("damping ratio of the first vibration", swing["damping_ratio"],
-             swing["damping_ratio_interval"], ".3g", 1.0),
-            ("let go at [s]", swing["release_s"], release, ".4g", 1.0)):
-        low, high = interval
-        rows.append([label, f"{scale * value:{form}}",
-                     f"{scale * low:{form}} to {scale * high:{form}}"])
-    return [*rows, ["first frequency [Hz]", f"{frequency:.4g}", "-"],
-            ["left over, of the largest displacement", f"{100 * swing['relative_residual']:.2g} %",
-             "-"]]
-
 
 def share_rows(shares: Mapping[str, float]) -> list[list[str]]:
     """Return which share of the axes' length each state of the radius has."""
