@@ -1,4 +1,7 @@
-"""Every command that the README shows is one that Limber understands."""
+"""Every command that the README shows is one that Limber understands.
+
+They are run by `scripts/bench worker --only readme`.
+"""
 
 import re
 import shlex
@@ -7,17 +10,14 @@ from pathlib import Path
 import click
 import pytest
 
+from benchmarks.worker_readme import shown_commands
 from limber.cli import main
 
 README = Path(__file__).parents[1] / "README.md"
 
 
 def _commands() -> list[str]:
-    """Lines of the README's code blocks that begin with limber, continued lines joined."""
-    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", README.read_text(encoding="utf-8"),
-                        re.MULTILINE | re.DOTALL)
-    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    return [line.split(" #")[0].strip() for line in lines if line.startswith("limber ")]
+    return shown_commands(README.read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("line", _commands())
@@ -36,3 +36,11 @@ def test_a_command_of_the_readme_is_understood(line):
 def test_the_readme_shows_commands():
     """The lines are found at all."""
     assert len(_commands()) > 15
+
+
+def test_every_command_has_an_example():
+    """Whatever `limber --help` lists is shown once."""
+    text = README.read_text(encoding="utf-8")
+    lacking = [name for name in main.list_commands(click.Context(main))
+               if not re.search(rf"limber {name}[ `\n]", text)]
+    assert not lacking

@@ -34,9 +34,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="fewer seeds")
     parser.add_argument("--json", action="store_true", help="last line: the table as JSON")
     parser.add_argument("--seed", type=int, help="repeat what a printed base seed drew")
+    parser.add_argument("--only", nargs="+", metavar="PART", default=(), help=(
+        "only these parts of the table, where a bench has parts; a wrong one lists them"))
     parser.add_argument("--out", type=Path, help="folder for pictures and raw numbers")
     options = parser.parse_args(arguments)
     module = importlib.import_module(f"benchmarks.{options.name}")
+    parts = getattr(module, "PARTS", {})
+    for part in options.only:
+        if part not in parts:
+            parser.error(f"{options.name} has no part {part!r}; it has: {', '.join(parts)}")
     if options.out:
         options.out.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
@@ -62,7 +68,7 @@ def show(rows: list[Row]) -> None:
 
 
 def _measure(module: object, options: argparse.Namespace) -> list[Row]:
-    drawn = {}
+    drawn = {"only": tuple(options.only)} if options.only else {}
     if "seed" in inspect.signature(module.rows).parameters:
         drawn["seed"] = secrets.randbits(31) if options.seed is None else options.seed
         print(f"base seed {drawn['seed']} (--seed repeats it)", flush=True)

@@ -1,12 +1,15 @@
 """The worker's table: mutated files, start-up times, exports bent in other programs, ringing.
 
-Times are those of this computer under its load at the moment.
+Times are those of this computer under its load at the moment: ``--only two-cores`` wants it quiet.
 """
 
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from benchmarks.table import Row
@@ -14,29 +17,65 @@ from benchmarks.worker_batches import killed, memory, on_dask, speed_up
 from benchmarks.worker_exports import rows as exported
 from benchmarks.worker_fuzz import fuzz
 from benchmarks.worker_readers import READERS
+from benchmarks.worker_readme import run_readme
 from benchmarks.worker_ringing import rows as rung
 from limber.progress import Progress
 
 TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    """Measure; ``quick`` takes a tenth of the files, branches and jobs."""
-    table = _start_up()
-    table += exported([seed + k for k in range(2 if quick else 5)], progress.part(0.02, 0.08))
-    table += rung(10 if quick else 100, seed, progress.part(0.08, 0.1))
-    progress(0.1, "mutated files")
+@dataclass(frozen=True)
+class Setting:
+    """How much is measured: ``quick`` takes a tenth of the files, branches and jobs."""
+
+    quick: bool
+    seed: int
+    keep: Path
+
+
+def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
+         only: tuple[str, ...] = ()) -> list[Row]:
+    """Measure the parts named in ``only``, or all; ``quick`` takes about a tenth of each."""
+    table = []
+    chosen = only or WHOLE
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
-        keep = (out or Path(place)) / "harmful"
-        table += _fuzzed(20 if quick else 200, seed, keep, progress.part(0.1, 0.5))
-    table.append(memory(30 if quick else 100, TEMPLATE, progress.part(0.5, 0.6)))
-    table.append(killed(3 if quick else 30, 2 if quick else 4, seed, progress.part(0.6, 0.75)))
-    table += on_dask(2 if quick else 8, seed, progress.part(0.75, 0.8))
-    table.append(speed_up(4 if quick else 40, seed, progress.part(0.8, 1.0)))
+        setting = Setting(quick, seed, (out or Path(place)) / "harmful")
+        for number, name in enumerate(chosen):
+            table += PARTS[name](setting, progress.part(
+                number / len(chosen), (number + 1) / len(chosen)))
     return table
 
 
-def _start_up() -> list[Row]:
+def _exports(setting: Setting, progress: Progress) -> list[Row]:
+    return exported([setting.seed + k for k in range(2 if setting.quick else 5)], progress)
+
+
+def _ringing(setting: Setting, progress: Progress) -> list[Row]:
+    return rung(10 if setting.quick else 100, setting.seed, progress)
+
+
+def _memory(setting: Setting, progress: Progress) -> list[Row]:
+    return [memory(30 if setting.quick else 100, TEMPLATE, progress)]
+
+
+def _kills(setting: Setting, progress: Progress) -> list[Row]:
+    kills, branches = (3, 1) if setting.quick else (30, 2)
+    return [killed(kills, branches, setting.seed, progress)]
+
+
+def _readme(setting: Setting, progress: Progress) -> list[Row]:
+    return [run_readme(setting.seed, progress)]
+
+
+def _dask(setting: Setting, progress: Progress) -> list[Row]:
+    return on_dask(2 if setting.quick else 8, setting.seed, progress)
+
+
+def _two_cores(setting: Setting, progress: Progress) -> list[Row]:
+    return [speed_up(4 if setting.quick else 40, setting.seed, progress)]
+
+
+def _start_up(_setting: Setting, _progress: Progress) -> list[Row]:
     found = []
     for arguments, asked in ((("--help",), 0.3), (("doctor",), 2.0)):
         seconds = []
@@ -50,9 +89,11 @@ def _start_up() -> list[Row]:
     return found
 
 
-def _fuzzed(count: int, seed: int, keep: Path, progress: Progress) -> list[Row]:
+def _fuzzed(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple(READERS),
+            ) -> list[Row]:
     """A row a reader, and one for all."""
-    found = fuzz(list(READERS), count, seed, TEMPLATE, keep, progress)
+    count = 20 if setting.quick else 200
+    found = fuzz(list(names), count, setting.seed, TEMPLATE, setting.keep, progress)
     table = []
     for name, outcomes in found.items():
         told = ", ".join(f"{number} {word}" for word, number in sorted(outcomes.counts.items()))
@@ -61,6 +102,16 @@ def _fuzzed(count: int, seed: int, keep: Path, progress: Progress) -> list[Row]:
         for word, file, message in outcomes.examples:
             print(f"{name}: {word}: {message} ({Path(file).name})")
     bad, total = sum(each.bad for each in found.values()), count * len(found)
-    table.append(Row(f"{len(found)} readers, {total} files: traceback, crash, hang over 10 s, "
-                     "over 2 GB, numbers not finite", "0", str(bad), bad == 0))
+    if len(found) > 1:
+        table.append(Row(f"{len(found)} readers, {total} files: traceback, crash, hang over 10 s, "
+                         "over 2 GB, numbers not finite", "0", str(bad), bad == 0))
     return table
+
+
+WHOLE: dict[str, Callable[[Setting, Progress], list[Row]]] = {
+    "start-up": _start_up, "exports": _exports, "ringing": _ringing, "fuzz": _fuzzed,
+    "readme": _readme, "memory": _memory, "kills": _kills, "dask": _dask,
+    "two-cores": _two_cores}
+"""The table's parts, in its order."""
+PARTS = WHOLE | {f"fuzz:{name}": partial(_fuzzed, names=(name,)) for name in READERS}
+"""What ``--only`` knows: those, and the fuzz of one reader."""

@@ -1,5 +1,6 @@
 """Batches: two cores against one, kills at random moments, memory over many jobs."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -69,33 +70,39 @@ def on_dask(count: int, seed: int, progress: Progress) -> list[Row]:
 
 
 def killed(kills: int, branches: int, seed: int, progress: Progress) -> Row:
-    """Kill -9 of the batch and all its workers at random moments, then let it end."""
+    """Kill -9 of the batch with its workers, or of one worker, at a random moment of a new run
+    each time; then let it go on to its end."""
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         folder = Path(place)
         _scans(folder, branches, seed)
-        undisturbed = _jobs(folder, "undisturbed", _STAGES)
         started = time.perf_counter()
-        code = _batch(undisturbed, 1).wait()
+        code = _batch(_jobs(folder, "undisturbed", _STAGES), 1).wait()
         whole = time.perf_counter() - started
-        jobs = _jobs(folder, "killed", _STAGES)
-        redone, kept = 0, {}
+        wanted = _digests(folder / "undisturbed")
+        redone = apart = alone = amid = 0
         for number in range(kills):
             progress(number / kills, f"kill {number + 1} of {kills}")
+            name = f"killed-{number}"
+            jobs, out = _jobs(folder, name, _STAGES), folder / name
             process = _batch(jobs, 1)
-            time.sleep(float(rng.uniform(0.5, 0.8 * whole)))
-            _kill(process)
-            now = _finished(folder / "killed")
+            time.sleep(float(rng.uniform(0.2, whole)))
+            amid += process.poll() is None
+            if rng.random() < 0.5:
+                _kill(process, _family(process))
+            else:
+                alone += _kill_one(process, rng)
+            kept = _finished(out)
+            code = code or _batch(jobs, 1, "--retry-failed").wait()
+            now = _finished(out)
             redone += sum(now.get(key) != value for key, value in kept.items())
-            kept = now
-        code = code or _batch(jobs, 1).wait()
-        now = _finished(folder / "killed")
-        redone += sum(now.get(key) != value for key, value in kept.items())
-        same = _digests(folder / "undisturbed") == _digests(folder / "killed")
-    told = (f"{'identical' if same else 'DIFFERENT'} files, {redone} stages redone, exit {code}; "
-            f"{kills} kills, {branches} branches")
-    return Row("kill -9 of batch and workers at random moments (30 asked)",
-               "identical, nothing stored redone", told, same and redone == 0 and code == 0)
+            apart += _digests(out) != wanted
+            shutil.rmtree(out)
+    told = (f"{apart} runs with other files, {redone} stages redone, exit {code}; {kills} kills, "
+            f"{amid} while it ran, {alone} of one worker alone; {branches} branches each")
+    return Row("kill -9 of batch and workers, or of a worker, at random moments (30 asked)",
+               "identical, nothing stored redone", told,
+               bool(wanted) and apart == 0 and redone == 0 and code == 0)
 
 
 def memory(jobs: int, template: Path, progress: Progress) -> Row:
@@ -139,19 +146,31 @@ def _batch(jobs: Path, workers: int, *more: str) -> subprocess.Popen:
         env=os.environ | {"LIMBER_CORES": str(workers)})
 
 
-def _kill(process: subprocess.Popen) -> None:
+def _family(process: subprocess.Popen) -> list[int]:
+    """The processes that a batch has started."""
     import psutil
 
     try:
-        family = psutil.Process(process.pid).children(recursive=True)
+        return [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
     except psutil.NoSuchProcess:
-        family = []
-    for one in (process.pid, *(child.pid for child in family)):
-        try:
+        return []
+
+
+def _kill(process: subprocess.Popen, others: list[int]) -> None:
+    for one in (process.pid, *others):
+        with contextlib.suppress(ProcessLookupError):
             os.kill(one, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
     process.wait()
+
+
+def _kill_one(process: subprocess.Popen, rng: np.random.Generator) -> bool:
+    """Kill one of the batch's processes, if it has any; the batch itself goes on to its end."""
+    family = _family(process)
+    if family:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(family[int(rng.integers(len(family)))], signal.SIGKILL)
+    process.wait()
+    return bool(family)
 
 
 def _manifests(out: Path) -> dict[str, dict]:

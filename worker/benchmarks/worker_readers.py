@@ -1,40 +1,20 @@
 """Every reader of files that others may have written: good files of each kind, and who reads them.
 
-Files of a branch folder are put into a copy of one with their checksums set right, as somebody
-would who wants to do harm; then whatever shows or computes with them is called.
+Those of a branch folder stand in :mod:`benchmarks.worker_branch_readers`.
 """
 
 import json
 import shutil
 import tempfile
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.worker_branch_readers import BRANCH_READERS, Reader, template_file
 from limber.errors import InputError
-from limber.files import file_digest
 from limber.store import Branch
-
-
-@dataclass(frozen=True)
-class Reader:
-    """One kind of file.
-
-    Attributes:
-        kind: How files are changed: ``text``, ``json``, ``npz``, ``binary``.
-        make: Writes good files into a folder, from a template branch; returns them.
-        read: Reads a file; gets the template as well.
-        may_lack: NaN is a word for "not measured" there.
-    """
-
-    kind: str
-    make: Callable[[Path, Path], list[Path]]
-    read: Callable[[Path, Path], Any]
-    may_lack: bool = False
 
 
 def _points() -> np.ndarray:
@@ -332,7 +312,9 @@ def _commands(_template: Path, folder: Path) -> list[Path]:
         {"command": "grasp", "vertex": 4, "mode": "pinned", "radius_m": 0.01},
         {"command": "move", "pose": [0.1, 0, 0.4, 0, 0, 0], "grasp": 1},
         {"command": "young", "young_pa": [1e8, 1e8]},
-        {"command": "loads", "loads": [{"point": [0, 0, 0.3], "force_n": [0, 0, -1]}]})) + "\n")
+        {"command": "loads", "loads": [{"point": [0, 0, 0.3], "force_n": [0, 0, -1]}]},
+        {"command": "outdoors", "wind_m_s": [4, 0, 0], "snow_kg_m2": 2, "cuts": [[0, 0, 0.3]],
+         "fruit": [{"point": [0, 0, 0.2], "mass_kg": 0.1}]})) + "\n")
     return [path]
 
 
@@ -349,137 +331,6 @@ def _read_commands(_template: Path, path: Path) -> Any:
         except NotUnderstood:
             continue
     return understood
-
-
-def _template_file(name: str, template: Path, folder: Path) -> list[Path]:
-    target = folder / Path(name).name
-    shutil.copyfile(template / name, target)
-    return [target]
-
-
-def _swc(_template: Path, path: Path) -> Any:
-    from limber.geometry.skeleton.files import read_swc
-
-    return read_swc(path)
-
-
-def _surface(_template: Path, path: Path) -> Any:
-    from limber.geometry.surface.surface import Surface
-
-    return Surface.read(path)
-
-
-@cache
-def _work_copy(template: Path) -> Path:
-    place = Path(tempfile.mkdtemp(prefix="limber-fuzz-branch-"))
-    import atexit
-
-    atexit.register(shutil.rmtree, place, ignore_errors=True)
-    return Path(shutil.copytree(template, place / "work.branch"))
-
-
-def _in_folder(name: str, act: Callable[[Branch], Any], template: Path, path: Path) -> Any:
-    """Act on a branch whose file ``name`` is ``path``, with the right checksum."""
-    work = _work_copy(template)
-    kept = {file: (work / file).read_bytes() if (work / file).exists() else None
-            for file in (name, "branch.json")}
-    try:
-        (work / name).write_bytes(path.read_bytes())
-        if name != "branch.json":
-            manifest = json.loads(kept["branch.json"])
-            entry = {"sha256": file_digest(path), "bytes": path.stat().st_size, "stage": "mesh"}
-            manifest["files"][name] = manifest["files"].get(name, {}) | entry
-            (work / "branch.json").write_text(json.dumps(manifest))
-        return act(Branch.open(work))
-    finally:
-        for file, content in kept.items():
-            if content is None:
-                (work / file).unlink()
-            else:
-                (work / file).write_bytes(content)
-
-
-def _shown(branch: Branch) -> Any:
-    from limber.scene.data import scene_data
-    from limber.stages.loading import load_targets
-
-    data = scene_data(branch, targets=load_targets(branch))
-    return {name: values for name, values in data.arrays.items()
-            if not name.startswith("observation")}
-
-
-def _computed(branch: Branch) -> Any:
-    from limber.stages.loading import load_branch, load_skeleton
-
-    load_skeleton(branch)
-    return load_branch(branch, gravity=False).model.mesh
-
-
-def _shown_and_computed(branch: Branch) -> Any:
-    return _shown(branch), _computed(branch)
-
-
-def _masses(branch: Branch) -> Any:
-    from limber.stages.loading import load_masses, load_point_masses
-
-    return load_masses(branch), load_point_masses(branch)
-
-
-def _planned(branch: Branch) -> Any:
-    """A plan's JSON and tables as scene and report show them."""
-    from limber.planning.plan_file import read_plan
-    from limber.report.tables import comparison_rows
-
-    plan = read_plan(branch.path("plans/to-goal.json"))
-    comparison_rows(plan.summary)
-    return _shown(branch), plan.plan, plan.baseline, plan.motion
-
-
-def _sampled(branch: Branch) -> Any:
-    from limber.planning.field.energy_field import EnergyField
-
-    field = EnergyField.read(branch.path("energy.npz"))
-    return _shown(branch), field.energy(field.samples.positions[:3])
-
-
-def _estimated(branch: Branch) -> Any:
-    """An estimate as the report tells it, and as `limber predict` takes it up to its solve."""
-    from limber.estimation.estimate_file import read_estimate
-    from limber.report.tables import cause_rows, deviation_rows, held_out_rows, modulus_rows
-
-    known = read_estimate(branch.path("estimate.json"))
-    modulus_rows(known, None), cause_rows(known), deviation_rows(known), held_out_rows(known)
-    return known
-
-
-def _pulled(branch: Branch) -> Any:
-    from limber.recordings.checks import clean
-    from limber.recordings.recording import read_pull
-
-    return clean(read_pull(branch.path("pulls/pull-1"))), _shown(branch)
-
-
-def _opened(branch: Branch) -> Any:
-    branch.damages()
-    return branch.gravity, _shown(branch)
-
-
-def _made(name: str, text: str, _template: Path, folder: Path) -> list[Path]:
-    path = folder / name
-    path.write_text(text)
-    return [path]
-
-
-def _json_file(name: str, content: Any) -> Callable[[Path, Path], list[Path]]:
-    return partial(_made, name, json.dumps(content))
-
-
-_MASSES = [{"mass_kg": 0.01, "attached_m": [0, 0, 0.2], "centre_m": [0.01, 0, 0.22],
-            "inertia_kg_m2": [[1e-6, 0, 0], [0, 1e-6, 0], [0, 0, 1e-6]]},
-           {"mass_kg": 0.02, "attached_m": [0, 0, 0.3]}]
-_TARGETS = {"format_version": 1, "targets": [
-    {"name": "fruit", "position_m": [0.0, 0.0, 0.3], "mass_kg": 0.1}]}
-
 
 def _cylinder_models(suffix: str, template: Path, folder: Path) -> list[Path]:
     from limber.stages.export import ExportSettings, export
@@ -526,10 +377,50 @@ def _scene_file(template: Path, folder: Path) -> list[Path]:
     return [path]
 
 
-def _branch_file(name: str, kind: str, act: Callable[[Branch], Any], make: Any = None,
-                 may_lack: bool = False) -> Reader:
-    return Reader(kind, make or partial(_template_file, name), partial(_in_folder, name, act),
-                  may_lack)
+def _matlab_73(template: Path, folder: Path) -> list[Path]:
+    """The cylinder model as Matlab saves it in version 7.3: HDF5 behind a header of its own."""
+    import h5py
+    from scipy.io import loadmat
+
+    held = loadmat(_cylinder_models(".mat", template, folder)[0])["QSM"]["cylinder"][0, 0]
+    path = folder / "tree73.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name in held.dtype.names:
+            file[f"QSM/cylinder/{name}"] = held[name][0, 0].T
+    with open(path, "r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file".ljust(512))
+    return [path]
+
+
+def _mcap(template: Path, folder: Path) -> list[Path]:
+    from limber.stages.export_pull import export_pull
+
+    path = folder / "pull.mcap"
+    export_pull(template, "pull-1", path)
+    return [path]
+
+
+def _bag(_template: Path, path: Path) -> Any:
+    """A bag up to the pull that is made of it."""
+    from limber.recordings.bags.pull import pull_of_bag
+    from limber.recordings.bags.reading import read_bag
+    from limber.recordings.settings import ImportSettings
+
+    with tempfile.TemporaryDirectory() as folder:
+        made = pull_of_bag(read_bag(path), Path(folder), ImportSettings())
+    return made.robot, made.seen
+
+
+def _swc(_template: Path, path: Path) -> Any:
+    from limber.geometry.skeleton.files import read_swc
+
+    return read_swc(path)
+
+
+def _surface(_template: Path, path: Path) -> Any:
+    from limber.geometry.surface.surface import Surface
+
+    return Surface.read(path)
 
 
 READERS: dict[str, Reader] = {
@@ -551,6 +442,8 @@ READERS: dict[str, Reader] = {
     "tables CSV": Reader("text", _tables, _table, True),
     "nominal CSV": Reader("text", _nominal, _read_nominal),
     "calipers CSV": Reader("text", _calipers, _read_calipers),
+    "MAT v7.3": Reader("binary", _matlab_73, _skeleton),
+    "MCAP": Reader("binary", _mcap, _bag, True),
     "MAT": Reader("binary", partial(_cylinder_models, ".mat"), _skeleton),
     "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), _skeleton),
     "ring CSV": Reader("text", partial(_decay, "ring.csv", "a_m_s2"), _ring),
@@ -561,29 +454,12 @@ READERS: dict[str, Reader] = {
         partial(_addon_read, "clouds", "read_points")),
     "add-on scene data": Reader("npz", _scene_file, partial(
         _addon_read, "scene_data", "read_scene_data"), True),
+    "SWC": Reader("text", partial(template_file, "skeleton.swc"), _swc),
+    "surface PLY": Reader("binary", partial(template_file, "surface.ply"), _surface),
     "edits JSON": Reader("json", _edits, _read_edits),
     "job TOML": Reader("text", _jobs, _read_jobs),
     "cell TOML": Reader("text", _cell, _read_cell),
     "session commands": Reader("text", _commands, _read_commands),
-    "branch.json": _branch_file("branch.json", "json", _opened),
-    "SWC": Reader("text", partial(_template_file, "skeleton.swc"), _swc),
-    "surface PLY": Reader("binary", partial(_template_file, "surface.ply"), _surface),
-    "QSM CSV": _branch_file("skeleton.csv", "text", _shown_and_computed),
-    "VTU": _branch_file("mesh.vtu", "text", _shown_and_computed),
-    "cloud.ply": _branch_file("cloud.ply", "binary", _shown),
-    "point_masses.json": _branch_file("point_masses.json", "json", _masses,
-                                      _json_file("point_masses.json", _MASSES)),
-    "targets.json": _branch_file("targets.json", "json", _shown_and_computed,
-                                 _json_file("targets.json", _TARGETS)),
-    "pull.toml": _branch_file("pulls/pull-1/pull.toml", "text", _pulled, may_lack=True),
-    "robot.csv": _branch_file("pulls/pull-1/robot.csv", "text", _pulled, may_lack=True),
-    "markers.csv": _branch_file("pulls/pull-1/markers.csv", "text", _pulled, may_lack=True),
-    "estimate.json": _branch_file("estimate.json", "json", _estimated),
-    "energy.npz": _branch_file("energy.npz", "npz", _sampled),
-    "frames JSON": _branch_file("frames/to-goal.json", "json", _shown),
-    "frames NPZ": _branch_file("frames/to-goal.npz", "npz", _shown),
-    "PC2": _branch_file("frames/to-goal.pc2", "binary", _shown),
-    "plan JSON": _branch_file("plans/to-goal.json", "json", _planned),
-    "plan CSV": _branch_file("plans/to-goal.csv", "text", _planned),
+    **BRANCH_READERS,
 }
 """Readers by name."""

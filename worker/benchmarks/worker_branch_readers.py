@@ -1,0 +1,227 @@
+"""Readers of the files of a branch folder: each is put into a copy of one with its checksums set
+right, as somebody would who wants to do harm; then whatever shows or computes with it is called.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from limber.files import file_digest
+from limber.store import Branch
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of file that others may have written.
+
+    Attributes:
+        kind: How files are changed: ``text``, ``json``, ``npz``, ``binary``.
+        make: Writes good files into a folder, from a template branch; returns them.
+        read: Reads a file; gets the template as well.
+        may_lack: NaN is a word for "not measured" there.
+    """
+
+    kind: str
+    make: Callable[[Path, Path], list[Path]]
+    read: Callable[[Path, Path], Any]
+    may_lack: bool = False
+
+def template_file(name: str, template: Path, folder: Path) -> list[Path]:
+    """Copy a file of the template branch."""
+    target = folder / Path(name).name
+    shutil.copyfile(template / name, target)
+    return [target]
+
+
+
+@cache
+def _work_copy(template: Path) -> Path:
+    place = Path(tempfile.mkdtemp(prefix="limber-fuzz-branch-"))
+    import atexit
+
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    return Path(shutil.copytree(template, place / "work.branch"))
+
+
+def _in_folder(name: str, act: Callable[[Branch], Any], template: Path, path: Path) -> Any:
+    """Act on a branch whose file ``name`` is ``path``, with the right checksum."""
+    work = _work_copy(template)
+    kept = {file: (work / file).read_bytes() if (work / file).exists() else None
+            for file in (name, "branch.json")}
+    try:
+        (work / name).parent.mkdir(exist_ok=True)
+        (work / name).write_bytes(path.read_bytes())
+        if name != "branch.json":
+            manifest = json.loads(kept["branch.json"])
+            entry = {"sha256": file_digest(path), "bytes": path.stat().st_size, "stage": "mesh"}
+            manifest["files"][name] = manifest["files"].get(name, {}) | entry
+            (work / "branch.json").write_text(json.dumps(manifest))
+        return act(Branch.open(work))
+    finally:
+        for file, content in kept.items():
+            if content is None:
+                (work / file).unlink()
+            else:
+                (work / file).write_bytes(content)
+
+
+def _shown(branch: Branch) -> Any:
+    from limber.scene.data import scene_data
+    from limber.stages.loading import load_targets
+
+    data = scene_data(branch, targets=load_targets(branch))
+    return {name: values for name, values in data.arrays.items()
+            if not name.startswith("observation")}
+
+
+def _computed(branch: Branch) -> Any:
+    from limber.stages.loading import load_branch, load_skeleton
+
+    load_skeleton(branch)
+    return load_branch(branch, gravity=False).model.mesh
+
+
+def _shown_and_computed(branch: Branch) -> Any:
+    return _shown(branch), _computed(branch)
+
+
+def _masses(branch: Branch) -> Any:
+    from limber.stages.loading import load_masses, load_point_masses
+
+    return load_masses(branch), load_point_masses(branch)
+
+
+def _planned(branch: Branch) -> Any:
+    """A plan's JSON and tables as scene and report show them."""
+    from limber.planning.plan_file import read_plan
+    from limber.report.tables import comparison_rows
+
+    plan = read_plan(branch.path("plans/to-goal.json"))
+    comparison_rows(plan.summary)
+    return _shown(branch), plan.plan, plan.baseline, plan.motion
+
+
+def _sampled(branch: Branch) -> Any:
+    from limber.planning.field.energy_field import EnergyField
+
+    field = EnergyField.read(branch.path("energy.npz"))
+    return _shown(branch), field.energy(field.samples.positions[:3])
+
+
+def _estimated(branch: Branch) -> Any:
+    """An estimate as the report tells it, and as `limber predict` takes it up to its solve."""
+    from limber.estimation.estimate_file import read_estimate
+    from limber.report.tables import cause_rows, deviation_rows, held_out_rows, modulus_rows
+
+    known = read_estimate(branch.path("estimate.json"))
+    modulus_rows(known, None), cause_rows(known), deviation_rows(known), held_out_rows(known)
+    return known
+
+
+def _pulled(branch: Branch) -> Any:
+    from limber.recordings.checks import clean
+    from limber.recordings.recording import read_pull
+
+    return clean(read_pull(branch.path("pulls/pull-1"))), _shown(branch)
+
+
+def _opened(branch: Branch) -> Any:
+    branch.damages()
+    return branch.gravity, _shown(branch)
+
+
+def _made(name: str, text: str, _template: Path, folder: Path) -> list[Path]:
+    path = folder / name
+    path.write_text(text)
+    return [path]
+
+
+def _json_file(name: str, content: Any) -> Callable[[Path, Path], list[Path]]:
+    return partial(_made, name, json.dumps(content))
+
+
+_MASSES = [{"mass_kg": 0.01, "attached_m": [0, 0, 0.2], "centre_m": [0.01, 0, 0.22],
+            "inertia_kg_m2": [[1e-6, 0, 0], [0, 1e-6, 0], [0, 0, 1e-6]]},
+           {"mass_kg": 0.02, "attached_m": [0, 0, 0.3]}]
+_TARGETS = {"format_version": 1, "targets": [
+    {"name": "fruit", "position_m": [0.0, 0.0, 0.3], "mass_kg": 0.1}]}
+
+
+def _load(branch: Branch) -> Any:
+    from limber.report.loads import load_rows, read_load
+
+    return load_rows(read_load(branch.path("loads/gale.json")))
+
+
+def _ringing(branch: Branch) -> Any:
+    from limber.report.ringing import vibration_rows
+
+    return vibration_rows(branch.path("vibration.json"))
+
+
+def _swing(branch: Branch) -> Any:
+    from limber.report.swings import along_its_way, read_swing, swing_rows
+
+    swing = read_swing(branch.path("swing.json"))
+    return swing_rows(swing), along_its_way(swing)
+
+
+_LOAD = {"tip_displacement_m": [0.01, 0, -0.02], "sag_m": 0.02, "sag_interval_m": [0.01, 0.03],
+         "greatest_strain": 0.001, "greatest_strain_interval": [0.0008, 0.0012],
+         "strain_over_limit": 0.1, "frequencies_hz": [2.0], "frequencies_before_hz": [2.5, 3.1],
+         "first_frequency_interval_hz": [1.9, 2.1], "wind_force_n": [1, 0, 0], "added_mass_kg": 0.1,
+         "cut_mass_kg": 0.0, "bears_times": 3.0, "bears_times_interval": [2.5, 3.5],
+         "held_by": "strain", "gusts": {
+             "factor": 1.5, "peak_factor": 3.2, "dynamic": 1.1, "damping": 0.03,
+             "mean_speed_m_s": 5.0, "mean_tip_displacement_m": [0.01, 0, 0]}}
+_RINGING = {"young_pa": 1e9, "young_interval_pa": [8e8, 1.2e9], "frequencies_hz": [2.0, 4.0],
+            "frequency_deviations_hz": [0.01, 0.02], "damping_ratios": [0.02, 0.03],
+            "damping_ratio_deviations": [0.001, 0.002], "model_frequencies_hz": [2.0, 4.1],
+            "left_over": 0.05}
+_TRACK = (0.02 * np.cos(np.linspace(0, 6, 12))[:, None, None] * [[[0, 0, 0.1], [0, 0.5, 1.0]]])
+_SWING = {"pull": "let-go", "young_pa": 2.5e6, "young_interval_pa": [2.4e6, 2.7e6],
+          "damping_ratio": 0.05, "damping_ratio_interval": [0.04, 0.06], "release_s": 0.4,
+          "release_deviation_s": 0.01, "frequency_hz": 3.2, "relative_residual": 0.012,
+          "warnings": ["a word"], "times_s": np.linspace(0, 1, 12).tolist(),
+          "seen_m": _TRACK.tolist(), "simulated_m": _TRACK.tolist()}
+
+
+def _branch_file(name: str, kind: str, act: Callable[[Branch], Any], make: Any = None,
+                 may_lack: bool = False) -> Reader:
+    return Reader(kind, make or partial(template_file, name), partial(_in_folder, name, act),
+                  may_lack)
+
+
+BRANCH_READERS: dict[str, Reader] = {
+    "branch.json": _branch_file("branch.json", "json", _opened),
+    "QSM CSV": _branch_file("skeleton.csv", "text", _shown_and_computed),
+    "VTU": _branch_file("mesh.vtu", "text", _shown_and_computed),
+    "cloud.ply": _branch_file("cloud.ply", "binary", _shown),
+    "point_masses.json": _branch_file("point_masses.json", "json", _masses,
+                                      _json_file("point_masses.json", _MASSES)),
+    "targets.json": _branch_file("targets.json", "json", _shown_and_computed,
+                                 _json_file("targets.json", _TARGETS)),
+    "pull.toml": _branch_file("pulls/pull-1/pull.toml", "text", _pulled, may_lack=True),
+    "robot.csv": _branch_file("pulls/pull-1/robot.csv", "text", _pulled, may_lack=True),
+    "markers.csv": _branch_file("pulls/pull-1/markers.csv", "text", _pulled, may_lack=True),
+    "estimate.json": _branch_file("estimate.json", "json", _estimated),
+    "energy.npz": _branch_file("energy.npz", "npz", _sampled),
+    "frames JSON": _branch_file("frames/to-goal.json", "json", _shown),
+    "frames NPZ": _branch_file("frames/to-goal.npz", "npz", _shown),
+    "PC2": _branch_file("frames/to-goal.pc2", "binary", _shown),
+    "plan JSON": _branch_file("plans/to-goal.json", "json", _planned),
+    "plan CSV": _branch_file("plans/to-goal.csv", "text", _planned),
+    "loads JSON": _branch_file("loads/gale.json", "json", _load, _json_file("gale.json", _LOAD)),
+    "vibration.json": _branch_file("vibration.json", "json", _ringing,
+                                   _json_file("vibration.json", _RINGING)),
+    "swing.json": _branch_file("swing.json", "json", _swing, _json_file("swing.json", _SWING),
+                               may_lack=True),
+}
+"""By name."""
