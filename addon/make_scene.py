@@ -1,7 +1,7 @@
 """Makes a scene file and its picture; `limber scene` runs this in a process that has bpy.
 
     blender -b --factory-startup --python make_scene.py -- \
-        --data DATA.npz --scene SCENE.blend [--picture PICTURE.png]
+        --data DATA.npz --scene SCENE.blend [--picture PICTURE.png] [--round FOLDER --sides 48]
 
 Standard output carries JSON lines as every stage's does; the last one has ``status``.
 """
@@ -10,6 +10,7 @@ import argparse
 import importlib
 import importlib.util
 import json
+import math
 import os
 import sys
 import threading
@@ -53,7 +54,8 @@ def _say(**content) -> None:
 
 
 def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = None,
-               width: int = 1120, color: str | None = None) -> dict:
+               width: int = 1120, color: str | None = None, round_path: Path | None = None,
+               sides: int = 48) -> dict:
     """Build the scene of ``data_path``, save it and render its last frame; returns a summary.
 
     Args:
@@ -62,6 +64,7 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
         picture_path: The PNG to render, if any.
         width: Of the picture [pixels].
         color: What the colours mean: a scalar of the data, the first by default.
+        round_path: A folder for pictures from all sides, if any; ``sides`` of them.
     """
     _load_addon()
     animation = importlib.import_module("limber_addon.bridge.animation")
@@ -91,8 +94,29 @@ def make_scene(data_path: Path, scene_path: Path, picture_path: Path | None = No
     if picture_path is not None:
         _say(progress=0.3, message="rendering")
         bpy.ops.render.render(write_still=True)
-    return {"object_count": len(scene.objects), "frame_count": shown.frame_count,
-            "blender": bpy.app.version_string}
+    summary = {"object_count": len(scene.objects), "frame_count": shown.frame_count,
+               "blender": bpy.app.version_string}
+    if round_path is not None:
+        _render_round(scene, round_path, sides)
+    return summary
+
+
+def _render_round(scene: bpy.types.Scene, folder: Path, sides: int) -> None:
+    """Render the branch as it is shown now from all sides; the file that was saved stays."""
+    sharing = importlib.import_module("limber_addon.operators.sharing")
+    sharing.register()
+    bpy.ops.limber.turntable(frames=sides)
+    pivot = bpy.data.objects[f"{sharing.RIG} pivot"]
+    # The branch stands still meanwhile: the camera turns by hand, not by the scene's frames.
+    pivot.animation_data_clear()
+    for collection in bpy.data.collections:
+        # It stands before the other camera.
+        collection.hide_render |= collection.name == "Legend"
+    for number in range(sides):
+        _say(progress=0.3 + 0.7 * number / sides, message="turntable")
+        pivot.rotation_euler[2] = 2 * math.pi * number / sides
+        scene.render.filepath = str(folder / f"{number:04d}.png")
+        bpy.ops.render.render(write_still=True)
 
 
 def _look_through_camera() -> None:
@@ -122,10 +146,13 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--width", type=int, default=1120)
     parser.add_argument("--color")
+    parser.add_argument("--round", type=Path)
+    parser.add_argument("--sides", type=int, default=48)
     given = parser.parse_args(arguments)
     _end_with_parent()
     try:
-        summary = make_scene(given.data, given.scene, given.picture, given.width, given.color)
+        summary = make_scene(given.data, given.scene, given.picture, given.width, given.color,
+                             given.round, given.sides)
     except (ValueError, RuntimeError, OSError) as error:
         _say(status="failed", error=str(error))
         return 3

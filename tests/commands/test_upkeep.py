@@ -52,9 +52,22 @@ def test_a_bug_report_holds_the_manifest_and_no_data_unasked(tmp_path, capsys):
         assert archive.namelist() == ["report.json", "branch/branch.json"]
         told = json.loads(archive.read("report.json"))
     assert told["note"] == "it broke" and told["damages"][0]["name"] == "mesh.vtu"
-    assert told["doctor"]["python"] and told["files"]["cloud.ply"] > 0
+    assert told["doctor"]["python"] and told["files"]["cloud.ply"]["bytes"] > 0
     (folder / "branch.json").write_text("{")
     assert call(["bug-report", str(folder), "-o", str(out), "--data", "--json"]) == 0
     assert not _result(capsys)["opens"]
     with zipfile.ZipFile(out) as archive:
         assert "branch/cloud.ply" in archive.namelist()
+
+
+def test_a_bug_report_of_a_scan(tmp_path, capsys):
+    """One that no branch came of: its size and checksum, with --data the file."""
+    scan, out = tmp_path / "scan.ply", tmp_path / "bug.zip"
+    scan.write_bytes(b"ply, more or less")
+    for words, names in (((), ["report.json"]), (("--data",), ["report.json", "scan.ply"])):
+        assert call(["bug-report", str(scan), "-o", str(out), *words, "--json"]) == 0
+        with zipfile.ZipFile(out) as archive:
+            assert archive.namelist() == names
+            assert json.loads(archive.read("report.json"))["files"]["scan.ply"]["bytes"] == 17
+    assert call(["bug-report", str(tmp_path / "none"), "-o", str(out)]) == 2
+    capsys.readouterr()

@@ -1,0 +1,16 @@
+"""The core in ten lines: bend a branch at its grasp and print energy and force.
+
+    python bend.py NAME.branch
+"""
+
+import sys
+
+from limber.stages.loading import load_branch
+from limber.store import Branch
+
+branch = load_branch(Branch.open(sys.argv[1]))
+grasp = branch.marked_grasp("pinned")
+for way in (0.005, 0.010, 0.015):  # along x [m]
+    pose = grasp.rest_pose + [way, 0, 0, 0, 0, 0]
+    result = branch.equilibrium(grasp, pose).require()
+    print(f"{1e3 * way:.0f} mm: {result.energy:.4g} J, {result.reaction_force} N")

@@ -1,0 +1,17 @@
+#!/usr/bin/env bash
+# Young's modulus of one branch from recordings, without a window:
+#   estimate.sh NAME.branch RECORDING...
+# In Blender instead: LIMBER="blender -b --command limber" estimate.sh ...
+# Run again it keeps what is up to date. Options of the import: IMPORT="--unit mm" (see --help).
+set -euo pipefail
+limber=${LIMBER:-limber}
+branch=$1
+shift
+for recording in "$@"; do
+  name=$(basename "${recording%.*}")
+  # shellcheck disable=SC2086
+  $limber import-pull "$branch" "$recording" --name "$name" ${IMPORT:-}
+done
+# The last line is one JSON object; the rest is for people.
+$limber estimate "$branch" --json | tail -n 1 > "${branch%.branch}-estimate.json"
+$limber report "$branch"

@@ -1,0 +1,106 @@
+"""The scripts that users copy, and the README's Python, do what they say."""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.batch.job_file import read_jobs
+from limber.recordings.recording import read_pull
+from limber.stages.export_pull import export_pull
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = ROOT / "scripts" / "examples"
+EXAMPLE = ROOT / "blend_files" / "bending_branch"
+LIMBER = os.environ | {"LIMBER": f"{sys.executable} -m limber"}
+
+
+def run(*command: object, **environment: str) -> str:
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False,
+                          timeout=250, env=LIMBER | environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_all_are_run_here():
+    assert {path.name for path in SCRIPTS.iterdir()} == {
+        "estimate.sh", "render.sh", "bend.py", "night.toml"}
+
+
+def test_the_core_in_ten_lines(branch_folder):
+    """Further out it holds more energy and pulls harder."""
+    told = re.findall(r"(\d+) mm: (\S+) J, \[(.+)\] N", run(sys.executable, SCRIPTS / "bend.py",
+                                                           branch_folder))
+    energies = [float(energy) for _, energy, _ in told]
+    forces = [float(np.linalg.norm([float(part) for part in force.split()]))
+              for _, _, force in told]
+    assert [way for way, _, _ in told] == ["5", "10", "15"]
+    assert 0 < energies[0] < energies[1] < energies[2] and 0 < forces[0] < forces[2]
+    text = (SCRIPTS / "bend.py").read_text().split('"""')[2]
+    assert len([line for line in text.splitlines() if line.strip()]) <= 10
+
+
+def test_the_readmes_python(tmp_path):
+    """Its blocks run as they stand, in a folder that has the branch they name."""
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"),
+                        re.MULTILINE | re.DOTALL)
+    assert blocks
+    shutil.copytree(EXAMPLE, tmp_path / "apple.branch")
+    script = tmp_path / "readme.py"
+    script.write_text("if __name__ == '__main__':\n" + "\n".join(
+        f"    {line}" for block in blocks for line in block.splitlines()) + "\n")
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True,
+                          check=False, timeout=250)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="the script is bash's")
+def test_headless_estimation(branch_folder, tmp_path):
+    """A recording becomes a pull, and the estimate's JSON stands beside the folder."""
+    recording = tmp_path / "pull-2.mcap"
+    export_pull(branch_folder, "pull-1", recording)
+    run("bash", SCRIPTS / "estimate.sh", branch_folder, recording)
+    told = json.loads((tmp_path / "small-estimate.json").read_text())
+    assert told["status"] == "done" and told["converged"] and min(told["young_pa"]) > 0
+    assert len(read_pull(branch_folder / "pulls" / "pull-2").times) > 10
+    assert (branch_folder / "report.html").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("bash") is None or importlib.util.find_spec("bpy") is None,
+                    reason="the script is bash's, and needs bpy")
+def test_rendering(tmp_path):
+    """A scene, a picture and a turntable whose sides differ."""
+    from PIL import Image
+
+    folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
+    run("bash", SCRIPTS / "render.sh", folder, WIDTH="160", SIDES="3")
+    assert (tmp_path / "a.blend").stat().st_size > 10_000
+    assert (tmp_path / "a.png").stat().st_size > 2000
+    with Image.open(tmp_path / "a.webp") as moving:
+        assert moving.n_frames == 3 and moving.size == (160, 120)
+        sides = []
+        for number in range(3):
+            moving.seek(number)
+            sides.append(np.asarray(moving.convert("L"), float))
+    assert all(np.abs(sides[k] - sides[k - 1]).max() > 30 for k in range(3))
+
+
+def test_the_job_file(tmp_path):
+    """It is checked whole; each scan gets its stages, and a file of its name."""
+    shutil.copyfile(SCRIPTS / "night.toml", tmp_path / "night.toml")
+    for name in ("scans/apple.ply", "scans/pear.ply", "pulls/apple/one.csv", "pulls/apple/two.csv",
+                 "pulls/pear/one.csv"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("")
+    apple, _ = read_jobs(tmp_path / "night.toml").branches
+    assert [task.label for task in apple.tasks] == [
+        "reconstruct", "import-pull:one", "import-pull:two", "estimate", "report", "scene"]
+    assert apple.tasks[-1].inputs.render == tmp_path / "results" / "apple.png"
