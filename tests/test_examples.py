@@ -34,10 +34,11 @@ def test_all_are_run_here():
         "estimate.sh", "render.sh", "bend.py", "night.toml"}
 
 
-def test_the_core_in_ten_lines(branch_folder):
+def test_the_core_in_ten_lines(tmp_path):
     """Further out it holds more energy and pulls harder."""
+    folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
     told = re.findall(r"(\d+) mm: (\S+) J, \[(.+)\] N", run(sys.executable, SCRIPTS / "bend.py",
-                                                           branch_folder))
+                                                           folder))
     energies = [float(energy) for _, energy, _ in told]
     forces = [float(np.linalg.norm([float(part) for part in force.split()]))
               for _, _, force in told]
