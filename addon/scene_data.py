@@ -6,6 +6,7 @@ index in it is believed before it is checked.
 
 import json
 import re
+import tokenize
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,7 +72,7 @@ def read_scene_data(path: Path) -> SceneData:
         arrays = _arrays(Path(path))
         info = json.loads(str(arrays.pop("info")))
     except (OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, MemoryError,
-            NotImplementedError, zipfile.BadZipFile) as error:
+            NotImplementedError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile) as error:
         raise SceneDataError(f"{path} cannot be shown ({error}).") from error
     if not isinstance(info, dict) or info.get("format") != FORMAT:
         found = info.get("format") if isinstance(info, dict) else None

@@ -10,6 +10,7 @@ import csv
 import json
 import math
 import os
+import tokenize
 import tomllib
 import zipfile
 import zlib
@@ -119,7 +120,8 @@ def read_arrays(path: str | os.PathLike, what: str) -> dict[str, np.ndarray]:
                     arrays[name] = _array(stream, member.file_size)
         return arrays
     except (OSError, ValueError, EOFError, SyntaxError, TypeError, OverflowError, RuntimeError,
-            NotImplementedError, RecursionError, zipfile.BadZipFile, zlib.error) as error:
+            NotImplementedError, RecursionError, tokenize.TokenError, zipfile.BadZipFile,
+            zlib.error) as error:
         raise _unreadable(path, what, error) from error
 
 

@@ -63,6 +63,8 @@ def read_nominal(path: Path) -> tuple[list[str], np.ndarray]:
     rows = [[part.strip().strip('"') for part in line.split(sign)] for line in lines]
     try:
         titles = [split_title(part) for part in rows[0][1:4]]
+        if len(titles) != 3:
+            raise ValueError("its first line has no three columns of places")
         scale = [scale_of(title, LENGTH_UNITS_M, "m", path) for title in titles]
         labels = [row[0] for row in rows[1:]]
         places = np.array([[float(part) for part in row[1:4]] for row in rows[1:]])

@@ -64,7 +64,8 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
         return []
     rows = [["control point", "place (0 base, 1 tip)", *known.values()]]
     for number, place in enumerate(estimate["fractions"]):
-        shares = [f"{100 * parts[name][number]:.1f} %" if parts.get(name) else "not examined"
+        shares = ["not examined" if not parts.get(name) else "not known"
+                  if parts[name][number] is None else f"{100 * parts[name][number]:.1f} %"
                   for name in known]
         rows.append([str(number + 1), f"{place:.2f}", *shares])
     return rows

@@ -5,6 +5,7 @@ Camera axes: x right, y down, z forward, as OpenCV and TUM's RGB-D data have the
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -12,6 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
 from limber.reading import read_toml
+
+_MOST = 1e6
+"""No camera's number is larger, whatever its unit; or smaller than one over it."""
+_Pixels = Annotated[float, Field(ge=1 / _MOST, le=_MOST)]
 
 
 class Camera(BaseModel):
@@ -26,13 +31,13 @@ class Camera(BaseModel):
 
     width: int = Field(gt=0)
     height: int = Field(gt=0)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
-    depth_scale: float = Field(1000.0, gt=0)
-    baseline_m: float = Field(0.095, gt=0)
-    disparity_sigma_px: float = Field(0.08, gt=0)
+    fx: _Pixels
+    fy: _Pixels
+    cx: float = Field(ge=-_MOST, le=_MOST)
+    cy: float = Field(ge=-_MOST, le=_MOST)
+    depth_scale: float = Field(1000.0, ge=1 / _MOST, le=_MOST)
+    baseline_m: float = Field(0.095, ge=1 / _MOST, le=_MOST)
+    disparity_sigma_px: float = Field(0.08, gt=0, le=_MOST)
     pose: tuple[float, float, float, float, float, float] = (0.0,) * 6
 
     @property

@@ -7,6 +7,7 @@ import numpy as np
 
 from limber.errors import InputError
 
+_PNG = b"\x89PNG\r\n\x1a\n"
 LARGEST_PIXELS = 100_000_000
 """Of one image: no camera has more, and a small file may claim to."""
 
@@ -20,6 +21,7 @@ def read_pixels(path: Path, what: str) -> np.ndarray:
     from PIL import Image
 
     try:
+        _check_chunks(path)
         with warnings.catch_warnings():
             # Its size is judged here.
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -34,3 +36,16 @@ def read_pixels(path: Path, what: str) -> np.ndarray:
         raise InputError(f"{path} cannot be read as an image ({error}).",
                          f"{what[0].upper()}{what[1:]} was expected.", "Check the file.",
                          ) from error
+
+
+def _check_chunks(path: Path) -> None:
+    """Refuse a PNG file that announces longer parts than it has: memory would be taken for them."""
+    size = path.stat().st_size
+    with open(path, "rb") as stream:
+        if stream.read(len(_PNG)) != _PNG:
+            return
+        while len(head := stream.read(8)) == 8:
+            length = int.from_bytes(head[:4], "big")
+            if stream.tell() + length > size:
+                raise ValueError(f"a part of {length} bytes is announced, and {size} are there")
+            stream.seek(length + 4, 1)

@@ -59,7 +59,8 @@ _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
     "axial_forces_n": ("m",),
-    "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
+    "rest_pose": (6,), "chart_layers": (2, 2), "chart_pivot_m": (3,), "chart_radius_m": (),
+    "energy_error": (),
     "force_error": (),
     **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
        for name, shape in {
@@ -68,6 +69,8 @@ _OPTIONAL_SHAPES = {
            "gradient_weights": (f"{fit} g", 3, f"{fit} c"),
            "polynomial": (f"{fit} p", f"{fit} c"), "powers": (f"{fit} p", 3)}.items()}}
 """Of the arrays in a file; equal letters are equal lengths."""
+_LARGEST = 1e60
+"""In any unit here: with larger numbers sums would not be finite."""
 _CHOOSE_FROM = 150  # samples at most; the choice hardly changes with more, the time does
 
 
@@ -283,6 +286,9 @@ class EnergyField:
             require_shapes(path, arrays, _SHAPES | {
                 name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
                            _WHAT)
+            for name, values in arrays.items():
+                if values.dtype.kind == "f" and (np.abs(values) > _LARGEST).any():
+                    raise ValueError(f"{name} has a number beyond {_LARGEST:g}")
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
@@ -306,7 +312,6 @@ class EnergyField:
             raise InputError(f"{path} is not an energy field ({error}).",
                              "It was not written by `limber energy`, or is damaged.",
                              "Run `limber energy` again with --force.") from error
-            missed = arrays["left_out_errors"]
         return cls(samples, *charts, *fits, region, errors, missed)
 
 
