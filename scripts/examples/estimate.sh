@@ -14,4 +14,3 @@ for recording in "$@"; do
 done
 # The last line is one JSON object; the rest is for people.
 $limber estimate "$branch" --json | tail -n 1 > "${branch%.branch}-estimate.json"
-$limber report "$branch"

@@ -59,8 +59,7 @@ _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
     "axial_forces_n": ("m",),
-    "rest_pose": (6,), "chart_layers": (2, 2), "chart_pivot_m": (3,), "chart_radius_m": (),
-    "energy_error": (),
+    "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
     "force_error": (),
     **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
        for name, shape in {
@@ -287,7 +286,8 @@ class EnergyField:
                 name: shape for name, shape in _OPTIONAL_SHAPES.items() if name in arrays},
                            _WHAT)
             for name, values in arrays.items():
-                if values.dtype.kind == "f" and (np.abs(values) > _LARGEST).any():
+                if "_fit_" in name and values.dtype.kind == "f" and (
+                        np.abs(values) > _LARGEST).any():
                     raise ValueError(f"{name} has a number beyond {_LARGEST:g}")
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
@@ -303,6 +303,8 @@ class EnergyField:
                     for name in ("energy_fit", "shape_fit", "load_fit")]
             region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3],
                                     arrays["chart_pivot_m"], float(arrays["chart_radius_m"]))
+            if arrays["chart_layers"].shape != (2, 2):
+                raise ValueError("two charts are needed")
             charts = [replace(region.chart, stretch=float(stretch), depth=float(depth))
                       for stretch, depth in arrays["chart_layers"]]
             missed = arrays["left_out_errors"]
