@@ -2,7 +2,10 @@
 
 import io
 import json
+import subprocess
+import sys
 import threading
+import time
 
 import pytest
 
@@ -43,3 +46,20 @@ def test_json_lines_are_whole_and_throttled():
     lines = [json.loads(line) for line in stream.getvalue().splitlines()]
     assert [line["message"] for line in lines] == ["a", "b", "b"]
     assert lines[0]["loss"] == 0.5
+
+
+def test_a_sign_of_life_says_what_was_computed():
+    """Beats come while nothing is reported; what this process and its children compute is in them.
+    """
+    from limber.heartbeat import Heartbeat
+
+    stream = io.StringIO()
+    sink = JsonSink(stream)
+    with Heartbeat(sink.say, 0.05):
+        subprocess.run([sys.executable, "-c", "sum(range(3_000_000))"], check=True)
+        time.sleep(0.12)
+    count = len(stream.getvalue().splitlines())
+    beats = [json.loads(line) for line in stream.getvalue().splitlines()]
+    assert count >= 2 and beats[-1]["cpu_s"] - beats[0]["cpu_s"] > 0.01
+    time.sleep(0.12)
+    assert len(stream.getvalue().splitlines()) == count, "it ends with the work"

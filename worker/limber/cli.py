@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from limber.errors import LimberError
+from limber.heartbeat import Heartbeat
 from limber.progress import BarSink, JsonSink, Progress, Sink
 from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
 from limber.terminal import result_lines, table_lines
@@ -191,13 +192,16 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
         progress_style = "bar" if sys.stderr.isatty() else "none"
     outcome: dict[str, Any] = {"command": name, "status": "done", "error": None}
     result: dict[str, Any] = {}
-    state = Run(JsonSink() if progress_style == "json" else None,
-                functools.partial(click.echo, err=True))
+    lines = JsonSink() if progress_style == "json" else None
+    state = Run(lines, functools.partial(click.echo, err=True))
     code = 0
     try:
         if progress_style == "bar":
             with BarSink(name) as bar:
                 state = Run(bar, bar.say)
+                result = function(state, **options)
+        elif lines is not None:
+            with Heartbeat(lines.say):
                 result = function(state, **options)
         else:
             result = function(state, **options)

@@ -89,6 +89,7 @@ class JsonSink:
     def __init__(self, stream: TextIO | None = None, *, interval_seconds: float = 0.05):
         self._stream = stream or sys.stdout
         self._interval = interval_seconds
+        self._lock = threading.Lock()
         self._start = time.perf_counter()
         self._last = -1.0
         self._last_message = ""
@@ -99,8 +100,15 @@ class JsonSink:
         if not (due or fraction >= 1.0):
             return
         self._last, self._last_message = now, message
-        line = {"progress": round(fraction, 4), "message": message, "seconds": round(now, 3)}
-        print(json.dumps(line | numbers, default=float), file=self._stream, flush=True)
+        self.say({"progress": round(fraction, 4), "message": message, "seconds": round(now, 3)}
+                 | numbers)
+
+    def say(self, content: dict[str, Any]) -> None:
+        """Write one line, from any thread."""
+        text = json.dumps(content, default=float) + "\n"
+        with self._lock:
+            self._stream.write(text)
+            self._stream.flush()
 
 
 class BarSink:

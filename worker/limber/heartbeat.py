@@ -1,0 +1,63 @@
+"""A sign of life beside the progress: a worker that hangs is told from one that works.
+
+Work may be silent for long (one factorisation, a process that meshes). A thread says every few
+seconds ``{"alive": seconds, "cpu_s": seconds}``: how long the command runs, and how much its
+processes have computed. Where the second stands still nothing is computed; where no line comes the
+process is stopped, or native code keeps every thread of it from running.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+INTERVAL_SECONDS = 2.0
+
+
+class Heartbeat:
+    """Tells ``say`` about this process while the ``with`` block runs.
+
+    Args:
+        say: Gets the numbers, from another thread.
+        interval_seconds: Between one and the next.
+    """
+
+    def __init__(self, say: Callable[[dict[str, Any]], None],
+                 interval_seconds: float = INTERVAL_SECONDS):
+        self._say = say
+        self._interval = interval_seconds
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def __enter__(self) -> "Heartbeat":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self._ended.set()
+        # What comes last on the stream is the result.
+        self._thread.join()
+
+    def _beat(self) -> None:
+        start = time.perf_counter()
+        while not self._ended.wait(self._interval):
+            self._say({"alive": round(time.perf_counter() - start, 1),
+                       "cpu_s": round(computed_seconds(), 2)})
+
+
+def computed_seconds() -> float:
+    """Return the processor time of this process and of all that it has started [s]."""
+    import psutil
+
+    own = psutil.Process()
+    total = 0.0
+    for process in (own, *own.children(recursive=True)):
+        try:
+            times = process.cpu_times()
+        except (psutil.NoSuchProcess, psutil.AccessDenied):
+            # It has ended meanwhile, or is another user's.
+            continue
+        # Of ended children too, which their parent has waited for.
+        total += sum(getattr(times, name, 0.0) for name in (
+            "user", "system", "children_user", "children_system"))
+    return total
