@@ -211,11 +211,100 @@ def test_a_simulation_has_its_own_times_and_moves_its_marks(tmp_path, mesh):
     assert set(data.info["frame_scalars"]) == {"strain_energy", "strain", "det_f"}
     np.testing.assert_allclose(data.arrays["frame_scalar:strain"], 0.01 * fields)
     np.testing.assert_allclose(data.arrays["scalar:det_f"], 0.97, rtol=1e-6)
-    assert data.info["scalars"]["strain"]["ticks"][2] in {"0.03", "0.045"}
+    assert data.info["scalars"]["strain"]["ticks"][2] in {"3 %", "4.5 %"}
     for name, height in (("grasp", 0.5 * 0.67), ("control_points", 0.25)):
         moved = data.arrays[f"{name}_motion"].reshape(4, 3)
         np.testing.assert_allclose(moved[0], data.arrays[name][0], atol=1e-6)
         assert moved[-1, 0] - moved[0, 0] == pytest.approx(height**2, rel=0.15)
+
+
+def test_stress_over_strength(tmp_path, mesh):
+    """Over 0.6 % of E where no strength is known, and that is said; one colour, one number."""
+    surface = mesh.nodes[np.unique(mesh.surface_faces())]
+    mesh = mesh.with_data(cell_data={"young": np.full(mesh.tet_count, 5e9)})
+    stress = np.linspace(0, 45e6, 3)[:, None] * np.ones(len(surface))
+    import io
+
+    npz = io.BytesIO()
+    np.savez(npz, principal_stress_pa=stress)
+    branch = _branch(tmp_path / "a.branch", mesh, simulate={
+        "frames/s.pc2": _pc2(_bending(surface, 3)), "frames/s.npz": npz.getvalue()})
+    data = scene_data(branch)
+    np.testing.assert_allclose(data.arrays["frame_scalar:stress_over_strength"][:, 0],
+                               [0.0, 0.75, 1.5], rtol=1e-6)
+    assert "0.6 % of E, assumed" in data.info["frame_scalars"]["stress_over_strength"]["title"]
+    known = scene_data(branch, strength=90e6)
+    np.testing.assert_allclose(known.arrays["scalar:stress_over_strength"], 0.5)
+    assert "(90 MPa)" in known.info["scalars"]["stress_over_strength"]["title"]
+    levels = data.arrays["frame_level:stress_over_strength"]
+    np.testing.assert_array_equal(levels[:, 0], [0, 128, 255])
+    colours = data.arrays["palette:inferno"][levels[-1]]
+    np.testing.assert_allclose(colours, data.arrays["color:stress_over_strength"], atol=1e-6)
+
+
+def test_rods_lie_about_their_lines(mesh):
+    """Each vertex at the radius of its point, across the line; lines without length have none."""
+    from limber.scene.rods import rods
+
+    points = np.array([[0, 0, 0], [0, 0, 1.0], [1.0, 0, 1.0]])
+    vertices, faces, node = rods(points, np.array([[0, 1], [1, 2], [1, 1]]),
+                                 np.array([0.1, 0.1, 0.2]))
+    assert set(faces.ravel()) == set(range(len(vertices))) and len(vertices) == len(node) == 24
+    away = np.linalg.norm(vertices - points[node], axis=1)
+    np.testing.assert_allclose(away, np.array([0.1, 0.1, 0.2])[node])
+    np.testing.assert_allclose(vertices[:12, 2], points[node[:12], 2], atol=1e-12)
+
+
+def test_balls_lie_about_their_points():
+    """Twelve vertices a point, all at the radius; their triangles look outwards."""
+    from limber.scene.rods import balls
+
+    points = np.array([[0, 0, 0], [5.0, 0, 1.0]])
+    vertices, faces, node = balls(points, 0.1)
+    assert len(vertices) == 24 and len(faces) == 40
+    away = vertices - points[node]
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), 0.1)
+    corner = away[faces]
+    outwards = np.einsum("ij,ij->i", np.cross(corner[:, 1] - corner[:, 0],
+                                              corner[:, 2] - corner[:, 0]), corner[:, 0])
+    assert (outwards > 0).all()
+
+
+def test_graphs_of_an_estimate(tmp_path, mesh):
+    """E with its interval and the truth, force measured and simulated, distances to the measured.
+
+    Places are shares of the frame: 10 and 40 MPa stand where the ticks of that name stand."""
+    estimate = {
+        "method": "gauss-newton", "young_pa": [4e7, 1e7], "poisson": 0.35, "loss_m2": 1e-6,
+        "young_interval_pa": [[3e7, 5e7], [8e6, 1.2e7]], "forward_count": 3, "converged": True,
+        "control_points_m": [[0, 0, 0.2], [0, 0, 0.4]], "fractions": [0.4, 0.8],
+        "parameters": ["E1", "E2"], "groups": [0, 1], "covariance": [[1, 0], [0, 1]],
+        "deviations_before_fit": [1, 1], "history": [], "pulls": [{
+            "name": "p", "times_s": [0, 1], "all_times_s": [0, 1],
+            "observed_m": [[[0, 0, 0.2], [0, 0, 0.4]], [[0.01, 0, 0.2], [None, None, None]]],
+            "simulated_m": [[[0, 0, 0.2], [0, 0, 0.4]], [[0.014, 0, 0.2], [0.05, 0, 0.4]]],
+            "measured_force_n": [[0, 0, 0], [3, 4, 0]],
+            "simulated_force_n": [[0, 0, 0], [6, 0, 0]]}]}
+    marks = np.full(mesh.node_count, -1)
+    for number, height in enumerate((0.2, 0.4)):
+        marks[np.abs(mesh.nodes - [0, 0, height]).sum(axis=1).argmin()] = number
+    data = scene_data(_branch(
+        tmp_path / "a.branch", mesh.with_data(point_data={"control_point": marks}),
+        estimate={"estimate.json": json.dumps(estimate)}))
+    young, force = data.info["graphs"]["young"], data.info["graphs"]["force"]
+    ticks = {words: share for share, words in young["y"]["ticks"]}
+    (line,) = [line for line in young["lines"] if line["label"] == "estimated"]
+    assert line["points"][1] == pytest.approx([0.8, ticks["10 MPa"]], abs=1e-3)
+    assert ticks["10 MPa"] < ticks["20 MPa"] < line["points"][0][1] < ticks["50 MPa"]
+    assert young["bands"][0]["rows"][0][1] < line["points"][0][1] < young["bands"][0]["rows"][0][2]
+    ends = {line["label"]: line["points"][-1] for line in force["lines"]}
+    assert ends["measured"][1] == pytest.approx(5 / 6 * ends["simulated"][1], abs=1e-3)
+    scale = data.info["rods"]["fit"]["scale"]
+    assert (scale["low"], scale["high"]) == (0.0, pytest.approx(0.004))
+    balls = data.arrays["rods:fit"][-12:]
+    np.testing.assert_allclose(balls.mean(axis=0), [0.01, 0, 0.2], atol=1e-12)
+    nearest = np.abs(data.arrays["vertices"] - [0, 0, 0.2]).sum(axis=1).argmin()
+    assert data.arrays["scalar:residual"][nearest] == pytest.approx(0.004 / np.sqrt(2), rel=0.05)
 
 
 def test_the_newest_motion_is_the_one_finished_last(tmp_path, mesh):

@@ -29,17 +29,14 @@ def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dic
     if log:
         low = max(low, high / _MOST_DECADES)
     middle = float(np.sqrt(low * high)) if log else 0.5 * (low + high)
-    ticks = [_with_unit(value, unit, value if log else high) for value in (low, middle, high)]
+    ticks = [with_unit(value, unit, value if log else high) for value in (low, middle, high)]
     return {"title": title, "unit": unit, "low": low, "high": high, "log": log, "ticks": ticks,
-            "stops": _stops(colours)}
+            "stops": _stops(colours), "colours": colours}
 
 
 def colours_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
     """Return linear colours of values by a scale, shape [n, 4]."""
-    low, high = scale["low"], scale["high"]
-    if scale["log"]:
-        values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
-    place = np.clip((values - low) / (high - low), 0.0, 1.0)
+    place = _places(values, scale)
     stops = np.array(scale["stops"])
     channels = [np.interp(place, stops[:, 0], stops[:, channel]) for channel in (1, 2, 3)]
     return np.column_stack([*channels, np.ones_like(place)])
@@ -58,10 +55,31 @@ def linear_of(srgb: np.ndarray) -> np.ndarray:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def _with_unit(value: float, unit: str, size: float) -> str:
-    """Return ``value`` in words, with the prefix that suits ``size``."""
+def palette(name: str) -> np.ndarray:
+    """Return the linear colours of levels 0 to 255, shape [256, 4]; see :func:`levels_of`."""
+    scale = {"low": 0.0, "high": 255.0, "log": False, "stops": _stops(name)}
+    return colours_of(np.arange(256.0), scale)
+
+
+def levels_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
+    """Return the nearest of 256 evenly spaced colours of a scale for each value, as bytes."""
+    return np.round(255 * _places(values, scale)).astype(np.uint8)
+
+
+def _places(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:
+    """Return where values stand on a scale, 0 to 1."""
+    low, high = scale["low"], scale["high"]
+    if scale["log"]:
+        values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
+    return np.clip((values - low) / (high - low), 0.0, 1.0)
+
+
+def with_unit(value: float, unit: str, size: float) -> str:
+    """Return ``value`` in words, with the prefix that suits ``size``; of a share with % too."""
     if not unit:
         return f"{value:.3g}"
+    if unit == "%":
+        return f"{100 * value:.3g} %"
     # What rounds up to a prefix gets it: 1 MPa, not 1e+03 kPa.
     factor, prefix = next((p for p in _PREFIXES if 1.0005 * abs(size) >= p[0]), (1.0, ""))
     return f"{value / factor:.3g} {prefix}{unit}"

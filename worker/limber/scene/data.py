@@ -12,6 +12,8 @@ Arrays (m, s, J, Pa; what a folder does not have is left out):
 ``scalar:NAME`` [v], ``color:NAME`` [v, 4]      values at rest, or the worst of all frames, and
                                                 linear colours; NAME in ``info["scalars"]``
 ``frame_scalar:NAME`` [frames, v]               the same in each frame; ``info["frame_scalars"]``
+``frame_level:NAME`` [frames, v] bytes,         its colours: which of the palette that the scale's
+``palette:COLOURS`` [256, 4]                    ``colours`` names
 ``frame_times``, ``frame_energy``,              one number a frame: ``info["frames"]`` says
 ``frame_kinetic_energy``, ``frame_min_det_f``,  ``rate_hz`` and whether the times are those of a
 ``frame_strain`` [frames]                       motion (``is_timed``) or one pose a frame
@@ -29,6 +31,10 @@ Arrays (m, s, J, Pa; what a folder does not have is left out):
 ``path_strain:KEY`` [p], ``path_color:KEY``
 ``tree:KEY`` [q, 3], ``tree_parent:KEY`` [q]    search trees of ``info["trees"]``: nodes, and which
                                                 earlier one each hangs on (-1: none)
+``rods:NAME`` [u, 3], ``rod_faces:NAME``        thin rods in the colours of ``info["rods"]``:
+[x, 3], ``rod_color:NAME`` [u, 4]               ``plan``, ``baseline`` by energy, ``skeleton`` as
+                                                thick as it is, ``fit`` along simulated points
+                                                with balls at measured ones
 ``observation`` [t, m, 3], ``observation_       what was measured in the pull that
 visible`` [t, m], ``observation_times`` [t],    ``info["observation"]`` names, and the gripper
 ``observation_grasp`` [g, 3], ``observation_
@@ -39,9 +45,9 @@ grasp_times`` [g]
 ``view_direction`` [3]
 ==============================================  ====================================================
 
-``info`` also has ``goal`` and ``hemisphere`` (centre, radius, axis), ``base``, ``alignment`` (4x4,
-scan's file to branch), ``map_offset`` (the branch's origin in the scan's coordinates, double
-precision) and ``source``.
+``info`` also has ``graphs`` (see :mod:`limber.scene.graphs`), ``goal`` and ``hemisphere`` (centre,
+radius, axis), ``base``, ``alignment`` (4x4, scan's file to branch), ``map_offset`` (the branch's
+origin in the scan's coordinates, double precision), ``uuid`` and ``source``.
 """
 
 from collections.abc import Sequence
@@ -52,6 +58,8 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.frames import node_average
 from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import FORMAT, SceneData
+from limber.scene.colours import colour_scale
+from limber.scene.fit import add_fit
 from limber.scene.motion import add_motion, add_observation
 from limber.scene.paths import add_hemisphere, add_plan
 from limber.scene.robot import add_robot
@@ -60,6 +68,7 @@ from limber.scene.shape import (
     add_marks,
     add_scalar,
     add_skeleton,
+    add_skeleton_rods,
     add_targets,
     add_view,
     alignment,
@@ -71,13 +80,14 @@ __all__ = ["FORMAT", "SceneData", "scene_data"]
 
 
 def scene_data(branch: Branch, plan: str | None = None, motion: str | None = None,
-               targets: Sequence[NamedTarget] = ()) -> SceneData:
+               targets: Sequence[NamedTarget] = (), strength: float | None = None) -> SceneData:
     """Gather what there is to show of ``branch``.
 
     Args:
         plan: Which path; the newest by default.
         motion: Which frames; the plan's by default, else the newest.
         targets: Named places on the branch.
+        strength: Stress that breaks the wood [Pa]; assumed where it is not given.
 
     Raises:
         BranchFolderError: no mesh yet, no such plan or frames, or frames of another mesh.
@@ -88,21 +98,25 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     data = SceneData({"vertices": mesh.nodes[used], "faces": compact.reshape(-1, 3)})
     matrix = alignment(branch)
     data.info = {"format": FORMAT, "name": branch.name, "folder": str(branch.folder.resolve()),
-                 "unit": "m", "scalars": {}, "frame_scalars": {}, "paths": {},
+                 "uuid": branch.uuid, "unit": "m", "scalars": {}, "frame_scalars": {}, "paths": {},
+                 "rods": {}, "graphs": {},
                  "notes": [_size_note(branch, mesh)], "source": branch.manifest.source,
                  "alignment": matrix, "map_offset": map_offset(matrix)}
     if "young" in mesh.cell_data:
         young = (node_average(mesh) @ mesh.cell_data["young"])[used]
-        add_scalar(data, "young", young, "Young's modulus", "Pa", "viridis")
+        add_scalar(data, "young", young,
+                   colour_scale(young, "Young's modulus", "Pa", "viridis"))
     add_cloud(data, branch)
     add_skeleton(data, branch)
+    add_skeleton_rods(data)
     add_marks(data, mesh, used)
     add_targets(data, targets)
     plan = add_plan(data, branch, plan)
     add_hemisphere(data, branch)
-    add_motion(data, branch, plan, motion)
+    add_motion(data, branch, plan, motion, strength)
     add_robot(data, branch, plan)
     add_observation(data, branch, (data.info.get("frames") or {}).get("name"))
+    add_fit(data, branch, (data.info.get("observation") or {}).get("pull"))
     add_view(data)
     data.arrays = {name: np.ascontiguousarray(array) for name, array in data.arrays.items()}
     return data

@@ -4,16 +4,17 @@ import numpy as np
 
 from limber.errors import BranchFolderError, InputError
 from limber.mechanics.frames import FramesFile, read_frames_file, read_pc2
+from limber.mechanics.strength import STRENGTH_OVER_YOUNG, strength_of
 from limber.reading import read_arrays, require_shapes
 from limber.recordings.recording import read_pull
 from limber.scene.arrays import SceneData
-from limber.scene.colours import colour_scale
+from limber.scene.colours import colour_scale, levels_of, palette
 from limber.scene.shape import add_scalar
 from limber.store import Branch
 
 _FRAME_SCALARS = {
     "strain_energy_density_j_m3": ("strain_energy", "strain energy density", "J/m³", "inferno"),
-    "principal_strain": ("strain", "largest principal strain", "", "inferno"),
+    "principal_strain": ("strain", "largest principal strain", "%", "inferno"),
     "principal_stress_pa": ("stress", "largest principal stress", "Pa", "inferno"),
     "det_f": ("det_f", "volume relative to that at rest", "", "viridis")}
 """Arrays of ``frames/NAME.npz`` [frames, vertices]: name in the scene, title, unit, colours."""
@@ -22,8 +23,11 @@ _FRAME_VALUES = {"energies_j": "frame_energy", "kinetic_energies_j": "frame_kine
 """Lists of ``frames/NAME.json`` with a number a frame, and the arrays they become."""
 
 
-def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | None) -> None:
+def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | None,
+               strength: float | None = None) -> None:
     """Add the frames of ``motion``, of the plan by default, else the newest there are.
+
+    ``strength`` [Pa] is the stress that breaks the wood; assumed where it is not given.
 
     Raises:
         BranchFolderError: no such frames, or of another mesh.
@@ -55,6 +59,7 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
     data.arrays["frame_bounds"] = np.array(
         [bound(positions.reshape(-1, 3), axis=0) for bound in (np.min, np.max)], float)
     _add_values(data, branch, name, about, positions)
+    _add_share_of_strength(data, strength)
     _add_carried(data, positions, name == plan)
 
 
@@ -146,12 +151,31 @@ def _add_values(data: SceneData, branch: Branch, name: str, about: FramesFile,
         if key not in content or content[key].shape != (count, vertex_count):
             continue
         require_shapes(path, content, {key: (count, vertex_count)}, "values of a motion's frames")
-        values = content[key].astype(np.float32)
-        data.arrays[f"frame_scalar:{scalar}"] = values
-        data.info["frame_scalars"][scalar] = colour_scale(values, title, unit, colours)
-        worst, word = (values.min(axis=0), "least") if scalar == "det_f" else (
-            values.max(axis=0), "peak")
-        add_scalar(data, scalar, worst.astype(float), f"{word} {title}", unit, colours)
+        _add_frame_scalar(data, scalar, content[key], title, unit, colours)
+
+
+def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
+    """Add the stress of each frame over the stress that breaks the wood."""
+    stress, young = data.arrays.get("frame_scalar:stress"), data.arrays.get("scalar:young")
+    if stress is None or young is None:
+        return
+    told = (f"{100 * STRENGTH_OVER_YOUNG:g} % of E, assumed" if strength is None
+            else f"{strength / 1e6:.3g} MPa")
+    _add_frame_scalar(data, "stress_over_strength", stress / strength_of(young, strength),
+                      f"stress over strength ({told})", "", "inferno", is_from_zero=True)
+
+
+def _add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
+                      colours: str, *, is_from_zero: bool = False) -> None:
+    """Add a value in each frame, and the worst of all frames, both on one scale."""
+    values = values.astype(np.float32)
+    worst, word = (values.min(axis=0), "least") if name == "det_f" else (
+        values.max(axis=0), "peak")
+    scale = colour_scale(np.append(worst, 0.0) if is_from_zero else worst, title, unit, colours)
+    add_scalar(data, name, worst.astype(float), {**scale, "title": f"{word} {title}"})
+    data.info["frame_scalars"][name] = scale
+    data.arrays |= {f"frame_scalar:{name}": values, f"frame_level:{name}": levels_of(values, scale),
+                    f"palette:{colours}": palette(colours)}
 
 
 def _add_carried(data: SceneData, positions: np.ndarray, is_plan: bool) -> None:

@@ -9,6 +9,8 @@ from limber.planning.search_files import read_trees
 from limber.reading import read_arrays, read_columns, require_shapes
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of
+from limber.scene.graphs import energy_graph
+from limber.scene.rods import add_rods
 from limber.store import Branch
 
 _POSITION = ("x_m", "y_m", "z_m")
@@ -95,8 +97,16 @@ def _add_energy_scale(data: SceneData) -> None:
         scale = colour_scale(np.concatenate(list(energies.values())), "energy along the path",
                              "J", "inferno")
         data.info["path_energy"] = scale
+        size = float(np.ptp(data.arrays["vertices"], axis=0).max())
         for key, values in energies.items():
             data.arrays[f"path_color:{key}"] = colours_of(values, scale)
+            points = data.arrays[f"path:{key}"]
+            along = np.arange(len(points) - 1)
+            add_rods(data, key, f"{data.info['paths'][key]['title']} path by energy", points,
+                     np.column_stack([along, along + 1]), 0.005 * size, values, scale)
+        data.info["graphs"]["energy"] = energy_graph({
+            key: (data.info["paths"][key]["title"], data.arrays[f"path:{key}"], values)
+            for key, values in energies.items()})
 
 
 def _path_note(summary: dict[str, Any]) -> str:

@@ -19,6 +19,7 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, colours_of, linear_of
+from limber.scene.rods import add_rods
 from limber.stages.loading import load_found_skeleton, load_skeleton
 from limber.store import Branch
 
@@ -29,10 +30,8 @@ CLOUD_LIMIT = 2_000_000
 """Most points of a scan that are handed on; of more, evenly chosen ones."""
 
 
-def add_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
-               colours: str) -> None:
-    """Add a value at each vertex, with its scale and colours."""
-    scale = colour_scale(values, title, unit, colours)
+def add_scalar(data: SceneData, name: str, values: np.ndarray, scale: dict[str, Any]) -> None:
+    """Add a value at each vertex, and its colours by a scale."""
     data.info["scalars"][name] = scale
     data.arrays[f"scalar:{name}"] = np.asarray(values, float)
     data.arrays[f"color:{name}"] = colours_of(values, scale)
@@ -71,6 +70,17 @@ def add_skeleton(data: SceneData, branch: Branch) -> None:
                            + RADIUS_UNRESOLVED * (state == UNRESOLVED)
                            + BRIDGE * (state == BRIDGED)
                            + EDITED * _edited(branch, skeleton)).astype(np.int32)}
+
+
+def add_skeleton_rods(data: SceneData) -> None:
+    """Add the centreline as thick as it was found to be, coloured by its radius."""
+    if "skeleton" not in data.arrays:
+        return
+    parent, radius = data.arrays["skeleton_parent"], data.arrays["skeleton_radius"]
+    hung = np.flatnonzero(parent >= 0)
+    add_rods(data, "skeleton", "Radii of the skeleton", data.arrays["skeleton"],
+             np.column_stack([parent[hung], hung]), radius, radius,
+             colour_scale(radius, "radius of the skeleton", "m", "viridis"))
 
 
 def _edited(branch: Branch, skeleton: Skeleton) -> np.ndarray:

@@ -36,23 +36,29 @@ class SceneInputs(BranchInputs):
 class SceneSettings(Settings):
     """What a scene shows."""
 
-    groups: ClassVar[Groups] = {"picture": ("width", "sides", "color", "plan", "motion")}
+    groups: ClassVar[Groups] = {
+        "picture": ("width", "sides", "color", "plan", "motion", "strength")}
 
     width: int = Field(1120, ge=160, le=8192, description=(
         "Of the picture [pixels]; its height is three quarters of it."))
     sides: int = Field(48, ge=2, le=720, description="Of the turntable.")
-    color: Literal["young", "strain_energy", "strain", "stress", "det_f"] = Field(
-        "young", description="What the branch's colours mean; all but young: the worst of all "
-        "frames.")
+    color: Literal["young", "strain_energy", "strain", "stress", "stress_over_strength", "det_f",
+                   "residual"] = Field(
+        "young", description="What the branch's colours mean; all but young and residual (measured "
+        "to simulated): the worst of all frames.")
     plan: str | None = Field(None, description="Which path to show; without it the newest.")
     motion: str | None = Field(
         None, description="Which frames to play; without it the path's, else the newest.")
+    strength: float | None = Field(
+        None, gt=0, description=(
+            "Stress that breaks the wood (modulus of rupture) [Pa], over which stress is shown; "
+            "without it 0.6 % of Young's modulus, as green wood has it (0.5 to 0.7 %)."))
 
 
 def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | None = None,
           turntable: Path | None = None, width: int = 1120, sides: int = 48,
-          color: str = "young", plan: str | None = None,
-          motion: str | None = None, data_path: Path | None = None,
+          color: str = "young", plan: str | None = None, motion: str | None = None,
+          strength: float | None = None, data_path: Path | None = None,
           progress: Progress = SILENT) -> dict[str, Any]:
     """Make a Blender scene of a branch, or only what it shows, as arrays.
 
@@ -63,9 +69,11 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         turntable: A moving picture of it from ``sides`` sides, or None.
         width: Of the picture [pixels].
         color: What the branch's colours mean: ``young``, or the worst of all frames:
-            ``strain_energy``, ``strain``, ``stress``, ``det_f``.
+            ``strain_energy``, ``strain``, ``stress``, ``stress_over_strength``, ``det_f``; or
+            ``residual``.
         plan: Which path to show; default the newest.
         motion: Which frames to play; default the plan's, else the newest.
+        strength: Stress that breaks the wood [Pa]; assumed where it is not given.
         data_path: The .npz to write instead of ``output``.
 
     Raises:
@@ -81,7 +89,7 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
                          "One says what to make.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
     branch = Branch.open(branch_folder)
-    data = scene_data(branch, plan, motion, load_targets(branch))
+    data = scene_data(branch, plan, motion, load_targets(branch), strength)
     if color not in data.info["scalars"]:
         raise InputError(f"The branch has no {color} to show.",
                          f"It has: {', '.join(data.info['scalars'])}.",
@@ -146,8 +154,8 @@ def run(inputs: SceneInputs, settings: SceneSettings, _options: NoOptions,
     """Run the stage."""
     return scene(inputs.branch_folder, output=inputs.output, picture=inputs.render,
                  turntable=inputs.turntable, data_path=inputs.data, width=settings.width,
-                 sides=settings.sides, color=settings.color,
-                 plan=settings.plan, motion=settings.motion, progress=progress)
+                 sides=settings.sides, color=settings.color, plan=settings.plan,
+                 motion=settings.motion, strength=settings.strength, progress=progress)
 
 
 STAGE = StageDescription("scene", 120, run, SceneInputs, SceneSettings, NoOptions,
