@@ -1,4 +1,4 @@
-"""Runs the worker as a process: starts it, reads its progress, cancels it. No bpy here.
+"""Runs the worker as a process: queues it, reads its progress, cancels it. No bpy here.
 
 Threads only read the process's output into a queue; whoever owns the job calls :meth:`Job.poll`
 from Blender's main thread.
@@ -19,47 +19,76 @@ from typing import Any
 from .worker import worker_environment
 
 _GRACE_SECONDS = 8.0
+_SILENT_SECONDS = 20.0
+"""A worker says every two seconds that it is alive; so long without a word, and something is wrong.
+Starting takes a few seconds."""
+_IDLE_SECONDS = 30.0
+_LEAST_CPU_SECONDS = 0.05
+"""Of work within a beat; a sign of life itself takes some thousandths."""
+_KNOWN_SHARE, _KNOWN_SECONDS = 0.03, 3.0
+"""How much must be done before the rest can be foretold."""
 _POSIX = os.name == "posix"
 
 
 class JobState(enum.Enum):
     """Where a job is."""
 
+    WAITING = "waiting"
     RUNNING = "running"
     DONE = "done"
     FAILED = "failed"
     CANCELLED = "cancelled"
 
 
+class Life(enum.Enum):
+    """Whether a running worker works."""
+
+    WORKING = ""
+    IDLE = "It is alive, but has computed nothing for {:.0f} s: waiting, or hung"
+    SILENT = "No sign of life for {:.0f} s: it may hang"
+
+
 class Job:
-    """One command of the worker in a process of its own.
+    """One command of the worker in a process of its own, once it is its turn.
 
     Attributes:
         title: What the user reads.
+        folder: The branch folder that it works in or makes, if it is about one.
         fraction: Share done, 0 to 1.
         message: What the worker is at.
+        numbers: What it said beside that, by name.
         result: Its last JSON object, once it has ended.
         error: Why it failed, for the user; empty otherwise.
         log: The last lines of its standard error.
     """
 
-    def __init__(self, title: str, command: list[str]):
+    def __init__(self, title: str, command: list[str], folder: str = ""):
         self.title = title
         self.command = command
-        self.state = JobState.RUNNING
+        self.folder = folder
+        self.state = JobState.WAITING
         self.fraction = 0.0
-        self.message = "starting"
+        self.message = "waiting for its turn"
+        self.numbers: dict[str, Any] = {}
         self.result: dict[str, Any] = {}
         self.error = ""
         self.log: deque[str] = deque(maxlen=40)
         self._lines: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
         self._cancelled_at: float | None = None
+        self._started_at = self._heard_at = self._worked_at = 0.0
+        self._cpu_seconds = 0.0
+        self._process: subprocess.Popen | None = None
+
+    def launch(self) -> None:
+        """Start the process; OSError where the program cannot be started."""
         self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, encoding="utf-8", errors="replace",
             # Its input closes when Blender ends, however that comes; then it ends too.
             env=worker_environment() | {"LIMBER_PARENT_PIPE": "stdin"},
             start_new_session=_POSIX)
+        self.state, self.message = JobState.RUNNING, "starting"
+        self._started_at = self._heard_at = self._worked_at = time.monotonic()
         self._readers = [
             threading.Thread(target=self._read, args=(name, stream), daemon=True)
             for name, stream in (("out", self._process.stdout), ("err", self._process.stderr))]
@@ -72,6 +101,8 @@ class Job:
 
     def poll(self) -> JobState:
         """Take in what the worker has said since the last call; returns the state."""
+        if self.state is JobState.WAITING:
+            _advance()
         if self.state is not JobState.RUNNING:
             return self.state
         code = self._process.poll()
@@ -89,26 +120,57 @@ class Job:
 
     def wait(self) -> JobState:
         """Poll until the job has ended: for scripts and Blender without a window."""
-        while self.poll() is JobState.RUNNING:
+        while self.poll() in (JobState.WAITING, JobState.RUNNING):
             time.sleep(0.05)
         return self.state
 
+    def life(self) -> tuple[Life, float]:
+        """Return whether the worker works, and for how long it has not [s]."""
+        now = time.monotonic()
+        if now - self._heard_at > _SILENT_SECONDS:
+            return Life.SILENT, now - self._heard_at
+        if now - self._worked_at > _IDLE_SECONDS:
+            return Life.IDLE, now - self._worked_at
+        return Life.WORKING, 0.0
+
+    def elapsed(self) -> float:
+        """Return for how long it has run [s]."""
+        return time.monotonic() - self._started_at
+
+    def remaining(self) -> float | None:
+        """Return how long it will take if it goes on like this [s]; None while that is not known.
+        """
+        elapsed = self.elapsed()
+        if self.fraction < _KNOWN_SHARE or elapsed < _KNOWN_SECONDS:
+            return None
+        return elapsed * (1.0 - self.fraction) / self.fraction
+
     def cancel(self) -> None:
         """Ask the worker to stop; it keeps what was there before. Killed if it does not."""
-        if self.state is JobState.RUNNING and self._cancelled_at is None:
+        if self.state is JobState.WAITING:
+            self._give_up("")
+        elif self.state is JobState.RUNNING and self._cancelled_at is None:
             self._cancelled_at = time.monotonic()
             self.message = "stopping"
             self._signal(kill=False)
 
     def stop_now(self) -> None:
         """End the worker at once: Blender is closing."""
-        if self._process.poll() is None:
+        if self.state is JobState.WAITING:
+            self._give_up("")
+        elif self._process is not None and self._process.poll() is None:
             self._signal(kill=False)
             try:
                 self._process.wait(1.0)
             except subprocess.TimeoutExpired:
                 self._signal(kill=True)
                 self._process.wait(5.0)
+
+    def _give_up(self, why: str) -> None:
+        """It will not run any more."""
+        self.state, self.message = JobState.CANCELLED, why
+        if self in _waiting:
+            _waiting.remove(self)
 
     def _read(self, name: str, stream) -> None:
         # Closed at its end, whoever else has had it open.
@@ -119,14 +181,26 @@ class Job:
     def _take_lines(self) -> None:
         while not self._lines.empty():
             name, line = self._lines.get()
+            self._heard_at = time.monotonic()
             content = _json_object(line) if name == "out" else None
             if content is None:
                 self.log.append(line)
             elif _is_fraction(content.get("progress")):
-                self.fraction = float(content["progress"])
-                self.message = str(content.get("message", ""))
+                self._worked_at = self._heard_at
+                self.fraction = float(content.pop("progress"))
+                self.message = str(content.pop("message", ""))
+                self.numbers = content
+            elif "alive" in content:
+                self._take_beat(content.get("cpu_s"))
             elif "status" in content:
                 self.result = content
+
+    def _take_beat(self, cpu_seconds: Any) -> None:
+        if not isinstance(cpu_seconds, int | float):
+            return
+        if abs(cpu_seconds - self._cpu_seconds) > _LEAST_CPU_SECONDS:
+            self._worked_at = self._heard_at
+        self._cpu_seconds = float(cpu_seconds)
 
     def _finish(self, code: int) -> None:
         if code == 0:
@@ -138,6 +212,10 @@ class Job:
             said = [line for line in self.log if line.strip()]
             self.error = self.result.get("error") or (
                 f"The worker ended with exit code {code}. " + " ".join(said[-2:]))
+        if self.state is not JobState.DONE and self.folder:
+            # What was to go on from there has nothing to go on from.
+            for job in [job for job in _waiting if job.folder == self.folder]:
+                job._give_up(f"not run: {self.title} before it did not end well")
 
     def _signal(self, *, kill: bool) -> None:
         try:
@@ -166,6 +244,7 @@ def _json_object(line: str) -> dict[str, Any] | None:
 
 
 _last: list[Job] = []
+_waiting: list[Job] = []
 
 
 def current() -> Job | None:
@@ -173,11 +252,22 @@ def current() -> Job | None:
     return _last[0] if _last else None
 
 
+def waiting() -> list[Job]:
+    """Return the jobs that wait for their turn, in order."""
+    return list(_waiting)
+
+
 def is_running() -> bool:
     return bool(_last) and _last[0].state is JobState.RUNNING
 
 
-def start(title: str, command: list[str]) -> Job:
+def works_in(folder: str) -> bool:
+    """Whether a job that runs or waits is about a branch folder."""
+    jobs = _waiting + [job for job in _last if job.state is JobState.RUNNING]
+    return bool(folder) and any(job.folder == folder for job in jobs)
+
+
+def start(title: str, command: list[str], folder: str = "") -> Job:
     """Start ``command`` as the current job.
 
     Raises:
@@ -186,14 +276,45 @@ def start(title: str, command: list[str]) -> Job:
     """
     if is_running():
         raise RuntimeError(f"{_last[0].title} is still running; wait for it or cancel it.")
-    _last[:] = [Job(title, command)]
-    return _last[0]
+    job = Job(title, command, folder)
+    job.launch()
+    _last[:] = [job]
+    return job
+
+
+def add(title: str, command: list[str], folder: str = "", *, is_next: bool = False) -> Job:
+    """Start ``command``, or queue it: it starts when it is its turn and is polled.
+
+    Args:
+        is_next: Before all that wait.
+
+    Raises:
+        OSError: the program cannot be started.
+    """
+    if not is_running() and (is_next or not _waiting):
+        return start(title, command, folder)
+    job = Job(title, command, folder)
+    _waiting.insert(0 if is_next else len(_waiting), job)
+    return job
+
+
+def _advance() -> None:
+    """Start the first of those that wait, where nothing runs."""
+    if is_running() or not _waiting:
+        return
+    job = _waiting.pop(0)
+    _last[:] = [job]
+    try:
+        job.launch()
+    except OSError as error:
+        job.state, job.error = JobState.FAILED, str(error)
 
 
 def forget() -> None:
     """End the current job, if any, and forget it: the add-on goes away or Blender closes."""
-    for job in _last:
+    for job in (*_waiting, *_last):
         job.stop_now()
+    _waiting.clear()
     _last.clear()
 
 

@@ -23,6 +23,7 @@ class StepState(enum.Enum):
 
     NOT_RUN = ("not run yet", "RADIOBUT_OFF")
     RUNNING = ("running", "SORTTIME")
+    WAITING = ("waiting for its turn", "TIME")
     DONE = ("done", "CHECKMARK")
     STALE = ("out of date: what it read has changed", "FILE_REFRESH")
     CHANGED = ("out of date: its settings have changed", "FILE_REFRESH")

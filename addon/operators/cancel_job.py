@@ -11,12 +11,20 @@ class LIMBER_OT_cancel_job(bpy.types.Operator):
     bl_idname = "limber.cancel_job"
     bl_label = "Cancel"
 
+    waiting: bpy.props.IntProperty(
+        name="Waiting", default=-1, min=-1, options={"SKIP_SAVE"},
+        description="Which of those that wait is not to run, from 0; -1: what runs")
+
     @classmethod
     def poll(cls, context):
-        return jobs.is_running()
+        return jobs.is_running() or bool(jobs.waiting())
 
     def execute(self, context):
-        jobs.current().cancel()
+        queue = jobs.waiting()
+        if self.waiting >= len(queue) or (self.waiting < 0 and not jobs.is_running()):
+            self.report({"WARNING"}, "It has ended, or begun, by now.")
+            return {"CANCELLED"}
+        (jobs.current() if self.waiting < 0 else queue[self.waiting]).cancel()
         return {"FINISHED"}
 
 

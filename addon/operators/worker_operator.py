@@ -11,16 +11,20 @@ _INTERVAL_SECONDS = 0.1
 class WorkerOperator:
     """Mix-in: ``arguments`` says what to run, ``finish`` what to do with the result.
 
-    Called from a button it runs beside the interface; from a script or without a window it waits.
+    Called from a button it runs beside the interface, after what runs or waits already; from a
+    script or without a window it is waited for. ``folder`` is the branch folder that it is about;
+    ``is_next`` lets it run before all that waits.
     """
 
     title = "Working"
+    is_next = False
+    _is_beside = False
     _timer = None
     _job: jobs.Job | None = None
 
     @classmethod
     def poll(cls, context):
-        if jobs.is_running():
+        if jobs.is_running() and bpy.app.background:
             cls.poll_message_set("The worker is busy")
             return False
         return True
@@ -28,6 +32,10 @@ class WorkerOperator:
     def arguments(self, context: bpy.types.Context) -> list[str]:
         """Return the command and its arguments, without --json; ValueError says what is missing."""
         raise NotImplementedError
+
+    def folder(self, context: bpy.types.Context) -> str:
+        """Return the branch folder that it is about, absolute, after ``arguments``; or nothing."""
+        return ""
 
     def finish(self, context: bpy.types.Context, result: dict) -> None:
         """Use the worker's result; ValueError says why it cannot be used."""
@@ -42,6 +50,7 @@ class WorkerOperator:
     def invoke(self, context, event):
         if bpy.app.background or context.window is None:
             return self.execute(context)
+        self._is_beside = True
         if not self._start(context):
             return {"CANCELLED"}
         manager = context.window_manager
@@ -53,7 +62,7 @@ class WorkerOperator:
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         _redraw_sidebars(context)
-        if self._job.poll() is jobs.JobState.RUNNING:
+        if self._job.poll() in (jobs.JobState.WAITING, jobs.JobState.RUNNING):
             return {"PASS_THROUGH"}
         self._remove_timer(context)
         return self._end(context)
@@ -74,7 +83,9 @@ class WorkerOperator:
         try:
             stage, *rest = self.arguments(context)
             command = [*preferences.worker_command(), stage, "--json", "--progress", "json", *rest]
-            self._job = jobs.start(self.title, command)
+            folder = self.folder(context)
+            self._job = jobs.add(self.title, command, folder, is_next=self.is_next) if (
+                self._is_beside) else jobs.start(self.title, command, folder)
         except (ValueError, RuntimeError, OSError, WorkerNotFound) as error:
             self.report({"ERROR"}, str(error))
             return False
@@ -86,7 +97,7 @@ class WorkerOperator:
         for warning in job.result.get("warnings", []):
             self.report({"WARNING"}, warning)
         if job.state is jobs.JobState.CANCELLED:
-            self.report({"INFO"}, f"{self.title}: cancelled")
+            self.report({"INFO"}, f"{self.title}: {job.message or 'cancelled'}")
             return {"CANCELLED"}
         if job.state is jobs.JobState.FAILED:
             self.report({"ERROR"}, job.error)

@@ -7,28 +7,86 @@ import bpy
 from .. import jobs
 from .sidebar import SidebarPanel
 
+_LETTERS = 40
+_LOG_LINES = 12
+
 
 class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
     bl_idname = "LIMBER_PT_job"
     bl_label = "Worker"
-    bl_order = 0
+    bl_order = 1
 
     @classmethod
     def poll(cls, context):
-        return jobs.is_running() or (jobs.current() is not None and bool(jobs.current().error))
+        job = jobs.current()
+        return jobs.is_running() or bool(jobs.waiting()) or (job is not None and bool(job.error))
 
     def draw(self, context):
         job = jobs.current()
-        if job.state is jobs.JobState.RUNNING:
-            self.layout.label(text=job.title)
-            self.layout.progress(factor=job.fraction, text=f"{100 * job.fraction:.0f} %")
-            self.layout.label(text=job.message)
-            self.layout.operator("limber.cancel_job", icon="X")
-            return
-        column = self.layout.column(align=True)
-        column.label(text=f"{job.title} failed", icon="ERROR")
-        for line in textwrap.wrap(job.error, 40)[:12]:
-            column.label(text=line)
+        if job is not None and job.state is jobs.JobState.RUNNING:
+            _draw_running(self.layout, job)
+        elif job is not None and job.error:
+            column = self.layout.column(align=True)
+            column.label(text=f"{job.title} failed", icon="ERROR")
+            for line in textwrap.wrap(job.error, _LETTERS)[:12]:
+                column.label(text=line)
+        if job is not None:
+            _draw_log(self.layout, job)
+        for number, waiting in enumerate(jobs.waiting()):
+            row = self.layout.row()
+            row.label(text=f"Then: {waiting.title}", icon="TIME")
+            row.operator("limber.cancel_job", text="", icon="X").waiting = number
+
+
+def _draw_running(layout: bpy.types.UILayout, job: jobs.Job) -> None:
+    layout.label(text=job.title)
+    layout.progress(factor=job.fraction, text=f"{100 * job.fraction:.0f} %")
+    column = layout.column(align=True)
+    column.label(text=job.message)
+    column.label(text=time_words(job))
+    for line in number_lines(job.numbers):
+        column.label(text=line)
+    life, seconds = job.life()
+    if life is not jobs.Life.WORKING:
+        for number, line in enumerate(textwrap.wrap(life.value.format(seconds), _LETTERS)):
+            column.label(text=line, icon="BLANK1" if number else "ERROR")
+    layout.operator("limber.cancel_job", icon="X")
+
+
+def _draw_log(layout: bpy.types.UILayout, job: jobs.Job) -> None:
+    said = [line for line in job.log if line.strip()][-_LOG_LINES:]
+    if not said:
+        return
+    header, body = layout.panel("limber_job_log", default_closed=True)
+    header.label(text="Log")
+    if body is not None:
+        column = body.column(align=True)
+        for line in said:
+            for part in textwrap.wrap(line, 2 * _LETTERS)[:3]:
+                column.label(text=part)
+
+
+def time_words(job: jobs.Job) -> str:
+    """Return for how long a job has run, and how long it will still take if that is known."""
+    words = f"{_span(job.elapsed())} so far"
+    remaining = job.remaining()
+    return words if remaining is None else f"{words}, about {_span(remaining)} left"
+
+
+def _span(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def number_lines(numbers: dict) -> list[str]:
+    """Return what a worker says beside its progress, in words: the loss and E of a fit."""
+    lines = []
+    if isinstance(numbers.get("best_m2"), int | float):
+        lines.append(f"Loss {numbers['best_m2']:.3g} m² at best")
+    if isinstance(numbers.get("young_mpa"), str):
+        lines.append(f"E {numbers['young_mpa']} MPa"[:_LETTERS + 8])
+    return lines
 
 
 def register() -> None:

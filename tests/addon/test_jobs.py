@@ -115,6 +115,59 @@ def test_stubborn_worker_is_killed_with_its_children(jobs, tmp_path, monkeypatch
     assert not _alive(child)
 
 
+def test_jobs_wait_for_their_turn(jobs, tmp_path):
+    """One after the other, in order; one that is taken out is not run."""
+    log = tmp_path / "log.txt"
+    command = {name: _worker(tmp_path, f"""
+        open({str(log)!r}, "a").write(sys.argv[1])
+        time.sleep(0.1)
+        """) + [name] for name in "abcd"}
+    queue = [jobs.add(name, command[name], "folder") for name in "abc"]
+    assert [job.state.value for job in queue] == ["running", "waiting", "waiting"]
+    first = jobs.add("d", command["d"], is_next=True)
+    assert jobs.waiting() == [first, queue[1], queue[2]]
+    assert jobs.works_in("folder") and not jobs.works_in("another")
+    queue[1].cancel()
+    for job in (queue[0], first, queue[2]):
+        assert job.wait() is jobs.JobState.DONE, job.error
+    assert log.read_text() == "adc"
+    assert queue[1].state is jobs.JobState.CANCELLED and not jobs.waiting()
+
+
+def test_what_follows_a_failure_is_not_run(jobs, tmp_path):
+    """A plan has nothing to go on from where the energy failed; another branch's goes on."""
+    failing = jobs.add("Sample", _worker(tmp_path, "sys.exit(3)"), "a.branch")
+    plan = jobs.add("Plan", [sys.executable, "-c", ""], "a.branch")
+    other = jobs.add("Report", [sys.executable, "-c", ""], "b.branch")
+    assert failing.wait() is jobs.JobState.FAILED
+    assert plan.poll() is jobs.JobState.CANCELLED and "Sample" in plan.message
+    assert other.wait() is jobs.JobState.DONE
+
+
+def test_a_worker_that_hangs_is_told_from_one_that_works(jobs, tmp_path, monkeypatch):
+    """Signs of life with work, without work, and none; what remains by what was done."""
+    monkeypatch.setattr(jobs, "_SILENT_SECONDS", 1.0)
+    monkeypatch.setattr(jobs, "_IDLE_SECONDS", 0.4)
+    monkeypatch.setattr(jobs, "_KNOWN_SECONDS", 0.0)
+    job = jobs.start("Trying", _worker(tmp_path, """
+        say(progress=0.25, best_m2=1e-6)
+        for number in range(8):
+            time.sleep(0.1)
+            say(alive=number, cpu_s=10.0 * number)
+        for number in range(8):
+            time.sleep(0.1)
+            say(alive=number, cpu_s=70.001)
+        time.sleep(60)
+        """))
+    _poll_until(job, lambda: job._cpu_seconds > 60)
+    assert job.life() == (jobs.Life.WORKING, 0.0)
+    assert job.remaining() == pytest.approx(3 * job.elapsed(), rel=0.05)
+    assert job.numbers["best_m2"] == 1e-6
+    _poll_until(job, lambda: job.life()[0] is jobs.Life.IDLE)
+    _poll_until(job, lambda: job.life()[0] is jobs.Life.SILENT)
+    assert job.life()[1] > 1.0
+
+
 def test_forget_ends_the_worker(jobs, tmp_path):
     """When the add-on goes away its worker goes too."""
     job = jobs.start("Trying", _worker(tmp_path, "say(progress=0.1)\ntime.sleep(60)"))
