@@ -28,7 +28,7 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class BranchRecord:
-    """What a branch folder holds: stages by key, and its scan's sha256.
+    """What a branch folder holds: stages by key, its scan's sha256, and its own number.
 
     ``files`` has, by name, each file's sha256 and the key of the stage that wrote it.
     """
@@ -37,6 +37,7 @@ class BranchRecord:
     stages: dict[str, StageRecord]
     files: dict[str, tuple[str, str]]
     scan_sha256: str
+    uuid: str = ""
 
     def of(self, stage: Stage, values: Mapping[str, Any]) -> StageRecord | None:
         """Return what is known of a stage that would be run with these values."""
@@ -82,7 +83,8 @@ def _read(path: Path, _changed: int, _size: int) -> BranchRecord | None:
         files = {name: (entry["sha256"], entry["stage"])
                  for name, entry in content["files"].items()}
         return BranchRecord(str(content["name"]), stages, files,
-                            str(content.get("source", {}).get("sha256", "")))
+                            str(content.get("source", {}).get("sha256", "")),
+                            str(content.get("uuid") or ""))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
 

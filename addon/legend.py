@@ -3,8 +3,9 @@
 import bpy
 from mathutils import Vector
 
+from .branches import ShownBranch, add_object
 from .bridge import materials, meshes
-from .scene import COLORS, ShownBranch, add_object
+from .scene import COLORS
 from .scene_data import SceneData
 
 # In picture heights.

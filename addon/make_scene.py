@@ -121,10 +121,14 @@ def _render_round(scene: bpy.types.Scene, folder: Path, sides: int) -> None:
 
 def _look_through_camera() -> None:
     """Let every 3D view of the file open on the branch, in its colours."""
+    layout = bpy.data.workspaces.get("Layout")
+    if layout is not None:
+        layout.name = "Limber"
     for screen in bpy.data.screens:
         for area in screen.areas:
             if area.type == "VIEW_3D":
                 space = area.spaces.active
+                space.show_region_ui = True
                 space.region_3d.view_perspective = "CAMERA"
                 space.shading.color_type = "VERTEX"
 

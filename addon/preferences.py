@@ -1,6 +1,8 @@
 """The add-on's preferences: which Python has the worker."""
 
+import json
 import sys
+import textwrap
 import time
 
 import bpy
@@ -24,13 +26,18 @@ class LimberPreferences(bpy.types.AddonPreferences):
                     ".venv/bin/python of a checkout. Empty: LIMBER_PYTHON, then what the "
                     "extension brought along, then `limber` on the PATH")
     worker_status: bpy.props.StringProperty(options={"SKIP_SAVE"})
+    worker_parts: bpy.props.StringProperty(options={"SKIP_SAVE"})
 
     def draw(self, context):
         layout = self.layout
         layout.prop(self, "python_path")
         layout.operator("limber.check_worker", icon="CHECKMARK")
-        for line in self.worker_status.splitlines():
+        if not has_worker():
+            for number, line in enumerate(textwrap.wrap(worker_trouble(), 90)):
+                layout.label(text=line, icon="BLANK1" if number else "ERROR")
+        for line in self.worker_status.splitlines()[:1]:
             layout.label(text=line)
+        draw_parts(layout, self.worker_parts)
         column = layout.column(align=True)
         column.label(text="The worker computes everything.", icon="INFO")
         brought = "brought it along" if worker.bundled_command() else "came without it"
@@ -62,6 +69,37 @@ def has_worker() -> bool:
         except worker.WorkerNotFound:
             _looked["found"] = False
     return bool(_looked["found"])
+
+
+def worker_trouble() -> str:
+    """Return why there is no worker and what to do, or nothing."""
+    try:
+        worker_command()
+    except worker.WorkerNotFound as error:
+        return str(error)
+    return ""
+
+
+def draw_parts(layout: bpy.types.UILayout, parts: str) -> None:
+    """Draw what the worker has and lacks: part, version, or what does not work without it.
+
+    Args:
+        parts: JSON; by name a version, or ``missing: `` and what then does not work.
+    """
+    try:
+        known = json.loads(parts or "{}")
+    except ValueError:
+        return
+    column = layout.column(align=True)
+    # What is missing first.
+    for name, told in sorted(known.items(), key=lambda part: not _lacks(part[1])):
+        row = column.split(factor=0.25)
+        row.label(text=name, icon="ERROR" if _lacks(told) else "CHECKMARK")
+        row.label(text=told)
+
+
+def _lacks(told: str) -> bool:
+    return told.startswith("missing")
 
 
 def register() -> None:

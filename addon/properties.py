@@ -6,8 +6,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from . import compat
-from .scene import SCAN_KEY
+from . import branches, compat
+from .overlays import graph as viewport_graph
 from .stages import Field, SettingError, Stage, rows_of, stages
 
 OPEN = "use_"
@@ -30,8 +30,20 @@ def _set_fruit_mass(settings: bpy.types.PropertyGroup, _context) -> None:
 
 def _show_scan(settings: bpy.types.PropertyGroup, _context) -> None:
     for thing in settings.id_data.objects:
-        if SCAN_KEY in thing:
+        if branches.SCAN_KEY in thing:
             thing.hide_viewport = not settings.show_scan
+
+
+def _color_again(settings: bpy.types.PropertyGroup, _context) -> None:
+    """Show what the branch is coloured by in the other way."""
+    surface = branches.find_surface(settings.id_data)
+    if surface is None:
+        return
+    name = surface.get(branches.FRAME_SCALAR_KEY)
+    if name is None and (active := surface.data.color_attributes.active_color) is not None:
+        name = active.name.removesuffix("_color")
+    if name in (branches.info_of(surface).get("frame_scalars") or {}):
+        bpy.ops.limber.color_by(scalar=name, each_frame=settings.each_frame)
 
 
 class LimberSettings(bpy.types.PropertyGroup):
@@ -51,6 +63,13 @@ class LimberSettings(bpy.types.PropertyGroup):
         description="Show imported scans; they lie over the branch that was made of them")
     show_legend: bpy.props.BoolProperty(
         name="Legend", default=True, description="Write in the 3D view what the colours mean")
+    each_frame: bpy.props.BoolProperty(
+        name="Colours follow the motion", default=True, update=_color_again,
+        description="Colour by the value in the frame in sight; else by the worst of all frames")
+    graph: bpy.props.EnumProperty(
+        name="Graph", description="Drawn in the lower right corner of the 3D view",
+        items=[(viewport_graph.NONE, "No graph", ""),
+               *((name, title, "") for name, title in viewport_graph.GRAPHS.items())])
     show_expert: bpy.props.BoolProperty(
         name="Expert settings", description="Show also the settings that few need")
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from .branches import FOLDER_KEY
 from .bridge import animation
-from .scene import FOLDER_KEY
 
 
 @persistent

@@ -20,11 +20,13 @@ class Scan:
         points: In its own unit, ``offset`` taken off, float32, shape [n, 3].
         offset: Whole numbers [3]: map coordinates would lose their last digits in a viewport.
         colours: Red, green, blue, alpha from 0 to 1 as on a screen, float32, [n, 4], if it has any.
+        extent: Its longest side, in its own unit.
         sha256: Of the file. folder: The branch folder that is, or would be, its own.
     """
 
     points: np.ndarray
     offset: np.ndarray
+    extent: float
     sha256: str
     folder: Path
     colours: np.ndarray | None = None
@@ -40,7 +42,8 @@ def read_scan(path: Path) -> Scan:
     colours = clouds.read_colours(path)
     if colours is not None:
         colours = np.column_stack([colours / np.float32(255), np.ones(len(colours), np.float32)])
-    return Scan((points - offset).astype(np.float32), offset, branch_folder.file_sha256(path),
+    return Scan((points - offset).astype(np.float32), offset, float((high - low).max()),
+                branch_folder.file_sha256(path),
                 branch_folder.folder_for(path), colours)
 
 

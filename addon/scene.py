@@ -2,26 +2,31 @@
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
+from . import annotations
+from .branches import (
+    ENERGY_KEY,
+    FOLDER_KEY,
+    FRAME_SCALAR_KEY,
+    GRASP_KEY,
+    INFO_KEY,
+    NAME_KEY,
+    OFFSET_KEY,
+    SCAN_KEY,
+    SHOWS_KEY,
+    UUID_KEY,
+    ShownBranch,
+    add_object,
+)
 from .bridge import animation, curves, materials, meshes, skeletons
 from .scene_data import SceneData
 from .skeleton_edits import Skeleton
-
-FOLDER_KEY = "limber_folder"
-SCAN_KEY = "limber_scan_sha256"
-NAME_KEY = "limber_name"
-INFO_KEY = "limber_info"
-ENERGY_KEY = "limber_energy_j"
-GRASP_KEY = "limber_grasp_m"
-"""Of the marked grasp: its place on the branch as it was scanned, and its radius."""
-OFFSET_KEY = "limber_map_offset"
-"""The branch's origin in the scan's coordinates, in double precision: a viewport has single."""
 
 # Linear colours. Those of the marks stand apart from the colour map of the branch.
 COLORS = {
@@ -35,16 +40,6 @@ COLORS = {
     "rest": (0.22, 0.22, 0.22),
     "robot": (0.32, 0.40, 0.48),
 }
-
-
-@dataclass
-class ShownBranch:
-    """What :func:`show_branch` made: the objects by what they show."""
-
-    collection: bpy.types.Collection
-    surface: bpy.types.Object
-    objects: dict[str, list[bpy.types.Object]] = field(default_factory=dict)
-    frame_count: int = 1
 
 
 def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = None,
@@ -62,7 +57,7 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     if bpy.context.mode != "OBJECT":
         # What is being edited may be what is shown anew.
         bpy.ops.object.mode_set(mode="OBJECT")
-    before = _remove_shown(scene, data.info["name"], data.folder)
+    before = _remove_shown(scene, data)
     shown = _new_branch(scene, data, scalar)
     _add_paths(shown, data)
     _add_trees(shown, data)
@@ -70,16 +65,15 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
     _add_points(shown, data)
     _add_goal(shown, data)
     _add_base(shown, data)
+    annotations.add_rods(shown, data)
+    annotations.add_hemisphere(shown, data)
     _add_motion(scene, shown, data)
+    for kind, things in shown.objects.items():
+        for thing in things:
+            thing[SHOWS_KEY] = kind
+            thing.delta_location = before.place
+    shown.surface.delta_location = before.place
     return shown
-
-
-def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the surface of the branch last opened in ``scene``, if there is one."""
-    for collection in reversed(scene.collection.children_recursive):
-        if FOLDER_KEY in collection:
-            return next((thing for thing in collection.objects if INFO_KEY in thing), None)
-    return None
 
 
 def place_scans(scene: bpy.types.Scene, data: SceneData) -> int:
@@ -112,25 +106,18 @@ def color_by(surface: bpy.types.Object, name: str) -> None:
         stops=scale["stops"])
     surface.data.materials.clear()
     surface.data.materials.append(material)
+    if FRAME_SCALAR_KEY in surface:
+        del surface[FRAME_SCALAR_KEY]
     color = f"{name}_color"
     surface.data.color_attributes.active_color = surface.data.color_attributes[color]
-
-
-def add_object(collection: bpy.types.Collection, name: str, data: bpy.types.ID,
-               material: bpy.types.Material | None = None) -> bpy.types.Object:
-    """Make an object of ``data`` in ``collection``."""
-    thing = bpy.data.objects.new(name, data)
-    collection.objects.link(thing)
-    if material is not None:
-        data.materials.clear()
-        data.materials.append(material)
-    return thing
 
 
 def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> ShownBranch:
     name = data.info["name"]
     collection = bpy.data.collections.new(name)
     collection[FOLDER_KEY], collection[NAME_KEY] = animation.shown_path(data.folder), name
+    if data.info.get("uuid"):
+        collection[UUID_KEY] = str(data.info["uuid"])
     scene.collection.children.link(collection)
     mesh = meshes.new_mesh(name, data.arrays["vertices"], data.arrays["faces"])
     surface = add_object(collection, name, mesh)
@@ -152,28 +139,40 @@ def _new_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None) -> 
 
 @dataclass
 class _Before:
-    """What stays of a branch that is shown anew: its skeleton where edits are not applied yet."""
+    """What stays of a branch that is shown anew: its skeleton where edits are not applied yet, and
+    where it was put beside others [m]."""
 
     edited: bpy.types.Mesh | None = None
     has_skeleton_in_sight: bool = False
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def _remove_shown(scene: bpy.types.Scene, name: str, folder: Path) -> _Before:
+def _remove_shown(scene: bpy.types.Scene, data: SceneData) -> _Before:
     """Remove what was shown of this branch before, also when its folder has moved since."""
     found = _Before()
     for collection in list(scene.collection.children):
-        if FOLDER_KEY not in collection:
+        if FOLDER_KEY not in collection or not _is_same(collection, data):
             continue
-        before = Path(bpy.path.abspath(collection[FOLDER_KEY])).resolve()
-        if before == folder.resolve() or (collection[NAME_KEY] == name and not before.is_dir()):
-            for thing in list(collection.objects):
-                mesh = thing.data if thing.type == "MESH" else None
-                if mesh is not None and skeletons.NODES_KEY in mesh:
-                    found.has_skeleton_in_sight = not thing.hide_viewport
-                    found.edited = mesh if skeletons.is_edited(thing) else None
-                bpy.data.objects.remove(thing)
-            bpy.data.collections.remove(collection)
+        for thing in list(collection.objects):
+            mesh = thing.data if thing.type == "MESH" else None
+            if INFO_KEY in thing:
+                found.place = tuple(thing.delta_location)
+            if mesh is not None and skeletons.NODES_KEY in mesh:
+                found.has_skeleton_in_sight = not thing.hide_viewport
+                found.edited = mesh if skeletons.is_edited(thing) else None
+            bpy.data.objects.remove(thing)
+        bpy.data.collections.remove(collection)
     return found
+
+
+def _is_same(collection: bpy.types.Collection, data: SceneData) -> bool:
+    """Whether a collection shows the branch: its folder, or one that was there before it moved."""
+    before = Path(bpy.path.abspath(collection[FOLDER_KEY])).resolve()
+    if before == data.folder.resolve():
+        return True
+    same = (collection[UUID_KEY] == data.info.get("uuid") if UUID_KEY in collection
+            else collection[NAME_KEY] == data.info["name"])
+    return same and not before.is_dir()
 
 
 def _add_paths(shown: ShownBranch, data: SceneData) -> None:
@@ -183,9 +182,10 @@ def _add_paths(shown: ShownBranch, data: SceneData) -> None:
         if name not in data.arrays:
             continue
         title = data.info["paths"][key]["title"]
-        curve = curves.new_polyline(title, data.arrays[name], share * data.info["size_m"])
+        tube = curves.new_tube(title, data.arrays[name], share * data.info["size_m"])
+        meshes.set_one_color(tube, COLORS[name])
         material = materials.plain_material(title, COLORS[name], roughness=0.4)
-        shown.objects[name] = [add_object(shown.collection, f"{title} path", curve, material)]
+        shown.objects[name] = [add_object(shown.collection, f"{title} path", tube, material)]
 
 
 def _add_trees(shown: ShownBranch, data: SceneData) -> None:
@@ -229,23 +229,6 @@ def _add_skeleton(shown: ShownBranch, data: SceneData, before: _Before) -> None:
     thing.hide_render = True
     thing.show_in_front = True
     shown.objects["skeleton"] = [thing]
-
-
-def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the skeleton of the branch last opened in ``scene``, if it has one."""
-    surface = find_surface(scene)
-    return None if surface is None else next(
-        (thing for thing in surface.users_collection[0].objects
-         if thing.type == "MESH" and skeletons.NODES_KEY in thing.data), None)
-
-
-def put_skeleton_back(thing: bpy.types.Object) -> None:
-    """Give a skeleton its nodes as the worker gave them."""
-    before = thing.data
-    if thing.mode == "EDIT":
-        bpy.ops.object.mode_set(mode="OBJECT")
-    thing.data = skeletons.as_it_was(before)
-    bpy.data.meshes.remove(before)
 
 
 def _add_points(shown: ShownBranch, data: SceneData) -> None:
@@ -318,6 +301,20 @@ def _add_robot(shown: ShownBranch, data: SceneData, speed: float) -> None:
         shown.objects["robot"].append(thing)
 
 
+def own_speed(scene: bpy.types.Scene, frames: dict) -> float:
+    """Return how many frames of a motion a frame of the scene goes on, in its own time.
+
+    It keeps that in the user's frame rate; a path has none, and plays pose by pose.
+    """
+    return frames["rate_hz"] * scene.render.fps_base / scene.render.fps if (
+        frames["is_timed"]) else 1.0
+
+
+def last_frame(first: int, count: int, speed: float) -> int:
+    """Return the scene's frame in which the last of ``count`` frames is shown."""
+    return max(first, first + math.ceil((count - 1) / speed - 1e-6))
+
+
 def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> None:
     frames = data.info.get("frames")
     if not frames:
@@ -328,13 +325,11 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
     # In the viewport, lines: the moving branch stays in sight.
     ghost.display_type = "WIRE"
     shown.objects["rest"] = [ghost]
-    # A motion keeps its own time in the user's frame rate; a path has none, and plays pose by pose.
-    speed = frames["rate_hz"] * scene.render.fps_base / scene.render.fps if (
-        frames["is_timed"]) else 1.0
+    speed = own_speed(scene, frames)
     header = animation.attach_cache(shown.surface, data.folder / frames["file"], speed=speed)
     shown.frame_count = header.frame_count
     scene.frame_start = 1
-    scene.frame_end = max(1, 1 + math.ceil((header.frame_count - 1) / speed - 1e-6))
+    scene.frame_end = last_frame(1, header.frame_count, speed)
     if "grasp_motion" in data.arrays and "grasp" in shown.objects:
         animation.move_along(shown.objects["grasp"][0], data.arrays["grasp_motion"], speed=speed)
     for name in ("control_points", "targets"):

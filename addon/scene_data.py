@@ -20,10 +20,11 @@ _MOST_ARRAYS = 500
 
 # Dimensions by letter: v vertices, f faces, c points of the cloud, n skeleton nodes, k control
 # points, t targets, s frames, o observations, m observed points, g gripper poses, w points to be
-# seen, p points of a path (each path has its own), q nodes of a search tree (likewise). i: whole
-# numbers, b: truth values, r: real.
+# seen, p points of a path (each path has its own), q nodes of a search tree, u vertices and x
+# faces of rods (likewise), y colours of a palette. i: whole numbers, b: truth values, r: real.
 _SHAPES = {
     "vertices": "v3 r", "faces": "f3 i", "scalar": "v r", "color": "v4 r", "frame_scalar": "sv r",
+    "frame_level": "sv i", "palette": "y4 r",
     "frame_times": "s r", "frame_energy": "s r", "frame_kinetic_energy": "s r",
     "frame_min_det_f": "s r", "frame_strain": "s r", "frame_bounds": "23 r",
     "cloud": "c3 r", "cloud_color": "c4 r",
@@ -37,6 +38,7 @@ _SHAPES = {
     "path_strain": "p r", "path_color": "p4 r", "tree": "q3 r", "tree_parent": "q i",
     "observation": "om3 r", "observation_visible": "om b", "observation_times": "o r",
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
+    "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
     "robot_links": "s83 r", "robot_radius": "1 r",
     "view_points": "w3 r", "view_direction": "3 r"}
 _NEEDED = ("vertices", "faces", "view_points", "view_direction")
@@ -117,7 +119,28 @@ def _info_trouble(info: dict[str, Any]) -> str:
             return f"its {name} is missing"
     if np.shape(info["alignment"]) != (4, 4):
         return "its alignment is no matrix"
-    return ""
+    return next((f"its graph {name} is none" for name, graph in (info.get("graphs") or {}).items()
+                 if not _is_graph(graph)), "")
+
+
+def _is_graph(graph: Any) -> bool:
+    """Whether a graph is what can be drawn: places as shares of a frame, words at ticks."""
+    try:
+        rows = [row for line in graph["lines"] for row in line["points"]]
+        bands = [row for band in graph["bands"] for row in band["rows"]]
+        ticks = [tick for axis in ("x", "y") for tick in graph[axis]["ticks"]]
+        colours = [part["color"] for part in (*graph["lines"], *graph["bands"])]
+        words = [graph["title"], graph["x"]["title"], graph["y"]["title"],
+                 *(part["label"] for part in (*graph["lines"], *graph["bands"])),
+                 *(text for _, text in ticks)]
+        numbers = [np.array(rows, float).reshape(-1, 2), np.array(bands, float).reshape(-1, 3),
+                   np.array(colours, float).reshape(-1, 3),
+                   np.array([share for share, _ in ticks], float),
+                   np.array(graph.get("cursor") or (), float).reshape(-1)]
+    except (KeyError, TypeError, ValueError):
+        return False
+    return all(isinstance(text, str) for text in words) and all(
+        np.isfinite(part).all() for part in numbers)
 
 
 def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
@@ -134,7 +157,7 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
         if kind not in _SHAPES:
             continue
         wanted, number = _SHAPES[kind].split()
-        letters = [f"{letter}:{key}" if letter in "pq" else letter
+        letters = [f"{letter}:{key}" if letter in "pqux" else letter
                    for letter in re.findall(r"\d|[a-z]", wanted)]
         fits = len(letters) == array.ndim and all(
             count == (int(letter) if letter.isdigit() else sizes.setdefault(letter, count))
@@ -145,9 +168,12 @@ def _arrays_trouble(arrays: dict[str, np.ndarray]) -> str:
             return f"{name} holds {array.dtype}"
         if number == "r" and not np.isfinite(array).all():
             return f"{name} holds values that are not finite"
-    faces, count = arrays["faces"], len(arrays["vertices"])
-    if len(faces) and (faces.min() < 0 or faces.max() >= count):
-        return f"faces do not index {count} vertices"
+    surfaces = [("faces", "vertices")] + [(name, name.replace("rod_faces", "rods", 1))
+                                          for name in arrays if name.startswith("rod_faces:")]
+    for name, vertices in surfaces:
+        faces, count = arrays[name], len(arrays.get(vertices, ()))
+        if len(faces) and (faces.min() < 0 or faces.max() >= count):
+            return f"{name} do not index {count} vertices"
     for name, parents in arrays.items():
         if name.partition(":")[0] in ("skeleton_parent", "tree_parent") and len(parents) and (
                 parents.min() < -1 or (parents >= np.arange(len(parents))).any()):
@@ -162,6 +188,8 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     wanted += [f"{kind}:{name}" for name in info.get("trees") or {}
                for kind in ("tree", "tree_parent")]
     wanted += [f"frame_scalar:{name}" for name in info.get("frame_scalars") or {}]
+    wanted += [f"{kind}:{name}" for name in info.get("rods") or {}
+               for kind in ("rods", "rod_faces", "rod_color")]
     if len(arrays.get("targets", ())) != len(info.get("targets") or ()):
         return "the targets do not fit their names"
     for name in ("grasp", "control_points", "targets"):

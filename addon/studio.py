@@ -7,8 +7,8 @@ import numpy as np
 from mathutils import Vector
 
 from . import compat
+from .branches import add_object
 from .bridge import materials, meshes
-from .scene import add_object
 from .scene_data import SceneData
 
 # Share of the picture's width that is kept free on the left, for the legend.

@@ -5,12 +5,15 @@ so the file is looked at here first.
 """
 
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
 from mathutils import Vector
+
+from .. import compat
 
 _HEADER = struct.Struct("<12siiffi")
 MODIFIER = "Limber motion"
@@ -141,6 +144,30 @@ def move_between(target: bpy.types.Object, starts: np.ndarray, ends: np.ndarray,
             target.keyframe_insert(channel, frame=frame_start + number / speed)
     if poses:
         target.location, target.rotation_quaternion = poses[0]
+
+
+def retime(things: Iterable[bpy.types.Object], moved: bpy.types.Object, frame_start: float,
+           speed: float) -> None:
+    """Let the motion of ``moved``, and what is keyed along with it, start and run otherwise.
+
+    Args:
+        things: What was keyed by :func:`move_along` and :func:`move_between` with ``moved``.
+        moved: What the cache moves.
+        frame_start: The motion's first frame in the scene.
+        speed: Frames of the file a frame of the scene.
+    """
+    modifier = moved.modifiers[MODIFIER]
+    # The modifier has the start scaled.
+    before, start = modifier.frame_scale, modifier.frame_start / modifier.frame_scale
+    modifier.frame_scale, modifier.frame_start = speed, speed * frame_start
+    for thing in things:
+        for curve in compat.fcurves_of(thing):
+            places = np.empty(2 * len(curve.keyframe_points), np.float32)
+            for handle in ("co", "handle_left", "handle_right"):
+                curve.keyframe_points.foreach_get(handle, places)
+                places[::2] = frame_start + (places[::2] - start) * (before / speed)
+                curve.keyframe_points.foreach_set(handle, places)
+            curve.update()
 
 
 def cache_frame(target: bpy.types.Object, frame: float) -> float:

@@ -18,6 +18,17 @@ def plain_material(name: str, color: tuple[float, float, float], *, alpha: float
     return material
 
 
+def vertex_color_material(name: str, attribute: str) -> bpy.types.Material:
+    """Make a material that shows the colours of attribute ``attribute`` of the mesh."""
+    material, shader = _new(name)
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    color = nodes.new("ShaderNodeAttribute")
+    color.attribute_name = attribute
+    links.new(color.outputs["Color"], shader.inputs["Base Color"])
+    shader.inputs["Roughness"].default_value = 0.5
+    return material
+
+
 def flat_material(name: str, color: tuple[float, float, float]) -> bpy.types.Material:
     """Make a material that shows its linear colour whatever the light: for a legend."""
     material, shader = _new(name)

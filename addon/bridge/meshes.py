@@ -130,6 +130,15 @@ def new_sphere(name: str, radius: float) -> bpy.types.Mesh:
         mesh, u_segments=32, v_segments=16, radius=radius))
 
 
+def new_half_ball(name: str, radius: float) -> bpy.types.Mesh:
+    """Make the upper half of a sphere of ``radius`` [m] about the origin, open below."""
+    def make(builder: bmesh.types.BMesh) -> None:
+        bmesh.ops.create_uvsphere(builder, u_segments=24, v_segments=12, radius=radius)
+        below = [vertex for vertex in builder.verts if vertex.co.z < -1e-6 * radius]
+        bmesh.ops.delete(builder, geom=below, context="VERTS")
+    return _primitive(name, make)
+
+
 def new_cylinder(name: str, radius: float, height: float) -> bpy.types.Mesh:
     """Make a cylinder of ``radius`` and ``height`` [m] about the origin, along z."""
     return _primitive(name, lambda mesh: bmesh.ops.create_cone(

@@ -1,5 +1,7 @@
 """Ask the worker what it is and what it lacks."""
 
+import json
+
 import bpy
 
 from .. import preferences
@@ -12,6 +14,7 @@ class LIMBER_OT_check_worker(WorkerOperator, bpy.types.Operator):
     bl_idname = "limber.check_worker"
     bl_label = "Check the Worker"
     title = "Checking the worker"
+    is_next = True
 
     def arguments(self, context):
         return ["doctor"]
@@ -22,6 +25,7 @@ class LIMBER_OT_check_worker(WorkerOperator, bpy.types.Operator):
         chosen = preferences.get(context)
         if chosen is not None:
             chosen.worker_status = status
+            chosen.worker_parts = json.dumps(result.get("packages", {}))
         self.report({"INFO"}, status.replace("\n", ". "))
 
 

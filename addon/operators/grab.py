@@ -11,7 +11,7 @@ import bpy
 from bpy_extras import view3d_utils
 from mathutils import Vector
 
-from .. import preferences, properties, scene
+from .. import branches, preferences, properties
 from ..bridge import animation, meshes
 from ..session import HeldFrame, Session
 from ..stages import stages
@@ -20,7 +20,9 @@ from . import live_loads
 from .live_loads import LiveLoads
 from .needs_result import NeedsBranchInObjectMode
 
-_INTERVAL_SECONDS = 1 / 60
+_INTERVAL_SECONDS = 1 / 120
+"""Between two looks for a frame: the session makes up to 60 a second, and half of this is how long
+one waits on average before it is seen."""
 _KEYS = ("Drag: bend | F: hang a fruit | C: cut here | Enter: keep for a simulation | "
          "S, G: keep as the plan's start, goal | Esc: let go and leave")
 _PLACED = {"F": "fruit", "C": "cut"}
@@ -88,8 +90,9 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
     def invoke(self, context, event):
         if context.area is None or context.area.type != "VIEW_3D" or bpy.app.background:
             return self.execute(context)
-        self._surface = scene.find_surface(context.scene)
-        folder = Path(bpy.path.abspath(self._surface.users_collection[0][scene.FOLDER_KEY]))
+        self._surface = branches.find_surface(context.scene)
+        branch = branches.branch_of(self._surface)
+        folder = Path(bpy.path.abspath(branch[branches.FOLDER_KEY]))
         try:
             command = [*preferences.worker_command(), "session", "--no-grasp", str(folder)]
             self._session = Session(command, len(self._surface.data.vertices))
@@ -155,6 +158,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
                 self._hold.is_dragged = False
         elif event.type == "MOUSEMOVE" and is_dragged:
             self._drag()
+            # At once: the next timer may be as long away as the answer takes.
+            self._send()
         elif event.type in _PLACED and event.value == "PRESS":
             if (seen := self._seen(context, self._mouse)) is not None:
                 self._loads.add(_PLACED[event.type], seen[0])
@@ -192,10 +197,14 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         if self._waiting is not None and self._session.hello:
             self._take(context, self._waiting)
             self._waiting = None
+        self._send()
+        return {"RUNNING_MODAL"}
+
+    def _send(self) -> None:
+        """Say where the grasp is to go, if that is not said yet."""
         if self._hold is not None and self._hold.wanted is not None and self._hold.number:
             self._session.move(self._hold.number, tuple(self._hold.wanted))
             self._hold.wanted = None
-        return {"RUNNING_MODAL"}
 
     def _draw_panel(self) -> None:
         """Let the sidebar show the numbers, a few times a second."""
@@ -259,7 +268,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         if hold is None or hold.position is None or self._target is None:
             self.report({"WARNING"}, "Nothing is bent yet: press on the branch and drag.")
             return {"RUNNING_MODAL"}
-        marked = self._surface.get(scene.GRASP_KEY)
+        marked = self._surface.get(branches.GRASP_KEY)
         is_marked = marked is not None and (
             (Vector(marked[:3]) - hold.rest).length <= marked[3] + self.radius)
         if kept is not Kept.MOTION and not is_marked:

@@ -6,13 +6,15 @@ from pathlib import Path
 import bpy
 
 from .. import branch_folder, scans
+from ..branches import OFFSET_KEY, SCAN_KEY, add_object
 from ..bridge import meshes
-from ..cloud_overlay import COLOUR
-from ..scene import OFFSET_KEY, SCAN_KEY, add_object
+from ..overlays.cloud import COLOUR
 from .viewing import look_at
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _INTERVAL_SECONDS = 0.05
+_LONGEST_PLANT_M = 300.0
+"""No plant is so large: a file with larger numbers is not in metres."""
 _KINDS = (".ply", ".xyz", ".txt", ".csv")
 
 
@@ -79,6 +81,10 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
         cloud[SCAN_KEY] = scan.sha256
         if scan.offset.any():
             cloud[OFFSET_KEY] = [float(value) for value in scan.offset]
+        guessed = scan.extent > _LONGEST_PLANT_M and (
+            not settings.reconstruct.is_property_set("unit"))
+        if guessed:
+            settings.reconstruct.unit = "mm"
         cloud.scale = [_METRES[settings.reconstruct.unit]] * 3
         settings.reconstruct.cloud = str(path)
         chosen = settings.branch_folder
@@ -86,7 +92,12 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             settings.branch_folder = str(scan.folder)
         settings.show_scan = True
         look_at(context, cloud)
-        self.report({"INFO"}, f"{len(scan.points)} points")
+        unit = settings.reconstruct.unit
+        size = f"{scan.extent:.4g} {unit} across"
+        if guessed:
+            self.report({"WARNING"}, f"{size}: taken for millimetres. Set Unit, and import again, "
+                                     "if it is not.")
+        self.report({"INFO"}, f"{len(scan.points)} points, {size}")
         return {"FINISHED"}
 
 

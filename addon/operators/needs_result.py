@@ -2,7 +2,7 @@
 
 import bpy
 
-from .. import scene
+from .. import branches
 
 
 def is_open(operator: type, thing: bpy.types.Object | None) -> bool:
@@ -17,7 +17,7 @@ class NeedsBranch:
 
     @classmethod
     def poll(cls, context):
-        return is_open(cls, scene.find_surface(context.scene))
+        return is_open(cls, branches.find_surface(context.scene))
 
 
 class NeedsBranchInObjectMode:
@@ -25,7 +25,7 @@ class NeedsBranchInObjectMode:
 
     @classmethod
     def poll(cls, context):
-        return is_open(cls, scene.find_surface(context.scene)) and context.mode == "OBJECT"
+        return is_open(cls, branches.find_surface(context.scene)) and context.mode == "OBJECT"
 
 
 class NeedsSkeleton:
@@ -33,4 +33,4 @@ class NeedsSkeleton:
 
     @classmethod
     def poll(cls, context):
-        return is_open(cls, scene.find_skeleton(context.scene))
+        return is_open(cls, branches.find_skeleton(context.scene))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, properties, scene, scene_data
+from .. import branch_folder, frame_colours, properties, scene, scene_data
 from ..stages import stages
 from .viewing import look_at
 from .worker_operator import WorkerOperator
@@ -18,9 +18,25 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
     bl_idname = "limber.open_result"
     bl_label = "Open Result"
     title = "Opening"
+    is_next = True
 
     directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
     _temporary = None
+    _is_asked = False
+
+    def invoke(self, context, event):
+        if not (self.directory or context.scene.limber.branch_folder or bpy.app.background):
+            self._is_asked = True
+            context.window_manager.fileselect_add(self)
+            return {"RUNNING_MODAL"}
+        return super().invoke(context, event)
+
+    def execute(self, context):
+        if self._is_asked:
+            # The folder has been chosen: from here on as from the button.
+            self._is_asked = False
+            return super().invoke(context, None)
+        return super().execute(context)
 
     def arguments(self, context):
         settings = context.scene.limber
@@ -32,7 +48,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-open-")
         stage = stages()["scene"]
         values = properties.values_of(properties.group_of(context.scene, stage), stage,
-                                      {"plan", "motion"})
+                                      {"plan", "motion", "strength"})
         return stage.arguments({**values, "branch_folder": str(folder),
                                 "data": str(self._data_path)})
 
@@ -43,9 +59,14 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
                                  f"{json.dumps(result)} {' '.join(self._job.log)}")
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
+        if trouble := frame_colours.keep(data):
+            self.report({"WARNING"}, trouble)
         if scene.place_scans(context.scene, data):
             # The branch would be buried under it; a switch in the panel brings it back.
             context.scene.limber.show_scan = False
+        if data.info.get("plan"):
+            # Its numbers are those that the panel shall show.
+            context.scene.limber.plan.name = data.info["plan"]
         self._take_over_settings(context, data.folder)
         look_at(context, shown.surface)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")

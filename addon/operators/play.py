@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import bpy
 
-from .. import scene
+from .. import branches, scene
 from ..bridge import animation
 from .needs_result import NeedsBranch
 
@@ -16,7 +16,7 @@ class LIMBER_OT_play(NeedsBranch, bpy.types.Operator):
     bl_label = "Play"
 
     def execute(self, context):
-        trouble = animation.cache_trouble(scene.find_surface(context.scene))
+        trouble = animation.cache_trouble(branches.find_surface(context.scene))
         if trouble:
             self.report({"ERROR"}, trouble)
             return {"CANCELLED"}
@@ -27,33 +27,43 @@ class LIMBER_OT_play(NeedsBranch, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LIMBER_OT_color_by(bpy.types.Operator):
-    """Colour the branch by this quantity"""
+class LIMBER_OT_retime(NeedsBranch, bpy.types.Operator):
+    """Set at which frame of the scene the motion starts, and how fast it plays"""
 
-    bl_idname = "limber.color_by"
-    bl_label = "Colour By"
+    bl_idname = "limber.retime"
+    bl_label = "Start and Speed"
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
-    scalar: bpy.props.StringProperty()
+    frame_start: bpy.props.IntProperty(name="First frame", default=1, soft_min=1,
+                                       description="Of the scene, where the motion begins")
+    speed: bpy.props.FloatProperty(
+        name="Speed", default=1.0, min=0.001, soft_max=10.0,
+        description="1: in its own time (a path: one pose a frame); 0.1: slow motion")
 
-    @classmethod
-    def poll(cls, context):
-        return scene.find_surface(context.scene) is not None
+    def invoke(self, context, event):
+        return context.window_manager.invoke_props_dialog(self)
 
     def execute(self, context):
-        try:
-            scene.color_by(scene.find_surface(context.scene), self.scalar)
-        except KeyError:
-            self.report({"ERROR"}, f"The branch has no {self.scalar!r}. Open the result again.")
+        surface, current = branches.find_surface(context.scene), context.scene
+        trouble = animation.cache_trouble(surface)
+        if trouble:
+            self.report({"ERROR"}, trouble)
             return {"CANCELLED"}
+        frames = branches.info_of(surface)["frames"]
+        own = scene.own_speed(current, frames)
+        branch = branches.branch_of(surface)
+        animation.retime(branch.objects, surface, self.frame_start, own * self.speed)
+        current.frame_end = max(current.frame_end, scene.last_frame(
+            self.frame_start, frames["count"], own * self.speed))
+        current.frame_set(current.frame_current)
         return {"FINISHED"}
 
 
 def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_retime)
     bpy.utils.register_class(LIMBER_OT_play)
-    bpy.utils.register_class(LIMBER_OT_color_by)
 
 
 def unregister() -> None:
-    bpy.utils.unregister_class(LIMBER_OT_color_by)
+    bpy.utils.unregister_class(LIMBER_OT_retime)
     bpy.utils.unregister_class(LIMBER_OT_play)

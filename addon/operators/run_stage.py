@@ -4,7 +4,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, properties
+from .. import branch_folder, jobs, properties
 from ..stages import SettingError, Stage, stages
 from ..steps import NOT_FROM_HERE, RUN, button_of
 from .worker_operator import WorkerOperator
@@ -61,13 +61,17 @@ class StageOperator(WorkerOperator):
                 settings.branch_folder = str(branch_folder.folder_for(self._source(context)))
             values["output"] = bpy.path.abspath(settings.branch_folder)
         else:
-            if branch_folder.read_record(_folder_of(context)) is None:
+            if branch_folder.read_record(_folder_of(context)) is None and (
+                    not jobs.works_in(str(_folder_of(context)))):
                 raise ValueError("Choose a branch folder: one that holds a file branch.json.")
             values["branch_folder"] = bpy.path.abspath(settings.branch_folder)
         for name in NOT_FROM_HERE.get(stage.name, ()):
             values.pop(name)
         self._folder = _folder_of(context)
         return stage.arguments(values)
+
+    def folder(self, context):
+        return str(self._folder)
 
     def finish(self, context, result):
         self.report({"INFO"}, f"{self.title}: done in {result['seconds']:.0f} s")

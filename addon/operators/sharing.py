@@ -7,7 +7,7 @@ from typing import ClassVar
 import bpy
 from mathutils import Vector
 
-from .. import scene
+from .. import branches
 from .needs_result import NeedsBranchInObjectMode
 
 _KINDS = (".abc", ".usd", ".usda", ".usdc", ".usdz")
@@ -29,7 +29,7 @@ class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def invoke(self, context, event):
         if not self.filepath:
-            surface = scene.find_surface(context.scene)
+            surface = branches.find_surface(context.scene)
             self.filepath = f"{surface.name}.abc"
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
@@ -45,8 +45,8 @@ class LIMBER_OT_export_motion(NeedsBranchInObjectMode, bpy.types.Operator):
             self.report({"ERROR"}, f"This Blender was built without "
                                    f"{'Alembic' if kind == '.abc' else 'USD'}.")
             return {"CANCELLED"}
-        surface = scene.find_surface(context.scene)
-        things = list(surface.users_collection[0].objects) if self.whole else [surface]
+        surface = branches.find_surface(context.scene)
+        things = list(branches.branch_of(surface).objects) if self.whole else [surface]
         before = (context.view_layer.objects.active, list(context.selected_objects))
         try:
             _select(context, [thing for thing in things if thing.visible_get()], surface)
@@ -87,7 +87,7 @@ class LIMBER_OT_turntable(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def execute(self, context):
         current = context.scene
-        surface = scene.find_surface(current)
+        surface = branches.find_surface(current)
         _remove_rig()
         rig = bpy.data.collections.new(RIG)
         current.collection.children.link(rig)

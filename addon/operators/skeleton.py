@@ -11,7 +11,7 @@ from typing import ClassVar
 import bmesh
 import bpy
 
-from .. import scene
+from .. import branches
 from ..bridge import skeletons
 from ..skeleton_edits import Mark, SkeletonEditError, edits_of
 from .needs_result import NeedsSkeleton
@@ -37,7 +37,7 @@ class LIMBER_OT_edit_skeleton(NeedsSkeleton, bpy.types.Operator):
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     def execute(self, context):
-        thing = scene.find_skeleton(context.scene)
+        thing = branches.find_skeleton(context.scene)
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         thing.hide_viewport = False
@@ -74,7 +74,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
         return next(told for name, _, told in _ACTIONS if name == properties.action)
 
     def invoke(self, context, event):
-        thing = scene.find_skeleton(context.scene)
+        thing = branches.find_skeleton(context.scene)
         if self.action != "RADIUS" or thing.mode != "EDIT":
             return self.execute(context)
         with skeletons.nodes_edited(thing, is_changed=False) as builder:
@@ -87,7 +87,7 @@ class LIMBER_OT_edit_node(NeedsSkeleton, bpy.types.Operator):
         self.layout.prop(self, "radius")
 
     def execute(self, context):
-        thing = scene.find_skeleton(context.scene)
+        thing = branches.find_skeleton(context.scene)
         try:
             with skeletons.nodes_edited(thing) as builder:
                 self._act(thing, builder)
@@ -169,24 +169,27 @@ class LIMBER_OT_apply_skeleton(NeedsSkeleton, WorkerOperator, bpy.types.Operator
             WorkerOperator.poll.__func__(cls, context))
 
     def arguments(self, context):
-        thing = scene.find_skeleton(context.scene)
+        thing = branches.find_skeleton(context.scene)
         edits = [] if self.restore else edits_of(
             skeletons.as_given(thing.data), skeletons.nodes_of(thing))
         if not edits and not self.restore:
             raise ValueError("Nothing is changed: move or delete nodes first.")
-        self._folder = bpy.path.abspath(thing.users_collection[0][scene.FOLDER_KEY])
+        self._folder = bpy.path.abspath(branches.branch_of(thing)[branches.FOLDER_KEY])
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-edits-")
         path = Path(self._temporary.name) / "edits.json"
         path.write_text(json.dumps(edits), encoding="utf-8")
         how = [] if self.restore else ["--frame", "branch", "--append"]
         return ["skeleton", "--edits", str(path), *how, "--", self._folder]
 
+    def folder(self, context):
+        return self._folder
+
     def finish(self, context, result):
         self.report({"INFO"}, f"{self.title}: done in {result['seconds']:.0f} s")
-        thing = scene.find_skeleton(context.scene)
+        thing = branches.find_skeleton(context.scene)
         if thing is not None:
             # They are in the folder now.
-            scene.put_skeleton_back(thing)
+            branches.put_skeleton_back(thing)
         bpy.ops.limber.open_result("EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT",
                                    directory=self._folder)
 
@@ -202,10 +205,10 @@ class LIMBER_OT_discard_skeleton(NeedsSkeleton, bpy.types.Operator):
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     def execute(self, context):
-        thing = scene.find_skeleton(context.scene)
+        thing = branches.find_skeleton(context.scene)
         if thing.mode == "EDIT":
             bpy.ops.object.mode_set(mode="OBJECT")
-        scene.put_skeleton_back(thing)
+        branches.put_skeleton_back(thing)
         return {"FINISHED"}
 
 

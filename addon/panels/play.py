@@ -3,7 +3,7 @@
 import bpy
 from bpy.app.handlers import persistent
 
-from .. import scene
+from .. import branches
 from ..bridge import animation
 from .sidebar import SidebarPanel
 
@@ -15,7 +15,7 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
 
     @classmethod
     def poll(cls, context):
-        surface = scene.find_surface(context.scene)
+        surface = branches.find_surface(context.scene)
         return surface is not None and animation.MODIFIER in surface.modifiers
 
     def draw(self, context):
@@ -23,16 +23,22 @@ class LIMBER_PT_play(SidebarPanel, bpy.types.Panel):
         self.layout.operator("limber.play", text="Stop" if playing else "Play",
                              icon="PAUSE" if playing else "PLAY")
         self.layout.prop(context.scene, "frame_current", text="Frame")
-        surface = scene.find_surface(context.scene)
-        energies = surface.get(scene.ENERGY_KEY)
+        surface = branches.find_surface(context.scene)
+        energies = surface.get(branches.ENERGY_KEY)
         if energies is not None:
             last = len(energies) - 1
             shown = round(animation.cache_frame(surface, context.scene.frame_current))
             number = min(max(shown, 0), last)
             self.layout.label(text=f"Energy {1000 * energies[number]:.3g} mJ")
+        self.layout.operator("limber.retime", icon="PREVIEW_RANGE")
         row = self.layout.row(align=True)
         row.operator("limber.export_motion", icon="EXPORT")
         row.operator("limber.turntable", icon="CAMERA_DATA")
+        if context.scene.camera is not None:
+            row = self.layout.row(align=True)
+            row.operator("render.render", text="Render", icon="RENDER_STILL")
+            motion = row.operator("render.render", text="Render Motion", icon="RENDER_ANIMATION")
+            motion.animation = True
 
 
 @persistent

@@ -1,22 +1,26 @@
 """The branch: its folder, what it holds, and what its colours mean."""
 
-import json
-
 import bpy
 
-from .. import preferences, scene
-from ..operators import live_loads
+from .. import branches, preferences
+from ..operators import live_loads, seeing
+from ..overlays import graph as viewport_graph
+from .comparing import draw_branches
 from .sidebar import SidebarPanel
+
+_NO_GRAPH = {"young": "Estimate first", "energy": "Plan a path first",
+             "force": "Estimate from a pull with forces first"}
 
 
 class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
     bl_idname = "LIMBER_PT_result"
     bl_label = "Branch"
-    bl_order = 1
+    bl_order = 2
 
     def draw(self, context):
         settings = context.scene.limber
         self.layout.prop(settings, "branch_folder")
+        draw_branches(self.layout, context)
         self.layout.prop(settings.scene, "plan")
         self.layout.prop(settings.scene, "motion")
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
@@ -27,14 +31,12 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
             column.label(text="Name the Python that has limber:")
             column.operator("preferences.addon_show", text="Preferences",
                             icon="PREFERENCES").module = preferences.KEY
-        surface = scene.find_surface(context.scene)
+        surface = branches.find_surface(context.scene)
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
             _draw_live(self.layout, settings)
-            row = self.layout.row()
-            row.prop(settings, "show_legend")
-            row.prop(settings, "show_scan")
-            _draw_legend(self.layout, json.loads(surface[scene.INFO_KEY]))
+            _draw_colours(self.layout, surface, settings)
+            _draw_in_sight(self.layout, surface, settings)
 
 
 def _draw_live(layout: bpy.types.UILayout, settings) -> None:
@@ -56,14 +58,59 @@ def _draw_live(layout: bpy.types.UILayout, settings) -> None:
     body.prop(settings.load, "cut")
 
 
-def _draw_legend(layout: bpy.types.UILayout, info: dict) -> None:
-    column = layout.column(align=True)
+def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:
+    """Draw what the branch can be coloured by, with the values that the colours span."""
+    info = branches.info_of(surface)
+    header, body = layout.panel("limber_colours")
+    header.label(text="Colours")
+    if body is None:
+        return
     for note in info["notes"]:
-        column.label(text=note)
+        body.label(text=note)
+    moving = info.get("frame_scalars") or {}
+    if moving:
+        body.prop(settings, "each_frame")
+    shown = surface.get(branches.FRAME_SCALAR_KEY)
+    active = surface.data.color_attributes.active_color
     for name, scale in info["scalars"].items():
-        row = layout.row(align=True)
-        row.operator("limber.color_by", text=scale["title"], icon="COLOR").scalar = name
-        layout.label(text=f"{scale['ticks'][0]} to {scale['ticks'][-1]}")
+        is_shown = name == shown if shown else active is not None and (
+            active.name == f"{name}_color")
+        told = (moving[name] if settings.each_frame and name in moving else scale)["title"]
+        title, _, rest = told.partition(" (")
+        button = body.operator("limber.color_by", text=title[0].upper() + title[1:], icon="COLOR",
+                               depress=is_shown)
+        button.scalar, button.each_frame = name, settings.each_frame
+        span = f"{scale['ticks'][0]} to {scale['ticks'][-1]}"
+        body.label(text=f"{span} ({rest}" if rest else span, icon="BLANK1")
+    if "stress_over_strength" in info["scalars"]:
+        row = body.row(heading="Strength [Pa]")
+        row.prop(settings.scene, "use_strength", text="")
+        value = row.row()
+        value.active = settings.scene.use_strength
+        value.prop(settings.scene, "strength", text="")
+
+
+def _draw_in_sight(layout: bpy.types.UILayout, surface: bpy.types.Object, settings) -> None:
+    """Draw what can be shown and hidden about the branch, and which graph stands in the view."""
+    header, body = layout.panel("limber_in_sight", default_closed=True)
+    header.label(text="Show")
+    if body is None:
+        return
+    row = body.row()
+    row.prop(settings, "show_legend")
+    row.prop(settings, "show_scan")
+    branch = branches.branch_of(surface)
+    for group, (title, _) in seeing.GROUPS.items():
+        things = seeing.things_of(branch, group)
+        if things:
+            is_hidden = things[0].hide_viewport
+            button = body.operator("limber.show", text=title, depress=not is_hidden,
+                                   icon="HIDE_ON" if is_hidden else "HIDE_OFF")
+            button.group, button.hide = group, not is_hidden
+    body.prop(settings, "graph", text="")
+    if settings.graph != viewport_graph.NONE and (
+            settings.graph not in viewport_graph.graphs_of(surface)):
+        body.label(text=_NO_GRAPH[settings.graph], icon="INFO")
 
 
 def register() -> None:

@@ -4,7 +4,8 @@ import textwrap
 
 import bpy
 
-from .. import scene, skeleton_overlay
+from .. import branches
+from ..overlays import skeleton as overlay
 
 _BUTTONS = (("DELETE", "CONFIRM"), ("BRIDGE", "MERGE"), ("SPLIT", "ROOT"), ("RADIUS", "NONE"))
 _LABELS = {"DELETE": "Delete Branch", "CONFIRM": "Confirm", "BRIDGE": "Bridge", "MERGE": "Merge",
@@ -13,7 +14,7 @@ _LABELS = {"DELETE": "Delete Branch", "CONFIRM": "Confirm", "BRIDGE": "Bridge", 
 
 def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Draw the buttons that edit nodes, and those that apply or discard what was done."""
-    thing = scene.find_skeleton(context.scene)
+    thing = branches.find_skeleton(context.scene)
     if thing is None:
         return
     header, body = layout.panel("limber_skeleton_nodes", default_closed=True)
@@ -30,9 +31,9 @@ def draw_skeleton(layout: bpy.types.UILayout, context: bpy.types.Context) -> Non
             for action in pair:
                 row.operator("limber.edit_node", text=_LABELS[action]).action = action
     column = body.column(align=True)
-    for words in skeleton_overlay.WORDS.values():
+    for words in overlay.WORDS.values():
         column.label(text=words, icon="DOT")
-    marks = skeleton_overlay.marks_in_sight(thing)
+    marks = overlay.marks_in_sight(thing)
     count = marks.edit_count
     for number, line in enumerate(textwrap.wrap(marks.trouble, 44)):
         body.label(text=line, icon="BLANK1" if number else "ERROR")

@@ -10,11 +10,14 @@ from ..branch_folder import BranchRecord, StageRecord
 from ..stages import Field, Stage, stages
 from ..steps import PLACES, STEPS, WAYS, StageView, Step, StepState, button_of, hidden_fields
 from ..steps import next_step as step_after
+from .comparing import draw_moduli, draw_paths
 from .results import draw_results
 from .sidebar import SidebarPanel
 from .skeleton import draw_skeleton
 
-_FIRST_ORDER = 2
+_FIRST_ORDER = 3
+_GRAPHS = {"estimate": "young", "plan": "energy"}
+"""Which graph a stage's result is seen in."""
 _registered: list[type] = []
 
 
@@ -38,6 +41,7 @@ class StepPanel(SidebarPanel):
             _draw_fields(layout, context, view, names=("cloud", "unit"))
         elif step.name == "material":
             _draw_origin(layout, context)
+            layout.operator_menu_enum("limber.material", "material", text="Known Materials")
         if step.scene_operator:
             _draw_scene_button(layout, context, step)
         else:
@@ -71,6 +75,8 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
     job = jobs.current()
     if job is not None and job.state is jobs.JobState.RUNNING and job.title == button_of(name):
         return StepState.RUNNING, entry
+    if any(job.title == button_of(name) for job in jobs.waiting()):
+        return StepState.WAITING, entry
     outcome = properties.outcome_of(scene, stage, folder)
     if outcome.get("status") == "failed":
         return StepState.FAILED, entry
@@ -122,7 +128,14 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
         _draw_text(layout, outcome["error"], "ERROR")
     for warning in outcome.get("warnings", []):
         _draw_text(layout, warning, "INFO")
-    draw_results(layout, view.stage, outcome.get("result", {}) if entry is None else entry.result)
+    result = outcome.get("result", {}) if entry is None else entry.result
+    if view.stage == "plan":
+        draw_paths(layout, result, branch_folder.read_record(Path(folder)))
+    elif view.stage == "estimate":
+        draw_moduli(layout, result)
+    if is_primary and view.stage in _GRAPHS and result:
+        layout.operator("limber.graph", icon="GRAPH").graph = _GRAPHS[view.stage]
+    draw_results(layout, view.stage, result)
 
 
 def _draw_scene_button(layout: bpy.types.UILayout, context: bpy.types.Context, step: Step) -> None:

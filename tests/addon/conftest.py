@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import limber
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.store import Branch
@@ -127,10 +128,29 @@ def addon(bpy):
     return sys.modules["limber_addon"]
 
 
+@pytest.fixture(scope="session")
+def worker_python(tmp_path_factory) -> str:
+    """A Python that runs the very limber that is tested, whichever is installed in this one.
+
+    The add-on hands no PYTHONPATH on.
+    """
+    tested = Path(limber.__file__).parents[1]
+    code = "import limber; print(limber.__file__)"
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    found = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True,
+                           text=True, env=clean, cwd="/")
+    if found.stdout.strip() == limber.__file__ or os.name != "posix":
+        return sys.executable
+    script = tmp_path_factory.mktemp("python") / "python"
+    script.write_text(f"#!/bin/sh\nPYTHONPATH={tested} exec {sys.executable} \"$@\"\n")
+    script.chmod(0o755)
+    return str(script)
+
+
 @pytest.fixture()
-def registered(addon, monkeypatch):
+def registered(addon, monkeypatch, worker_python):
     """The add-on, registered, with this Python as the worker's."""
-    monkeypatch.setenv("LIMBER_PYTHON", sys.executable)
+    monkeypatch.setenv("LIMBER_PYTHON", worker_python)
     addon.register()
     yield addon
     addon.unregister()

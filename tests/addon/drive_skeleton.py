@@ -17,11 +17,11 @@ state = {}
 
 
 def skeleton():
-    return sys.modules[f"{KEY}.scene"].find_skeleton(bpy.context.scene)
+    return sys.modules[f"{KEY}.branches"].find_skeleton(bpy.context.scene)
 
 
 def marks():
-    return sys.modules[f"{KEY}.skeleton_overlay"].marks_in_sight(skeleton())
+    return sys.modules[f"{KEY}.overlays.skeleton"].marks_in_sight(skeleton())
 
 
 def open_result():

@@ -80,14 +80,16 @@ def test_wrong_attributes_are_refused(meshes):
         meshes.set_positions(mesh, np.zeros((49, 3)))
 
 
-def test_polyline_round_trip(addon):
-    """A path's points come back; one that is not finite is refused."""
+def test_a_tube_lies_about_its_points(addon):
+    """Every vertex at the radius of a straight path; one that is not finite is refused."""
     curves = importlib.import_module("limber_addon.bridge.curves")
-    points = np.random.default_rng(5).random((17, 3))
-    np.testing.assert_allclose(
-        curves.polyline_points(curves.new_polyline("path", points, 0.01)), points, rtol=1e-6)
+    meshes = importlib.import_module("limber_addon.bridge.meshes")
+    points = np.column_stack([np.zeros(9), np.zeros(9), np.linspace(0, 1, 9)])
+    tube = meshes.positions(curves.new_tube("path", points, 0.01))
+    np.testing.assert_allclose(np.linalg.norm(tube[:, :2], axis=1), 0.01, rtol=1e-4)
+    assert (tube[:, 2].min(), tube[:, 2].max()) == (0.0, 1.0)
     with pytest.raises(ValueError):
-        curves.new_polyline("path", points * np.nan, 0.01)
+        curves.new_tube("path", points * np.nan, 0.01)
 
 
 def test_damaged_caches_are_refused(animation, meshes, beam, bpy, tmp_path):

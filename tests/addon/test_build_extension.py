@@ -42,6 +42,9 @@ def test_by_the_bpy_package(tmp_path, bpy):
     path, said = _build(ROOT, tmp_path)
     assert "valid, says" in said
     _check(path)
+    with zipfile.ZipFile(path) as archive:
+        assert {"example/bending_branch.blend", "example/bending_branch/branch.json"} <= set(
+            archive.namelist())
 
 
 def test_without_any_blender(tmp_path):

@@ -78,7 +78,7 @@ def test_reconstruct_hands_the_worker_what_the_user_chose(bpy, registered, tmp_p
     jobs = importlib.import_module("limber_addon.jobs")
     seen = []
     start = jobs.start
-    monkeypatch.setattr(jobs, "start", lambda title, command: seen.append(command) or start(
+    monkeypatch.setattr(jobs, "start", lambda title, command, _: seen.append(command) or start(
         title, [command[0], "-c", "print('{\"status\": \"failed\", \"error\": \"Too few.\"}');"
                                   "raise SystemExit(2)"]))
     (tmp_path / "scan.xyz").write_text("0 0 0\n")
@@ -187,7 +187,7 @@ def test_replacing_a_branch_has_to_be_said(bpy, registered, tmp_path, monkeypatc
     """Reconstructing into the folder of another scan is refused unless it is asked for."""
     jobs = importlib.import_module("limber_addon.jobs")
     started = []
-    monkeypatch.setattr(jobs, "start", lambda title, command: started.append(command) or 1 / 0)
+    monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     one, two = _scan(tmp_path / "a.xyz", 1), _scan(tmp_path / "b.xyz", 2)
     _branch_of(one, tmp_path / "a.branch")
     given = {"cloud": str(two), "output": str(tmp_path / "a.branch")}
@@ -203,7 +203,7 @@ def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
     """What a script gives a stage is what the panels show, and what the worker gets."""
     jobs = importlib.import_module("limber_addon.jobs")
     started = []
-    monkeypatch.setattr(jobs, "start", lambda title, command: started.append(command) or 1 / 0)
+    monkeypatch.setattr(jobs, "start", lambda title, command, _: started.append(command) or 1 / 0)
     with pytest.raises(RuntimeError, match="division"):
         bpy.ops.limber.plan(branch_folder=str(beam.folder), name="to-light", goal=(0.1, -0.2, 0.3),
                             max_force=2.5)
@@ -250,6 +250,18 @@ def test_import_stands_in_the_file_menu(bpy, registered):
     assert bpy.types.LIMBER_FH_cloud.bl_import_operator == "limber.import_cloud"
 
 
+def test_a_scan_of_thousands_of_units_is_in_millimetres(bpy, registered, tmp_path):
+    """Nobody scans a plant of 400 m: guessed and said, unless the user has set the unit."""
+    np.savetxt(tmp_path / "a.xyz", POINTS * 1.5)
+    settings = bpy.context.scene.limber.reconstruct
+    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "a.xyz"))
+    assert settings.unit == "mm"
+    assert list(bpy.data.objects["a scan"].scale) == pytest.approx([0.001] * 3)
+    settings.unit = "cm"
+    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "a.xyz"))
+    assert settings.unit == "cm"
+
+
 def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
     """A scan in a map's coordinates: a millimetre is still there, and it comes to its branch."""
     meshes = importlib.import_module("limber_addon.bridge.meshes")
@@ -258,7 +270,8 @@ def test_map_coordinates_keep_their_digits(bpy, registered, tmp_path):
     (tmp_path / "map.xyz").write_text("".join(f"{x} {y} {z}\n" for x, y, z in points))
     bpy.ops.limber.import_cloud(filepath=str(tmp_path / "map.xyz"))
     cloud = bpy.data.objects["map scan"]
-    offset = np.array(cloud[scene.OFFSET_KEY])
+    branches = importlib.import_module("limber_addon.branches")
+    offset = np.array(cloud[branches.OFFSET_KEY])
     np.testing.assert_allclose(meshes.positions(cloud.data) + offset, points, rtol=0, atol=1e-6)
     alignment = np.eye(4)
     alignment[:3, 3] = -points[0]

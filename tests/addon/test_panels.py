@@ -1,13 +1,18 @@
 """The panels draw what they should; a fake layout writes it down."""
 
 import importlib
+import json
+import shutil
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from limber.store import Branch
+
+EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 
 class Layout:
@@ -25,6 +30,15 @@ class Layout:
         return Layout(self.calls)
 
     column = row
+
+    def split(self, factor, **_):
+        assert 0 < factor < 1
+        return Layout(self.calls)
+
+    def operator_menu_enum(self, name, choice, text):
+        assert choice in getattr(bpy_module().ops.limber, name.split(".")[1]).get_rna_type(
+            ).properties
+        self.calls.append(("menu", name, text))
 
     def panel(self, name, default_closed=False):
         self.calls.append(("panel", name, None))
@@ -192,9 +206,58 @@ def test_an_opened_result(bpy, panels, beam):
     assert panels("play").poll(bpy.context)
     bpy.context.scene.frame_set(6)
     drawn = _draw(panels("play"), bpy.context)
-    assert drawn.names("operator") == ["limber.play", "limber.export_motion",
-                                                 "limber.turntable"]
+    assert drawn.names("operator") == ["limber.play", "limber.retime", "limber.export_motion",
+                                       "limber.turntable"]
     assert drawn.names("label") == ["Energy 10 mJ"]
+
+
+def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
+    """The example: E with its interval, both paths with their energy, what is proven; graphs."""
+    shutil.copytree(EXAMPLE, tmp_path / "example")
+    bpy.ops.limber.open_result(directory=str(tmp_path / "example"))
+    plan, estimate = _draw_step(bpy, "plan"), _draw_step(bpy, "estimate")
+    result = json.loads((EXAMPLE / "plans" / "to-goal.json").read_text())
+    texts = plan.names("label")
+    for key in ("plan", "baseline"):
+        assert f"{result[key]['energy_sum_nmm']:.3g}" in texts
+        assert f"{1e3 * result[key]['length_m']:.3g}" in texts
+    gap = result["certificate"]["gap_percent"]
+    assert f"Proven: {gap:.1f} % over the least at most" in texts
+    estimated = json.loads((EXAMPLE / "estimate.json").read_text())
+    low, high = estimated["young_interval_pa"][0]
+    for value in (low, high):
+        assert f"{1e-6 * value:.3g}" in estimate.names("label")
+    assert f"1:  {1e-6 * estimated['young_pa'][0]:.3g}" in estimate.names("label")
+    assert "limber.graph" in plan.names("operator") and "limber.graph" in estimate.names("operator")
+
+
+def test_where_to_start(bpy, panels, beam):
+    """An empty scene offers the example, a scan, a folder; with a branch it makes way."""
+    drawn = _draw(panels("start"), bpy.context)
+    assert drawn.names("operator") == ["limber.open_example", "limber.import_cloud",
+                                       "limber.open_result", "limber.workspace"]
+    assert panels("start").poll(bpy.context)
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    assert not panels("start").poll(bpy.context)
+
+
+def test_jobs_that_wait_are_listed(bpy, panels):
+    """What runs with its time and numbers, then what waits, each with its own cross."""
+    jobs = importlib.import_module("limber_addon.jobs")
+    job = jobs.add("Estimating", [sys.executable, "-c", "import time; time.sleep(30)"])
+    jobs.add("Planning", [sys.executable, "-c", ""])
+    jobs.add("Reporting", [sys.executable, "-c", ""])
+    job.numbers = {"best_m2": 2.5e-5, "young_mpa": "70 30"}
+    drawn = _draw(panels("job"), bpy.context)
+    texts = drawn.names("label")
+    assert ["Then: Planning", "Then: Reporting"] == [text for text in texts if "Then" in text]
+    assert "Loss 2.5e-05 m² at best" in texts and "E 70 30 MPa" in texts
+    assert any(text.endswith("so far") for text in texts)
+    assert bpy.ops.limber.cancel_job(waiting=1) == {"FINISHED"}
+    assert [waiting.title for waiting in jobs.waiting()] == ["Planning"]
+    job._heard_at -= 100
+    texts = _draw(panels("job"), bpy.context).names("label")
+    assert any("No sign of life" in text for text in texts)
 
 
 def test_a_running_and_a_failed_job(bpy, panels):

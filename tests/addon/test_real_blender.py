@@ -26,10 +26,10 @@ FOLDER = Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory) -> dict[str, str]:
+def environment(tmp_path_factory, worker_python) -> dict[str, str]:
     """An environment whose Blender keeps its settings in a folder of the test, with our worker."""
     return os.environ | {"BLENDER_USER_RESOURCES": str(tmp_path_factory.mktemp("resources")),
-                         "LIMBER_PYTHON": sys.executable}
+                         "LIMBER_PYTHON": worker_python}
 
 
 @pytest.fixture(scope="module")

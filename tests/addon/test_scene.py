@@ -64,7 +64,6 @@ def test_frames_play_after_save_reopen_and_move(bpy, addon, beam, positions, tmp
 def test_content(bpy, addon, beam, tmp_path):
     """Surface with E, both paths, control points, goal, grasp and base are where they should."""
     meshes = importlib.import_module("limber_addon.bridge.meshes")
-    curves = importlib.import_module("limber_addon.bridge.curves")
     shown = _scene_in_process(addon, beam.folder, tmp_path / "scene.blend", bpy)
     objects = bpy.data.objects
     mesh = objects["beam"].data
@@ -78,8 +77,12 @@ def test_content(bpy, addon, beam, tmp_path):
     red = colours.reshape(-1, 4)[:, 0]
     assert red[young.argmax()] > 0.8, "stiffest: yellow"
     assert red[young.argmin()] < 0.1, "softest: violet"
-    np.testing.assert_allclose(curves.polyline_points(objects["D-RRT* path"].data), beam.path,
-                               atol=1e-6)
+    tube = meshes.positions(objects["D-RRT* path"].data)
+    away = np.linalg.norm(tube[:, None] - beam.path, axis=2)
+    radius = away.min()
+    np.testing.assert_allclose(away.min(axis=0), radius, rtol=0.05)
+    np.testing.assert_allclose(away.min(axis=1), radius, rtol=0.05)
+    assert 0.001 < radius < 0.004
     assert objects["RRT* path"].active_material != objects["D-RRT* path"].active_material
     tree = objects["D-RRT* tree"].data
     np.testing.assert_allclose(meshes.positions(tree), beam.path, atol=1e-6)
@@ -106,6 +109,21 @@ def test_marks_stand_at_their_first_place_on_the_first_frame(bpy, addon, beam, t
     np.testing.assert_allclose(shown.objects["grasp"][0].location, beam.path[0], atol=1e-6)
     for thing in shown.objects["control_points"]:
         assert abs(thing.location.x) < 1e-3
+
+
+def test_a_motion_starts_and_runs_as_it_is_told(bpy, registered, beam, positions):
+    """At half its speed from frame 11 on: the surface and what is keyed with it stay together."""
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    bpy.ops.limber.retime(frame_start=11, speed=0.5)
+    scene = bpy.context.scene
+    assert scene.frame_end == 11 + 2 * (len(beam.frames) - 1)
+    for number, frame in enumerate(beam.frames):
+        np.testing.assert_allclose(positions("beam", 11 + 2 * number), frame, atol=1e-6)
+        np.testing.assert_allclose(scene.objects["Grasp 1"].location, beam.path[number], atol=1e-6)
+    np.testing.assert_allclose(positions("beam", 5), beam.frames[0], atol=1e-6)
+    bpy.ops.limber.retime()
+    np.testing.assert_allclose(positions("beam", 3), beam.frames[2], atol=1e-6)
+    np.testing.assert_allclose(scene.objects["Grasp 1"].location, beam.path[2], atol=1e-5)
 
 
 @pytest.mark.parametrize("fps", [24, 60, 25])

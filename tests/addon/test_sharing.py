@@ -10,7 +10,7 @@ import pytest
 @pytest.fixture()
 def opened(bpy, registered, beam):
     bpy.ops.limber.open_result(directory=str(beam.folder))
-    return importlib.import_module("limber_addon.scene").find_surface(bpy.context.scene)
+    return importlib.import_module("limber_addon.branches").find_surface(bpy.context.scene)
 
 
 @pytest.mark.parametrize("kind", [".abc", ".usdc"])
@@ -64,11 +64,11 @@ def test_the_turntable_goes_round_and_sees_the_branch(bpy, opened):
 
 def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
     """Its scale follows the button; the bar has a row a stop, in the colours of the screen."""
-    legend = importlib.import_module("limber_addon.viewport_legend")
-    assert legend.shown_scale(opened)["title"] == "Young's modulus"
+    legend = importlib.import_module("limber_addon.overlays.legend")
+    assert [scale["title"] for scale in legend.shown_scales(opened)] == ["Young's modulus"]
     bpy.ops.limber.color_by(scalar="strain_energy")
-    scale = legend.shown_scale(opened)
-    assert "energy" in scale["title"]
+    scale = legend.shown_scales(opened)[0]
+    assert "peak" in scale["title"] and "energy" in scale["title"]
     places, colours, triangles = legend.bar([[0, 0, 0, 0], [0.5, 1, 0, 0], [1, 0.2, 0.2, 0.2]],
                                             10, 20, 5, 100)
     assert places[0] == (10, 20) and places[-1] == (15, 120) and len(triangles) == 4
@@ -78,7 +78,7 @@ def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
 
 def test_a_scan_keeps_its_colours_and_gives_way_to_its_branch(bpy, registered, tmp_path):
     """Red, green and blue of a PLY file, as a screen has them; the switch hides the scan."""
-    overlay = importlib.import_module("limber_addon.cloud_overlay")
+    overlay = importlib.import_module("limber_addon.overlays.cloud")
     colours = np.random.default_rng(3).integers(0, 256, (50, 3)).astype("u1")
     rows = np.zeros(50, [(axis, "<f4") for axis in "xyz"] + [
         (name, "u1") for name in ("red", "green", "blue")])

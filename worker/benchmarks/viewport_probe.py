@@ -84,7 +84,7 @@ def import_points(path: Path) -> None:
         longest, last = max(longest, time.perf_counter() - last), time.perf_counter()
     scan = reading.scan()
     mesh = part("bridge.meshes").new_mesh("cloud", scan.points)
-    cloud = part("scene").add_object(bpy.context.scene.collection, "cloud", mesh)
+    cloud = part("branches").add_object(bpy.context.scene.collection, "cloud", mesh)
     bpy.context.view_layer.update()
     now = time.perf_counter()
     say("import", seconds=now - started, reading_ms=1e3 * longest, shown_ms=1e3 * (now - last),
@@ -94,16 +94,16 @@ def import_points(path: Path) -> None:
 
 def grab_loop(branch: Path, count: int) -> None:
     """Poses streamed to a session at 60 Hz; what Blender's side does with each answer."""
-    sessions, meshes, scene = part("session"), part("bridge.meshes"), part("scene")
+    sessions, meshes, branches = part("session"), part("bridge.meshes"), part("branches")
     bpy.ops.limber.open_result(directory=str(branch))
-    surface = scene.find_surface(bpy.context.scene)
+    surface = branches.find_surface(bpy.context.scene)
     command = [*part("preferences").worker_command(), "session", "--no-grasp", str(branch)]
     held = sessions.Session(command, len(surface.data.vertices))
     try:
         _until(lambda: held.poll() is not None and (held.hello or held.error), 60)
         if held.error:
             raise RuntimeError(held.error)
-        place = tuple(surface[scene.GRASP_KEY][:3])
+        place = tuple(surface[branches.GRASP_KEY][:3])
         asked = held.grasp(place, 0.01)
         reply = _until(lambda: next((t for t in held.poll() if t.get("id") == asked), None), 30)
         number, start = reply["grasp"], np.array(reply["pose"][:3])
@@ -210,15 +210,15 @@ def undo_sequences(branch: Path, cloud: Path, count: int, seed: int) -> None:
 
 
 def _act(name: str, branch: Path, cloud: Path, rng: np.random.Generator) -> None:
-    limber, scene = bpy.ops.limber, part("scene")
-    skeleton = scene.find_skeleton(bpy.context.scene)
-    surface = scene.find_surface(bpy.context.scene)
+    limber, branches = bpy.ops.limber, part("branches")
+    skeleton = branches.find_skeleton(bpy.context.scene)
+    surface = branches.find_surface(bpy.context.scene)
     if name == "open" and surface is None:
         # What the worker would be asked for each time stands in a file here.
         part("scene").show_branch(bpy.context.scene, part("scene_data").read_scene_data(
             branch.with_suffix(".npz")))
     elif name == "colour" and surface is not None:
-        scalars = list(json.loads(surface[scene.INFO_KEY])["scalars"])
+        scalars = list(json.loads(surface[branches.INFO_KEY])["scalars"])
         limber.color_by(scalar=str(rng.choice(scalars)))
     elif name == "cursor":
         bpy.context.scene.cursor.location = rng.random(3)
@@ -241,8 +241,8 @@ def _state() -> str:
     limber = bpy.context.scene.limber
     things = sorted((thing.name, len(thing.data.vertices) if thing.type == "MESH" else 0)
                     for thing in bpy.context.scene.objects)
-    skeleton = part("scene").find_skeleton(bpy.context.scene)
-    surface = part("scene").find_surface(bpy.context.scene)
+    skeleton = part("branches").find_skeleton(bpy.context.scene)
+    surface = part("branches").find_surface(bpy.context.scene)
     radii = [] if skeleton is None else part("bridge.meshes").scalars(
         skeleton.data, "radius").round(6).tolist()
     colour = None if surface is None else surface.data.color_attributes.active_color.name

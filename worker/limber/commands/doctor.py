@@ -61,7 +61,8 @@ def report() -> dict[str, Any]:
     missing = []
     for module, distribution, cost in PARTS:
         present = importlib.util.find_spec(module) is not None
-        parts[module] = _version(distribution) if present else f"missing: {cost}"
+        parts[module] = _version(distribution) if present else (
+            f"missing: {cost or 'nothing works without it'}")
         if not present:
             missing.append(module)
     return {

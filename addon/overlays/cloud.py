@@ -6,8 +6,8 @@ import numpy as np
 from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
 
-from .bridge import meshes
-from .scene import SCAN_KEY
+from ..branches import SCAN_KEY
+from ..bridge import meshes
 
 COLOUR = "scan_color"
 """Attribute of a scan's vertices, where its file has colours."""

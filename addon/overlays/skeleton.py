@@ -8,9 +8,9 @@ import numpy as np
 from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
 
-from . import compat, scene
-from .bridge import skeletons
-from .skeleton_edits import Nodes, SkeletonEditError, edits_of
+from .. import branches, compat
+from ..bridge import skeletons
+from ..skeleton_edits import Nodes, SkeletonEditError, edits_of
 
 EDITED, DOUBTFUL = 128, 32 | 64
 """Bits of the worker's flags: edits applied; a radius not resolved, a gap bridged."""
@@ -74,7 +74,7 @@ def marks_of(nodes: Nodes, mesh: bpy.types.Mesh) -> Marks:
 
 
 def _draw() -> None:
-    thing = scene.find_skeleton(bpy.context.scene)
+    thing = branches.find_skeleton(bpy.context.scene)
     if thing is None or not thing.visible_get():
         return
     marks = marks_in_sight(thing)

@@ -1,23 +1,34 @@
 """The legend of the branch's colours in the 3D view: title, bar, values with their unit."""
 
 import json
+import textwrap
 
 import blf
 import bpy
 import gpu
 from gpu_extras.batch import batch_for_shader
 
-from . import scene
+from .. import branches, frame_colours
 
 _MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
+_BETWEEN, _LINE_LETTERS = 20, 20
 _GAP = 60  # above the lower edge: what Blender writes there stays readable
 _handle: list = []
 
 
-def shown_scale(surface: bpy.types.Object) -> dict | None:
-    """Return the scale of the scalar that colours the branch now, None where nothing does."""
+def shown_scales(surface: bpy.types.Object) -> list[dict]:
+    """Return the scales of what is coloured now: the branch's, then those of what is about it."""
+    scales = [frame_colours.shown_scale(surface) or _scale_at_rest(surface)]
+    for thing in branches.branch_of(surface).objects:
+        if branches.SCALE_KEY in thing and thing.visible_get():
+            scales.append(json.loads(thing[branches.SCALE_KEY]))
+    told = {scale["title"]: scale for scale in scales if scale is not None}
+    return list(told.values())
+
+
+def _scale_at_rest(surface: bpy.types.Object) -> dict | None:
     active = surface.data.color_attributes.active_color
-    scalars = json.loads(surface.get(scene.INFO_KEY, "{}")).get("scalars", {})
+    scalars = branches.info_of(surface).get("scalars", {})
     return scalars.get(active.name.removesuffix("_color")) if active is not None else None
 
 
@@ -40,29 +51,27 @@ def _display(value: float) -> float:
 
 def _draw() -> None:
     context = bpy.context
-    surface = scene.find_surface(context.scene)
+    surface = branches.find_surface(context.scene)
     if (surface is None or not context.scene.limber.show_legend or not surface.visible_get()
             or not context.space_data.overlay.show_overlays):
         return
     shading = context.space_data.shading
     if shading.type == "WIREFRAME" or (shading.type == "SOLID" and shading.color_type != "VERTEX"):
         return
-    scale = shown_scale(surface)
-    if scale is None:
-        return
     size = context.preferences.system.ui_scale
-    x = _left(context) + _MARGIN * size
-    y = _GAP * size
-    places, colours, triangles = bar(scale["stops"], x, y, _WIDTH * size, _HEIGHT * size)
-    shader = gpu.shader.from_builtin("SMOOTH_COLOR")
-    gpu.state.blend_set("ALPHA")
-    batch_for_shader(shader, "TRIS", {"pos": places, "color": colours},
-                     indices=triangles).draw(shader)
-    gpu.state.blend_set("NONE")
-    _write(scale, x, y, size)
+    x, y = _left(context) + _MARGIN * size, _GAP * size
+    for scale in shown_scales(surface):
+        places, colours, triangles = bar(scale["stops"], x, y, _WIDTH * size, _HEIGHT * size)
+        shader = gpu.shader.from_builtin("SMOOTH_COLOR")
+        gpu.state.blend_set("ALPHA")
+        batch_for_shader(shader, "TRIS", {"pos": places, "color": colours},
+                         indices=triangles).draw(shader)
+        gpu.state.blend_set("NONE")
+        x += _write(scale, x, y, size) + _BETWEEN * size
 
 
-def _write(scale: dict, x: float, y: float, size: float) -> None:
+def _write(scale: dict, x: float, y: float, size: float) -> float:
+    """Write title and values of a scale; returns how wide it is [pixels]."""
     blf.size(0, _TEXT * size)
     blf.color(0, 1.0, 1.0, 1.0, 1.0)
     blf.enable(0, blf.SHADOW)
@@ -72,9 +81,12 @@ def _write(scale: dict, x: float, y: float, size: float) -> None:
         share = number / max(len(ticks) - 1, 1)
         blf.position(0, x + (_WIDTH + 6) * size, y + (share * _HEIGHT - 4) * size, 0)
         blf.draw(0, str(tick))
-    blf.position(0, x, y + (_HEIGHT + 10) * size, 0)
-    blf.draw(0, scale["title"])
+    lines = textwrap.wrap(scale["title"] + (", log scale" if scale["log"] else ""), _LINE_LETTERS)
+    for number, line in enumerate(reversed(lines)):
+        blf.position(0, x, y + (_HEIGHT + 10 + 16 * number) * size, 0)
+        blf.draw(0, line)
     blf.disable(0, blf.SHADOW)
+    return max(blf.dimensions(0, line)[0] for line in lines)
 
 
 def _left(context: bpy.types.Context) -> float:

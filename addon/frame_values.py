@@ -1,0 +1,96 @@
+"""What a branch is coloured by in each frame of its motion: kept beside it in its folder. No bpy.
+
+A .blend keeps the values of one frame alone; those of all stand in ``.viewport/MOTION.npz`` of the
+branch folder, so that a file that was closed and moved still plays in colours.
+"""
+
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .scene_data import SceneData
+
+_FOLDER = ".viewport"
+_FORMAT = 1
+_ERRORS = (OSError, ValueError, KeyError, TypeError, EOFError, RecursionError, MemoryError,
+           zipfile.BadZipFile)
+
+
+@dataclass(frozen=True)
+class FrameValues:
+    """Values of a motion's frames by name.
+
+    Attributes:
+        scalars: In their real unit, each [frames, v].
+        levels: Which colour of its palette each has, bytes, each [frames, v].
+        palettes: Linear colours, each [256, 4].
+    """
+
+    scalars: dict[str, np.ndarray]
+    levels: dict[str, np.ndarray]
+    palettes: dict[str, np.ndarray]
+
+    def colours(self, name: str, palette: str, frame: int) -> np.ndarray:
+        """Return the colours of a frame, shape [v, 4]."""
+        return self.palettes[palette][self.levels[name][frame]]
+
+    def names(self, frame_count: int, vertex_count: int) -> set[str]:
+        """Return what there is of a motion of this size."""
+        size = (frame_count, vertex_count)
+        return {name for name, values in self.scalars.items()
+                if values.shape == size and self.levels.get(name, values[:0]).shape == size}
+
+
+def values_of(data: SceneData) -> FrameValues:
+    """Return what the worker said of each frame."""
+    parts = {kind: {name.partition(":")[2]: array for name, array in data.arrays.items()
+                    if name.startswith(f"{kind}:")}
+             for kind in ("frame_scalar", "frame_level", "palette")}
+    return FrameValues(parts["frame_scalar"], parts["frame_level"], parts["palette"])
+
+
+def path_of(folder: Path, motion: str) -> Path:
+    """Return where the values of a motion stand in a branch folder."""
+    return folder / _FOLDER / f"{motion}.npz"
+
+
+def keep(folder: Path, motion: str, values: FrameValues) -> None:
+    """Write the values of a motion into the branch folder; OSError where that cannot be."""
+    path = path_of(folder, motion)
+    path.parent.mkdir(exist_ok=True)
+    arrays = {f"{kind}:{name}": array for kind, named in (
+        ("scalar", values.scalars), ("level", values.levels), ("palette", values.palettes))
+        for name, array in named.items()}
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(stream, about=np.array(json.dumps({"format": _FORMAT})), **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def read(folder: Path, motion: str) -> FrameValues | None:
+    """Return what was kept of a motion; None where there is nothing, or nothing whole."""
+    try:
+        with np.load(path_of(folder, motion), allow_pickle=False) as content:
+            if json.loads(str(content["about"])).get("format") != _FORMAT:
+                return None
+            parts: dict[str, dict[str, np.ndarray]] = {"scalar": {}, "level": {}, "palette": {}}
+            for name in content.files:
+                kind, _, key = name.partition(":")
+                if kind in parts:
+                    parts[kind][key] = content[name]
+    except _ERRORS:
+        return None
+    found = FrameValues(parts["scalar"], parts["level"], parts["palette"])
+    sound = all(colours.shape == (256, 4) for colours in found.palettes.values()) and all(
+        level.dtype == np.uint8 for level in found.levels.values()) and all(
+        np.isfinite(values).all() for values in found.scalars.values())
+    return found if sound else None

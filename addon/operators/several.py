@@ -1,0 +1,171 @@
+"""Several branches in a scene: which is meant, where each stands, and where its folder is."""
+
+from pathlib import Path
+from typing import ClassVar
+
+import bpy
+
+from .. import branch_folder, branches
+from ..bridge import animation
+from .needs_result import NeedsBranch
+
+_GAP = 0.25
+"""Between branches that stand side by side, in widths of the widest."""
+_MOST_LOOKED_AT = 2000
+
+
+class LIMBER_OT_choose_branch(NeedsBranch, bpy.types.Operator):
+    """Make this the branch that the panels are about"""
+
+    bl_idname = "limber.choose_branch"
+    bl_label = "Choose Branch"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    branch: bpy.props.StringProperty(name="Branch", description="Name of its collection")
+
+    def execute(self, context):
+        found = next((each for each in branches.branches(context.scene)
+                      if each.name == self.branch), None)
+        surface = branches.surface_of(found) if found is not None else None
+        if surface is None:
+            self.report({"ERROR"}, f"There is no branch {self.branch!r}.")
+            return {"CANCELLED"}
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        for other in context.selected_objects:
+            other.select_set(False)
+        surface.select_set(True)
+        context.view_layer.objects.active = surface
+        context.scene.limber.branch_folder = found[branches.FOLDER_KEY]
+        return {"FINISHED"}
+
+
+class LIMBER_OT_side_by_side(NeedsBranch, bpy.types.Operator):
+    """Put the branches of the scene side by side, or back to where they grew"""
+
+    bl_idname = "limber.side_by_side"
+    bl_label = "Side by Side"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    back: bpy.props.BoolProperty(name="In place", options={"SKIP_SAVE"},
+                                 description="Each where it was scanned")
+
+    def execute(self, context):
+        shown = [branch for branch in branches.branches(context.scene)
+                 if branches.surface_of(branch) is not None]
+        spans = [_span(branches.surface_of(branch)) for branch in shown]
+        gap = _GAP * max(high - low for low, high in spans)
+        # The first stays; each of the others begins where the one before it ends.
+        end = spans[0][1]
+        for number, (branch, (low, high)) in enumerate(zip(shown, spans, strict=True)):
+            place = 0.0
+            if number and not self.back:
+                place = end + gap - low
+                end = place + high
+            for thing in branch.objects:
+                thing.delta_location = (place, 0.0, 0.0)
+        return {"FINISHED"}
+
+
+def _span(surface: bpy.types.Object) -> tuple[float, float]:
+    """Return from where to where a branch reaches along x where it was scanned [m]."""
+    along = [corner[0] for corner in surface.bound_box]
+    return min(along), max(along)
+
+
+class LIMBER_OT_relink(NeedsBranch, bpy.types.Operator):
+    """Find the branch's folder again where it was moved or renamed: beside this file, else where
+    you say"""
+
+    bl_idname = "limber.relink"
+    bl_label = "Find the Folder Again"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    directory: bpy.props.StringProperty(subtype="DIR_PATH", options={"SKIP_SAVE"})
+
+    def invoke(self, context, event):
+        if not self.directory and not bpy.app.background and (
+                _beside_file(self._branch(context)) is None):
+            context.window_manager.fileselect_add(self)
+            return {"RUNNING_MODAL"}
+        return self.execute(context)
+
+    def execute(self, context):
+        branch = self._branch(context)
+        folder = Path(bpy.path.abspath(self.directory)) if self.directory else _beside_file(branch)
+        if folder is None:
+            self.report({"ERROR"}, f"No folder of {branch.name} lies beside this file. Give its "
+                                   "place.")
+            return {"CANCELLED"}
+        record = branch_folder.read_record(folder)
+        if record is None or not _is_of(branch, record):
+            what = "no branch folder" if record is None else f"the folder of {record.name}"
+            self.report({"ERROR"}, f"{folder} is {what}, not that of {branch.name}.")
+            return {"CANCELLED"}
+        was = bpy.path.abspath(branch[branches.FOLDER_KEY])
+        _set_folder(branch, folder)
+        settings = context.scene.limber
+        if not settings.branch_folder or (
+                Path(bpy.path.abspath(settings.branch_folder)) == Path(was)):
+            settings.branch_folder = str(folder)
+        trouble = animation.cache_trouble(branches.surface_of(branch))
+        if animation.MODIFIER in branches.surface_of(branch).modifiers and trouble:
+            self.report({"WARNING"}, trouble)
+        self.report({"INFO"}, f"{branch.name}: {folder}")
+        return {"FINISHED"}
+
+    def _branch(self, context) -> bpy.types.Collection:
+        return branches.branch_of(branches.find_surface(context.scene))
+
+
+def is_lost(branch: bpy.types.Collection) -> bool:
+    """Whether the folder of a branch is not where it was."""
+    folder = Path(bpy.path.abspath(branch[branches.FOLDER_KEY]))
+    return branch_folder.read_record(folder) is None
+
+
+def _set_folder(branch: bpy.types.Collection, folder: Path) -> None:
+    """Let a branch and its motion be in another folder."""
+    branch[branches.FOLDER_KEY] = animation.shown_path(folder)
+    for thing in branch.objects:
+        modifier = thing.modifiers.get(animation.MODIFIER)
+        if modifier is not None:
+            frames = Path(bpy.path.abspath(modifier.filepath)).name
+            modifier.filepath = animation.shown_path(folder / "frames" / frames)
+
+
+def _is_of(branch: bpy.types.Collection, record: branch_folder.BranchRecord) -> bool:
+    if branches.UUID_KEY in branch:
+        return branch[branches.UUID_KEY] == record.uuid
+    # Of a file from before branches had a number of their own.
+    return branch[branches.NAME_KEY] == record.name
+
+
+def _beside_file(branch: bpy.types.Collection) -> Path | None:
+    """Return the branch's folder if it lies in that of the .blend, or in a folder there."""
+    if not bpy.data.filepath:
+        return None
+    home = Path(bpy.data.filepath).parent
+    looked = 0
+    for pattern in (f"*/{branch_folder.MANIFEST}", f"*/*/{branch_folder.MANIFEST}"):
+        for path in home.glob(pattern):
+            looked += 1
+            record = branch_folder.read_record(path.parent)
+            if record is not None and _is_of(branch, record):
+                return path.parent
+            if looked > _MOST_LOOKED_AT:
+                return None
+    return None
+
+
+_CLASSES = (LIMBER_OT_choose_branch, LIMBER_OT_side_by_side, LIMBER_OT_relink)
+
+
+def register() -> None:
+    for each in _CLASSES:
+        bpy.utils.register_class(each)
+
+
+def unregister() -> None:
+    for each in reversed(_CLASSES):
+        bpy.utils.unregister_class(each)

@@ -1,0 +1,100 @@
+"""Tables of the sidebar: paths side by side, moduli with their intervals, branches of the scene."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import bpy
+
+from .. import branch_folder, branches
+from ..branch_folder import BranchRecord
+from ..operators import several
+
+_PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy sum", "energy_sum_nmm", 1.0, "N mm"),
+              ("Peak energy", "peak_energy_j", 1e3, "mJ"), ("Peak force", "peak_force_n", 1.0, "N"),
+              ("Peak strain", "peak_strain", 1e2, "%"))
+_PLAN = "plan:"
+
+
+def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
+               record: BranchRecord | None) -> None:
+    """Draw the planned path beside the one without energy, what is proven, and other plans."""
+    paths = [result.get(key) or {} for key in ("plan", "baseline")]
+    if not paths[0]:
+        return
+    title = "Gentle" if result.get("planner") == "eikonal" else "D-RRT*"
+    rows = [["", title, "RRT*"]]
+    rows += [[f"{words} [{unit}]", *(_number(path.get(key), factor) for path in paths)]
+             for words, key, factor, unit in _PATH_ROWS]
+    draw_table(layout, rows)
+    saved, longer = result.get("energy_saved_percent"), result.get("length_added_percent")
+    if saved is not None and longer is not None:
+        layout.label(text=f"{saved:.0f} % of the energy saved, {longer:.1f} % longer")
+    gap = (result.get("certificate") or {}).get("gap_percent")
+    layout.label(text="No bound was proven" if gap is None else
+                 f"Proven: {gap:.1f} % over the least at most",
+                 icon="QUESTION" if gap is None else "CHECKMARK")
+    others = {key.removeprefix(_PLAN): entry.result for key, entry in (
+        record.stages.items() if record else ()) if key.startswith(_PLAN)}
+    if len(others) > 1:
+        draw_table(layout, [["Plan", "Energy [N mm]", "Length [mm]"], *(
+            [name, _number((each.get("plan") or {}).get("energy_sum_nmm"), 1.0),
+             _number((each.get("plan") or {}).get("length_m"), 1e3)]
+            for name, each in others.items())])
+
+
+def draw_moduli(layout: bpy.types.UILayout, result: dict[str, Any]) -> None:
+    """Draw Young's modulus at the control points with its interval, base first."""
+    young = result.get("young_pa") or []
+    intervals = result.get("young_interval_pa") or [[None, None]] * len(young)
+    if young and len(young) == len(intervals):
+        draw_table(layout, [["E [MPa]", "from", "to (95 %)"], *(
+            [f"{number + 1}:  {_number(value, 1e-6)}", _number(low, 1e-6), _number(high, 1e-6)]
+            for number, (value, (low, high)) in enumerate(zip(young, intervals, strict=True)))])
+
+
+def draw_branches(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the branches of the scene where there are several, and a button where one is lost."""
+    shown = branches.branches(context.scene)
+    surface = branches.find_surface(context.scene)
+    chosen = branches.branch_of(surface) if surface is not None else None
+    if chosen is not None and several.is_lost(chosen):
+        layout.label(text="Its folder is not where it was", icon="ERROR")
+        layout.operator("limber.relink", icon="FILE_REFRESH")
+    if len(shown) < 2:
+        return
+    for branch in shown:
+        row = layout.row(align=True)
+        row.operator("limber.choose_branch", text=branch.name, depress=branch == chosen,
+                     icon="ERROR" if several.is_lost(branch) else "NONE").branch = branch.name
+        row.label(text=_told(branch))
+    row = layout.row(align=True)
+    row.operator("limber.side_by_side", icon="MOD_ARRAY")
+    row.operator("limber.side_by_side", text="In Place").back = True
+
+
+def _told(branch: bpy.types.Collection) -> str:
+    """Return E and the energy saved of a branch, as far as its folder knows them."""
+    record = branch_folder.read_record(bpy.path.abspath(branch[branches.FOLDER_KEY]))
+    if record is None:
+        return "folder not found"
+    young = record.stages["estimate"].result.get("young_pa") if "estimate" in record.stages else []
+    plans = [entry.result for key, entry in record.stages.items() if key.startswith(_PLAN)]
+    words = [f"E {_number(min(young), 1e-6)} to {_number(max(young), 1e-6)} MPa"] if young else []
+    if plans and plans[-1].get("energy_saved_percent") is not None:
+        words.append(f"{plans[-1]['energy_saved_percent']:.0f} % saved")
+    return ", ".join(words) or "E assumed"
+
+
+def draw_table(layout: bpy.types.UILayout, rows: Sequence[Sequence[str]]) -> None:
+    """Draw rows of words under each other, the first as wide as two of the others."""
+    column = layout.column(align=True)
+    for first, *others in rows:
+        row = column.split(factor=0.46, align=True)
+        row.label(text=first)
+        cells = row.row(align=True)
+        for words in others:
+            cells.label(text=words)
+
+
+def _number(value: Any, factor: float) -> str:
+    return f"{factor * value:.3g}" if isinstance(value, int | float) else "-"

@@ -1,0 +1,36 @@
+"""What to do first, while the scene has neither a branch nor a scan."""
+
+import bpy
+
+from .. import branches
+from .sidebar import SidebarPanel
+
+
+class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
+    bl_idname = "LIMBER_PT_start"
+    bl_label = "Start Here"
+    bl_order = 0
+
+    @classmethod
+    def poll(cls, context):
+        return not context.scene.limber.branch_folder and not any(
+            branches.SCAN_KEY in thing for thing in context.scene.objects) and (
+            branches.find_surface(context.scene) is None)
+
+    def draw(self, context):
+        column = self.layout.column()
+        column.scale_y = 1.3
+        column.operator("limber.open_example", icon="PLAY")
+        column.operator("limber.import_cloud", text="Import a Scan", icon="IMPORT").filepath = ""
+        column.operator("limber.open_result", text="Open a Branch Folder", icon="FILE_FOLDER")
+        self.layout.label(text="A scan may also be dropped into the view")
+        if "Limber" not in bpy.data.workspaces:
+            self.layout.operator("limber.workspace", icon="WORKSPACE")
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_PT_start)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(LIMBER_PT_start)

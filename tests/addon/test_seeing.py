@@ -1,0 +1,219 @@
+"""What is in sight and what its colours mean: each frame, rods, graphs, several branches."""
+
+import importlib
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limber.scene.data import scene_data
+from limber.store import Branch
+
+
+def part(name):
+    return importlib.import_module(f"limber_addon.{name}")
+
+
+@pytest.fixture()
+def show(bpy, registered, tmp_path):
+    """A function that shows a branch folder as `limber.open_result` does, without its process."""
+    def show(folder):
+        scene_data(Branch.open(folder)).write(tmp_path / "scene.npz")
+        data = part("scene_data").read_scene_data(tmp_path / "scene.npz")
+        shown = part("scene").show_branch(bpy.context.scene, data)
+        bpy.context.scene.limber.branch_folder = str(folder)
+        assert not part("frame_colours").keep(data)
+        return shown.surface
+    return show
+
+
+@pytest.fixture()
+def opened(show, beam):
+    return show(beam.folder)
+
+
+def _density(beam, frame):
+    """The strain energy density that conftest gives the beam [J/m^3], at each vertex."""
+    return 1000.0 * frame / 5 * (0.61 - beam.surface[:, 2])
+
+
+def test_colours_follow_the_motion(bpy, opened, beam):
+    """At each frame the values are that frame's, and so are the colours; the worst of all stays."""
+    meshes, scene = part("bridge.meshes"), bpy.context.scene
+    bpy.ops.limber.color_by(scalar="strain_energy", each_frame=True)
+    colours = []
+    for frame in (0, 2, 5):
+        scene.frame_set(1 + frame)
+        np.testing.assert_allclose(meshes.scalars(opened.data, "now"), _density(beam, frame),
+                                   rtol=1e-5, atol=1e-5)
+        shown = opened.data.color_attributes.active_color
+        assert shown.name == "now_color"
+        values = np.empty(4 * len(shown.data), np.float32)
+        shown.data.foreach_get("color", values)
+        colours.append(values.reshape(-1, 4)[opened.data.vertices[0].index, 0])
+    assert colours[0] < colours[1] < colours[2], "the base: from dark to bright as it is bent"
+    bpy.ops.limber.color_by(scalar="strain_energy")
+    assert opened.data.color_attributes.active_color.name == "strain_energy_color"
+    np.testing.assert_allclose(meshes.scalars(opened.data, "strain_energy"), _density(beam, 5),
+                               rtol=1e-5)
+
+
+def test_the_switch_changes_what_is_shown(bpy, opened):
+    """From the worst of all frames to the frame in sight and back; E, which stays, stays."""
+    settings, attributes = bpy.context.scene.limber, opened.data.color_attributes
+    bpy.ops.limber.color_by(scalar="strain_energy", each_frame=True)
+    settings.each_frame = False
+    assert attributes.active_color.name == "strain_energy_color"
+    settings.each_frame = True
+    assert attributes.active_color.name == "now_color"
+    bpy.ops.limber.color_by(scalar="young", each_frame=True)
+    assert attributes.active_color.name == "young_color"
+    settings.each_frame = False
+    assert attributes.active_color.name == "young_color"
+
+
+def test_colours_of_each_frame_survive_closing_and_moving(bpy, opened, beam, tmp_path):
+    """File and folder moved together: the colours go on; without the folder the last ones stay."""
+    bpy.ops.limber.color_by(scalar="strain_energy", each_frame=True)
+    home = tmp_path / "elsewhere"
+    home.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    shutil.move(beam.folder, home / beam.folder.name)
+    shutil.move(tmp_path / "scene.blend", home / "scene.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(home / "scene.blend"))
+    meshes, scene = part("bridge.meshes"), bpy.context.scene
+    data = scene.objects["beam"].data
+    scene.frame_set(6)
+    np.testing.assert_allclose(meshes.scalars(data, "now"), _density(beam, 5), rtol=1e-5)
+    (home / beam.folder.name / ".viewport" / "to-goal.npz").write_bytes(b"rubbish")
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=str(home / "scene.blend"))
+    scene = bpy.context.scene
+    scene.frame_set(3)
+    np.testing.assert_allclose(meshes.scalars(scene.objects["beam"].data, "now"),
+                               _density(beam, 5), rtol=1e-5)
+    assert bpy.ops.limber.color_by(scalar="strain_energy", each_frame=True) == {"FINISHED"}
+    active = scene.objects["beam"].data.color_attributes.active_color
+    assert active.name == "strain_energy_color", "the worst of all, and a warning"
+
+
+def test_a_motion_of_another_size_is_not_shown(addon, tmp_path):
+    """Values of fewer frames, or of fewer vertices, are no values of this motion."""
+    frame_values = part("frame_values")
+    shape = (3, 4)
+    values = frame_values.FrameValues({"strain": np.ones(shape, np.float32)},
+                                      {"strain": np.ones(shape, np.uint8)},
+                                      {"inferno": np.ones((256, 4))})
+    frame_values.keep(tmp_path, "swing", values)
+    read = frame_values.read(tmp_path, "swing")
+    assert read.names(3, 4) == {"strain"}
+    assert read.names(3, 5) == read.names(2, 4) == set()
+    assert frame_values.read(tmp_path, "another") is None
+    values.scalars["strain"][0, 0] = np.nan
+    frame_values.keep(tmp_path, "swing", values)
+    assert frame_values.read(tmp_path, "swing") is None
+    assert [path.name for path in (tmp_path / ".viewport").iterdir()] == ["swing.npz"]
+
+
+def test_what_can_be_shown_and_hidden(bpy, opened):
+    """Trees are hidden at first, paths are not; what is not there is said."""
+    seeing, branch = part("operators.seeing"), part("branches").branch_of(opened)
+
+    def hidden(group):
+        return {thing.hide_viewport for thing in seeing.things_of(branch, group)}
+    assert (hidden("trees"), hidden("paths"), hidden("hemisphere")) == ({True}, {False}, set())
+    bpy.ops.limber.show(group="trees")
+    bpy.ops.limber.show(group="paths", hide=True)
+    assert (hidden("trees"), hidden("paths")) == ({False}, {True})
+    with pytest.raises(RuntimeError, match="no grasps in reach"):
+        bpy.ops.limber.show(group="hemisphere")
+
+
+def test_paths_by_energy_have_a_legend_and_a_graph(bpy, opened):
+    """Rods in the colours of the energy; their scale joins the legend once they are in sight."""
+    legend, graph = part("overlays.legend"), part("overlays.graph")
+    rods = bpy.data.objects["D-RRT* path by energy"]
+    assert rods.hide_viewport and len(legend.shown_scales(opened)) == 1
+    bpy.ops.limber.show(group="energy")
+    assert [scale["unit"] for scale in legend.shown_scales(opened)] == ["Pa", "J"]
+    assert list(graph.graphs_of(opened)) == ["energy"]
+    assert bpy.ops.limber.graph(graph="energy") == {"FINISHED"}
+    assert bpy.context.scene.limber.graph == "energy"
+    bpy.ops.limber.graph(graph="energy")
+    assert bpy.context.scene.limber.graph == "none"
+    with pytest.raises(RuntimeError, match="no such graph"):
+        bpy.ops.limber.graph(graph="young")
+    corners, triangles = graph.strip([[0, 0, 1], [1, 0.5, 1]])
+    assert len(corners) == 4 and triangles == [(0, 1, 2), (1, 3, 2)]
+
+
+def test_several_branches(bpy, show, beam, tmp_path):
+    """Side by side without touching, back in place, each chosen by its button; grabs know which."""
+    copied = tmp_path / "second.branch"
+    shutil.copytree(beam.folder, copied)
+    first, second = show(beam.folder), show(copied)
+    find, scene = part("branches").find_surface, bpy.context.scene
+    assert find(scene) == second
+    bpy.ops.limber.choose_branch(branch=first.users_collection[0].name)
+    assert find(scene) == first
+    assert Path(scene.limber.branch_folder) == beam.folder
+    bpy.ops.limber.side_by_side()
+    bpy.context.view_layer.update()
+    spans = [[(thing.matrix_world @ type(thing.location)(corner)).x for corner in thing.bound_box]
+             for thing in (first, second)]
+    assert max(spans[0]) < min(spans[1])
+    # Shown anew it stays where it was put.
+    place = second.delta_location.x
+    second = show(copied)
+    assert second.delta_location.x == place > 0
+    bpy.ops.limber.side_by_side(back=True)
+    assert second.delta_location.x == 0
+    with pytest.raises(RuntimeError, match="no branch 'third'"):
+        bpy.ops.limber.choose_branch(branch="third")
+
+
+def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
+    """Renamed beside the file: by its number. Elsewhere: where the user says; never another's."""
+    several, scene = part("operators.several"), bpy.context.scene
+    branch = part("branches").branch_of(opened)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    shutil.copytree(beam.folder, tmp_path / "other.branch")
+    manifest = tmp_path / "other.branch" / "branch.json"
+    content = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps(content | {"uuid": "another"}))
+    beam.folder.rename(tmp_path / "renamed.branch")
+    assert several.is_lost(branch)
+    with pytest.raises(RuntimeError, match="not that of beam"):
+        bpy.ops.limber.relink(directory=str(tmp_path / "other.branch"))
+    assert bpy.ops.limber.relink() == {"FINISHED"}
+    assert not several.is_lost(branch)
+    assert bpy.path.abspath(scene.limber.branch_folder).endswith("renamed.branch")
+    assert bpy.ops.limber.play() == {"FINISHED"}
+    away = tmp_path / "a" / "b" / "c"
+    away.mkdir(parents=True)
+    (tmp_path / "renamed.branch").rename(away / "beam.branch")
+    with pytest.raises(RuntimeError, match="lies beside this file"):
+        bpy.ops.limber.relink()
+    assert bpy.ops.limber.relink(directory=str(away / "beam.branch")) == {"FINISHED"}
+    assert bpy.ops.limber.play() == {"FINISHED"}
+
+
+def test_the_example_opens(bpy, registered, tmp_path):
+    """The branch that comes along, in a copy: with all its results."""
+    assert bpy.ops.limber.open_example(directory=str(tmp_path / "mine")) == {"FINISHED"}
+    surface = part("branches").find_surface(bpy.context.scene)
+    assert surface.name == "bending_branch"
+    assert (tmp_path / "mine" / "bending_branch.blend").is_file()
+    info = part("branches").info_of(surface)
+    assert {"young", "energy", "force"} <= set(info["graphs"])
+    assert {"young", "strain_energy", "stress_over_strength", "residual"} <= set(info["scalars"])
+
+
+def test_a_known_material(bpy, registered):
+    """Its modulus and density are what the scan is reconstructed with."""
+    settings = bpy.context.scene.limber
+    bpy.ops.limber.material(material="oak")
+    assert settings.reconstruct.young == pytest.approx(9.3e9)
+    assert settings.scene.use_strength and settings.scene.strength == pytest.approx(57e6)
