@@ -45,7 +45,7 @@ PLANNED_TOLERANCE_M = 0.006
 
 _LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
-_MOST_FORCE_N = 10.0  # of the gripper on the planned path: a branch that is bent, not stretched
+_MOST_FORCE_N = 15.0  # of the gripper on the planned path: a branch that is bent, not stretched
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 _TOUCH_SIGMA_M = 3e-4
 _SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8

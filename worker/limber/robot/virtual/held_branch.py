@@ -20,12 +20,15 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
+from limber.robot.real_time import claim_real_time
 
+_SOLVER_PRIORITY = 10
 _BLEND_SECONDS = 0.05
 _LEAD = 1.5  # times what a solution takes: the middle of when it is used
 _LONGEST_LEAD = 0.5  # s
 _LEAST_WAY = 2e-3  # m between two solutions whose tangents are compared
 _FARTHEST = 0.03  # m over which such a change of the tangent is led on
+_SAME_PLACE = 1e-6  # m, rad; over that the tangent leads on exactly
 _TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
 
 
@@ -314,6 +317,11 @@ class HeldBranch:
             if self._solution is not None:
                 force = self._extrapolated(self._solution, ahead)[:3]
                 ahead[:3, 3] -= self.setting.compliance * force
+                if self._solution.converged and (
+                        np.abs(self._solution.change_to(ahead)).max() < _SAME_PLACE):
+                    # It stands still, and is solved there: the processor is others'.
+                    self._asked_age = 0.0
+                    return
             self._pipe.send(("solve", ahead))
             self._busy, self._asked_age = True, 0.0
 
@@ -364,6 +372,8 @@ def extrapolated(solution: Solution, patch: np.ndarray, compliance: float) -> np
 
 def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
     solver = _Solver(setting)
+    # Below the arm's own loop; above other programs, for which the branch's force would be late.
+    claim_real_time(_SOLVER_PRIORITY)
     try:
         pipe.send(("ready", {"points": solver.seen()}))
         while True:

@@ -111,8 +111,8 @@ class Server:
                 due = time.perf_counter()
             else:
                 await asyncio.sleep(0)
-            self.controller.step()
             stepped = time.perf_counter()
+            self.controller.step()
             self._publish()
             due += step
 
