@@ -110,7 +110,7 @@ def _stop_time(model: str, seed: int, runs: int) -> list[Row]:
                 after = robot.state
             # The force acts from the next step on.
             acts = before["clock"] + 1.0 / (125 if model == "ur5" else 500)
-            stopped = [moment for line in after["log"] if line.endswith("came")
+            stopped = [moment for line in after["log"] if line.endswith(("came", "dashboard"))
                        and (moment := float(line.split()[0])) > before["clock"]]
             latencies.append(stopped[0] - acts)
             ways.append(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))

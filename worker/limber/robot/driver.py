@@ -85,6 +85,7 @@ class Driver:
         self._following: Following | None = None
         self._gone: Trajectory | None = None
         self._stopped_at: float | None = None
+        self._dashboard_was_used = False
         self._command: np.ndarray | None = None
         self._held_for: np.ndarray | None = None
         self._held_at = np.zeros(6)
@@ -295,7 +296,11 @@ class Driver:
             self._sensor.connections = ()
             self._judge(self.guard.event(str(error)))
             return
-        self._judge(self.guard.feel(self._chain.between(sample, reading)))
+        decision = self.guard.feel(self._chain.between(sample, reading))
+        if decision.verdict == Verdict.STOP and self._following is not None:
+            # ur-rtde hands a command over with the controller's next step, 8 ms of a CB3's.
+            self._stop_by_dashboard(f"it does not wait for a step: {decision.reason}")
+        self._judge(decision)
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
                   pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -342,12 +347,13 @@ class Driver:
             stopped = bool(self._control.servoStop(_STOP_DECELERATION))
         except RuntimeError as error:
             self.tell(event="warning", text=f"servoStop: {error}")
-        if not stopped:
+        if not stopped and not self._dashboard_was_used:
             self._stop_by_dashboard("the control program did not confirm the stop")
 
     def _stop_by_dashboard(self, why: str) -> None:
         try:
             self._dashboard.stop()
+            self._dashboard_was_used = True
             self.tell(event="second_channel", reason=why)
         except OSError as error:
             self.tell(event="warning", text=f"dashboard stop: {error}; the controller's watchdog "
@@ -376,7 +382,7 @@ class Driver:
         if not self._control.isProgramRunning() and not self._control.reuploadScript():
             raise WorkError("The control program does not run.", "", "See the pendant.")
         self.guard.begin()
-        self._stopped_at = None
+        self._stopped_at, self._dashboard_was_used = None, False
         self._following = Following(trajectory)
         self._command = sample.pose.copy()
         rest = None if trajectory.expected is None else trajectory.expected.rest_pose

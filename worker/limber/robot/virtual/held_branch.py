@@ -9,6 +9,7 @@ tangent alone would be newtons off. How long a solution takes, and by how much t
 when one came, is part of the robot's state.
 """
 
+import time
 import zlib
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -23,6 +24,7 @@ from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
 from limber.robot.real_time import claim_real_time
 
 _SOLVER_PRIORITY = 10
+_REST = 0.25  # of what a solution took: a process that never rests is held up by the system
 _BLEND_SECONDS = 0.05
 _LEAD = 1.5  # times what a solution takes: the middle of when it is used
 _LONGEST_LEAD = 0.5  # s
@@ -385,7 +387,9 @@ def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
             elif kind == "try":
                 pipe.send(("tried", solver.tried()))
             else:
+                began = time.monotonic()
                 pipe.send(("solved", solver.solve(content)))
+                time.sleep(_REST * (time.monotonic() - began))
     except (EOFError, OSError):
         # The robot is gone, and nobody else asks.
         return
