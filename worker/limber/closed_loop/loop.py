@@ -217,8 +217,9 @@ class ClosedLoop:
             try:
                 self._part("overload", "the path again, with an overload", "execute", self.branch,
                            *self._armed(executed))
-            except SafetyStop as stop:
-                return stop.seen, watch
+            except SafetyStop:
+                told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
+                return told["stop_reason"], watch
         raise WorkError("The overload stopped nothing.", f"{_OVERLOAD[2]:.0f} N were added to the "
                         "sensor while the branch was led.", "See the robot's log.")
 
