@@ -207,6 +207,27 @@ def test_first_path(run, blender, environment, tmp_path):
         assert _colour_count(tmp_path / f"{picture}.png") > 50
 
 
+def test_manual_pictures(run, blender, environment, tmp_path):
+    """The manual's pictures can be taken: a window each, with what it shows. Kept where
+    LIMBER_MANUAL_PICTURES says, which alone has them taken."""
+    kept = os.environ.get("LIMBER_MANUAL_PICTURES")
+    if not kept:
+        pytest.skip("for the manual: scripts/make_manual_pictures")
+    require_screen()
+    driven("drive_manual.py", blender, environment, tmp_path)
+    Path(kept).mkdir(parents=True, exist_ok=True)
+    for name in ("start", "stress", "young"):
+        assert _colour_count(tmp_path / f"{name}.png") > 50
+        _cropped(tmp_path / f"{name}.png").save(Path(kept) / f"{name}.png", optimize=True)
+
+
+def _cropped(path: Path):
+    """Return the picture of the 3D view and its sidebar; in all its colours, which mean numbers."""
+    from PIL import Image
+
+    return Image.open(path).convert("RGB").crop((0, 28, 1056, 718))
+
+
 def test_skeleton(run, blender, environment, tmp_path):
     """In Edit Mode: a node moved, a twig cut, one hung over; undone; applied by the worker."""
     require_screen()

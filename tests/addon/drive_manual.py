@@ -1,0 +1,64 @@
+"""Takes the manual's pictures inside a Blender with a window; scripts/make_manual_pictures does it.
+
+FOLDER gets NAME.png. The example that comes along is what they show.
+"""
+
+import sys
+from pathlib import Path
+
+import bpy
+
+sys.path.insert(0, str(Path(__file__).parent))
+from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, view, waited
+
+BENT = 14
+
+
+def jobs():
+    return sys.modules[f"{KEY}.jobs"]
+
+
+def begin():
+    clear()
+    return True
+
+
+def open_example():
+    with override():
+        bpy.ops.limber.open_example("INVOKE_DEFAULT", directory=str(FOLDER))
+    return True
+
+
+def is_open():
+    return "bending_branch" in bpy.data.collections and not jobs().is_running() and waited(1.5)
+
+
+def save():
+    """Beside the example: its folder is shown relative to the file, not where this machine has it.
+    """
+    with override():
+        bpy.ops.wm.save_as_mainfile(filepath=str(FOLDER / "manual.blend"))
+    return True
+
+
+def see(graph, scalar, frame, *groups):
+    """Return the step that shows a graph, colours of a frame, and groups of marks beside it."""
+    def step():
+        current = bpy.context.scene
+        current.frame_set(frame)
+        current.limber.graph = graph
+        with override():
+            bpy.ops.limber.color_by(scalar=scalar, each_frame=True)
+            for group in groups:
+                bpy.ops.limber.show(group=group)
+            for thing in list(bpy.context.selected_objects):
+                # No outline about what is coloured.
+                thing.select_set(False)
+        view()[1].tag_redraw()
+        return True
+    return step
+
+
+drive([begin, is_tab_open, picture("start"), open_example, is_open, save,
+       see("energy", "stress_over_strength", BENT, "energy"), picture("stress"),
+       see("young", "young", 1), picture("young")], longest=60)
