@@ -80,7 +80,8 @@ def _draw_colours(layout: bpy.types.UILayout, surface: bpy.types.Object, setting
         button = body.operator("limber.color_by", text=title[0].upper() + title[1:], icon="COLOR",
                                depress=is_shown)
         button.scalar, button.each_frame = name, settings.each_frame
-        span = f"{scale['ticks'][0]} to {scale['ticks'][-1]}"
+        ticks = scale["ticks"]
+        span = f"{ticks[1]} everywhere" if scale.get("is_one") else f"{ticks[0]} to {ticks[-1]}"
         body.label(text=f"{span} ({rest}" if rest else span, icon="BLANK1")
     if "stress_over_strength" in info["scalars"]:
         row = body.row(heading="Strength [Pa]")

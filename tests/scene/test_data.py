@@ -86,7 +86,7 @@ def test_scale(tmp_path, mesh, low, high, log, ticks):
     young[mesh.centroids[:, 2] > 0.25] = high
     data = scene_data(_branch(tmp_path / "a.branch", mesh.with_data(cell_data={"young": young})))
     scale = data.info["scalars"]["young"]
-    assert scale["log"] is log
+    assert scale["log"] is log and scale["is_one"] is (low == high)
     assert scale["ticks"] == ticks
     colours = data.arrays["color:young"]
     assert colours.shape == (len(data.arrays["vertices"]), 4)

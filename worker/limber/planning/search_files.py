@@ -42,9 +42,8 @@ class CostToGo:
         return map_coordinates(self.costs, places.T, order=1, cval=np.nan)
 
     def write(self, path: Path) -> None:
-        """Write it as plain arrays; -1 where it is not known."""
-        np.savez_compressed(path, origin_m=self.origin, axes=self.axes,
-                            costs=np.nan_to_num(self.costs, nan=-1.0),
+        """Write it as plain arrays."""
+        np.savez_compressed(path, origin_m=self.origin, axes=self.axes, costs=self.costs,
                             spacing_m=np.array(self.spacing))
 
     @classmethod
@@ -57,8 +56,8 @@ class CostToGo:
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, {"origin_m": (3,), "axes": (3, 3), "spacing_m": (),
                                       "costs": ("x", "y", "z")}, _WHAT)
-        costs = np.where(arrays["costs"] < 0.0, np.nan, arrays["costs"])
-        return cls(arrays["origin_m"], arrays["axes"], float(arrays["spacing_m"]), costs)
+        return cls(arrays["origin_m"], arrays["axes"], float(arrays["spacing_m"]),
+                   arrays["costs"])
 
 
 def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -16,13 +16,15 @@ _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, 
 
 
 def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dict[str, Any]:
-    """Return a scale that spans ``values``: title, unit, low, high, log, ticks, stops.
+    """Return a scale that spans ``values``: title, unit, low, high, log, ticks, stops,
+    colours; and ``is_one``: all values are the middle one.
 
     Args:
         colours: ``viridis`` or ``inferno``.
     """
     low, high = float(values.min()), float(values.max())
-    if high - low <= 1e-6 * abs(high):
+    is_one = high - low <= 1e-6 * abs(high)
+    if is_one:
         # One value everywhere: put it in the middle, so that it has a colour and a label.
         low, high = (0.5 * low, 1.5 * low) if low > 0 else (low - 0.5, low + 0.5)
     log = low > 0 and high / low > 10.0
@@ -31,7 +33,7 @@ def colour_scale(values: np.ndarray, title: str, unit: str, colours: str) -> dic
     middle = float(np.sqrt(low * high)) if log else 0.5 * (low + high)
     ticks = [with_unit(value, unit, value if log else high) for value in (low, middle, high)]
     return {"title": title, "unit": unit, "low": low, "high": high, "log": log, "ticks": ticks,
-            "stops": _stops(colours), "colours": colours}
+            "stops": _stops(colours), "colours": colours, "is_one": is_one}
 
 
 def colours_of(values: np.ndarray, scale: dict[str, Any]) -> np.ndarray:

@@ -171,7 +171,8 @@ def _add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str
     values = values.astype(np.float32)
     worst, word = (values.min(axis=0), "least") if name == "det_f" else (
         values.max(axis=0), "peak")
-    scale = colour_scale(np.append(worst, 0.0) if is_from_zero else worst, title, unit, colours)
+    spanned = np.append(np.maximum(worst, 0.0), 0.0) if is_from_zero else worst
+    scale = colour_scale(spanned, title, unit, colours)
     add_scalar(data, name, worst.astype(float), {**scale, "title": f"{word} {title}"})
     data.info["frame_scalars"][name] = scale
     data.arrays |= {f"frame_scalar:{name}": values, f"frame_level:{name}": levels_of(values, scale),
