@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 import bpy
+from mathutils import Vector
 
 from .bridge import skeletons
 
@@ -76,6 +77,15 @@ def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
         return surface
     found = (surface_of(branch) for branch in reversed(shown))
     return next((surface for surface in found if surface is not None), None)
+
+
+def in_branch(scene: bpy.types.Scene, place: Vector) -> Vector:
+    """Return a place of the world in the frame of the branch that is meant [m].
+
+    They differ where branches stand side by side; without a branch they are one.
+    """
+    surface = find_surface(scene)
+    return Vector(place) if surface is None else surface.matrix_world.inverted() @ Vector(place)
 
 
 def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:

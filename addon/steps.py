@@ -14,6 +14,8 @@ NOT_FROM_HERE = {"execute": frozenset({"arm", "confirm", "after_stop"})}
 """What the add-on never sets: a robot is set in motion at a terminal, by who stands beside it."""
 WAYS = frozenset({"move"})
 """Vectors in metres that say how far, not where: the 3D cursor does not give them."""
+REGIONS = ("goal", "tip_goal", "target_box", "workspace_low")
+"""Fields of a plan that the active object gives: a ball, or (with what belongs to it) a box."""
 PLACES = {"fruit": (0.1,), "cut": ()}
 """Lists of places on the branch, and what stands behind a place: the mass [kg] of a fruit."""
 

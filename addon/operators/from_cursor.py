@@ -1,12 +1,13 @@
-"""Take a place from the 3D cursor."""
+"""Take a place from the 3D cursor, or a region from an object."""
 
 from typing import ClassVar
 
 import bpy
+from mathutils import Vector
 
-from .. import properties
+from .. import branches, properties
 from ..stages import stages
-from ..steps import PLACES
+from ..steps import PLACES, REGIONS
 
 
 class LIMBER_OT_from_cursor(bpy.types.Operator):
@@ -27,7 +28,7 @@ class LIMBER_OT_from_cursor(bpy.types.Operator):
             self.report({"ERROR"}, f"{self.stage} has no place {self.field!r}.")
             return {"CANCELLED"}
         group = properties.group_of(context.scene, stage)
-        place = tuple(context.scene.cursor.location)
+        place = tuple(branches.in_branch(context.scene, context.scene.cursor.location))
         if is_list:
             # One more of them.
             given = getattr(group, field.name)
@@ -40,9 +41,51 @@ class LIMBER_OT_from_cursor(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LIMBER_OT_from_object(bpy.types.Operator):
+    """Take this region of the plan from the active object: its bounding box, or the ball about its
+    middle"""
+
+    bl_idname = "limber.from_object"
+    bl_label = "From Active Object"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    region: bpy.props.EnumProperty(name="Region", items=[
+        (name, name.replace("_", " ").capitalize(), "") for name in REGIONS])
+
+    @classmethod
+    def poll(cls, context):
+        thing = context.active_object
+        if thing is None or branches.branch_of(thing) is not None:
+            cls.poll_message_set("Add an object where the region is, and select it")
+            return False
+        return True
+
+    def execute(self, context):
+        thing, plan = context.active_object, context.scene.limber.plan
+        corners = [branches.in_branch(context.scene, thing.matrix_world @ Vector(corner))
+                   for corner in thing.bound_box]
+        low, high = (tuple(bound(corner[axis] for corner in corners) for axis in range(3))
+                     for bound in (min, max))
+        if self.region == "target_box":
+            given = {"target_box": low + high}
+        elif self.region == "workspace_low":
+            given = {"workspace_low": low, "workspace_high": high}
+        else:
+            given = {self.region: tuple((a + b) / 2 for a, b in zip(low, high, strict=True))}
+            # Of an empty, a point: the tolerance stays.
+            plan.goal_tolerance = max(b - a for a, b in zip(low, high, strict=True)) / 2 or (
+                plan.goal_tolerance)
+        for name, value in given.items():
+            setattr(plan, name, value)
+            setattr(plan, properties.OPEN + name, True)
+        return {"FINISHED"}
+
+
 def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_from_object)
     bpy.utils.register_class(LIMBER_OT_from_cursor)
 
 
 def unregister() -> None:
     bpy.utils.unregister_class(LIMBER_OT_from_cursor)
+    bpy.utils.unregister_class(LIMBER_OT_from_object)

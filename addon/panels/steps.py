@@ -8,7 +8,17 @@ import bpy
 from .. import branch_folder, jobs, properties
 from ..branch_folder import BranchRecord, StageRecord
 from ..stages import Field, Stage, stages
-from ..steps import PLACES, STEPS, WAYS, StageView, Step, StepState, button_of, hidden_fields
+from ..steps import (
+    PLACES,
+    REGIONS,
+    STEPS,
+    WAYS,
+    StageView,
+    Step,
+    StepState,
+    button_of,
+    hidden_fields,
+)
 from ..steps import next_step as step_after
 from .comparing import draw_moduli, draw_paths
 from .results import draw_results
@@ -186,6 +196,7 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
     has_place = "branch_folder" in stage.fields and (field.name in PLACES or (
         field.kind == "vector" and field.length == 3 and field.unit == "m"
         and field.name not in WAYS))
+    has_region = stage.name == "plan" and field.name in REGIONS
     if not (field.is_optional and properties.has_switch(field)) and not has_place:
         layout.prop(group, field.name)
         return
@@ -199,6 +210,8 @@ def _draw_field(layout: bpy.types.UILayout, context: bpy.types.Context, stage: S
     if has_place:
         operator = row.operator("limber.from_cursor", text="", icon="CURSOR")
         operator.stage, operator.field = stage.name, field.name
+    if has_region:
+        row.operator("limber.from_object", text="", icon="OBJECT_DATA").region = field.name
 
 
 def _draw_text(layout: bpy.types.UILayout, text: str, icon: str) -> None:

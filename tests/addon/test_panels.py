@@ -133,7 +133,8 @@ def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, opera
     stages = importlib.import_module("limber_addon.stages").stages()
     steps = importlib.import_module("limber_addon.steps")
     drawn = _draw_step(bpy, name)
-    shown = [call for call in drawn.names("operator") if call != "limber.from_cursor"]
+    shown = [call for call in drawn.names("operator") if call not in (
+        "limber.from_cursor", "limber.from_object")]
     assert shown == operators
     step = _step(bpy, name).step
     for view in (step.view, *step.others):

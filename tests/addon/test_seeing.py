@@ -211,6 +211,26 @@ def test_the_example_opens(bpy, registered, tmp_path):
     assert {"young", "strain_energy", "stress_over_strength", "residual"} <= set(info["scalars"])
 
 
+def test_regions_come_from_objects_in_the_branchs_frame(bpy, opened):
+    """A cube about a place: as a ball, as a box; also where the branch was put aside."""
+    plan = bpy.context.scene.limber.plan
+    opened.delta_location = (2.0, 0.0, 0.0)
+    bpy.ops.mesh.primitive_cube_add(size=0.1, location=(2.1, 0.2, 0.3))
+    bpy.context.view_layer.update()
+    assert bpy.ops.limber.from_object(region="goal") == {"FINISHED"}
+    assert list(plan.goal) == pytest.approx([0.1, 0.2, 0.3], abs=1e-5)
+    assert plan.use_goal and plan.goal_tolerance == pytest.approx(0.05, abs=1e-5)
+    bpy.ops.limber.from_object(region="target_box")
+    assert list(plan.target_box) == pytest.approx([.05, .15, .25, .15, .25, .35], abs=1e-5)
+    bpy.ops.limber.from_object(region="workspace_low")
+    assert list(plan.workspace_high) == pytest.approx([.15, .25, .35], abs=1e-5)
+    bpy.context.scene.cursor.location = (2.0, 0.0, 0.4)
+    bpy.ops.limber.from_cursor(stage="plan", field="goal")
+    assert list(plan.goal) == pytest.approx([0.0, 0.0, 0.4], abs=1e-5)
+    bpy.context.view_layer.objects.active = opened
+    assert not bpy.ops.limber.from_object.poll()
+
+
 def test_a_known_material(bpy, registered):
     """Its modulus and density are what the scan is reconstructed with."""
     settings = bpy.context.scene.limber
