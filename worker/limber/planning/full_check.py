@@ -15,11 +15,18 @@ _MOST_LEARNT = 12  # of them a round
 _SLACK = 1e-3  # share of the goal's tolerance that is round-off
 
 
-def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal) -> list[str]:
+def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: np.ndarray,
+                         ) -> list[str]:
     """Return what is wrong with a motion, each with its place; nothing if it may be used.
 
-    Every pose of approach and path must have an acceptable solution within the limits, and its end
-    must be in the goal region. The way back takes the same states.
+    Every pose of approach and path must have an acceptable solution within the limits, clear of
+    obstacles, and its end must be in the goal region. The way back takes the same states.
+
+    Args:
+        path: Solved on the full model.
+        limits: As asked, without margins.
+        goal: Where it must end.
+        nodes: Of the mesh at rest [m], shape [n, 3].
     """
     told = []
     for position, reason in zip(path.unsolved, path.reasons, strict=True):
@@ -32,6 +39,8 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal) -> list
         off = float(goal.region.distance(goal.place(path.solved)[None])[0])
         if off > goal.tolerance * _SLACK:
             told.append(f"the {goal.name} ends {1e3 * off:.1f} mm outside its goal")
+    if met := limits.met(whole, nodes):
+        told.append(met)
     return told
 
 
@@ -72,8 +81,8 @@ def _as_samples(grasp_model: GraspModel, states: SolvedPoses, unsolved: np.ndarr
     names = ("targets", "torques", "strain_places", "stresses", "axial_forces")
     optional = {name: getattr(states, name) for name in names if getattr(like, name) is not None}
     if like.shape_slopes is not None:
-        optional["shape_slopes"] = np.array([grasp_model.shape_slopes(u)
-                                             for u in states.displacements])
+        slopes = [grasp_model.shape_slopes(moved) for moved in states.displacements]
+        optional["shape_slopes"] = np.reshape(slopes, (-1, *like.shape_slopes.shape[1:]))
     return GraspSamples(states.poses, states.energies, states.forces, states.tips,
                         states.min_det_f, np.hstack([unsolved, np.zeros_like(unsolved)]),
                         states.strains, **optional)

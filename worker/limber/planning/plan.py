@@ -107,9 +107,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             grasp_model, [pair.plan.points] + [pair.baseline.points] * (not same), pair.approach,
             workers, ahead.part(0.3, 0.95))
         baseline = other[0] if other else baseline
-        broken = broken_on_full_model(plan, limits, goal)
-        if met := limits.met(plan.approach.joined(plan.solved), grasp_model.mesh.nodes):
-            broken.append(met)
+        broken = broken_on_full_model(plan, limits, goal, grasp_model.mesh.nodes)
         if doubt is not None and not broken:
             risks.append(doubt.risk(grasp_model, plan, limits, settings.confidence))
             broken = risks[-1].told()
