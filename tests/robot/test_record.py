@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
-from limber.errors import InputError, SafetyStop
+from limber.errors import BranchFolderError, InputError, SafetyStop
 from limber.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.robot.cell import Cell
@@ -20,7 +20,7 @@ from limber.robot.kinematics import matrices
 from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.stages.loading import load_skeleton
 from limber.stages.record import RecordOptions, RecordSettings, record
-from limber.stages.record_way import there_and_back, way_on_arc, way_through
+from limber.stages.record_way import suggested_pull, there_and_back, way_on_arc, way_through
 from limber.store import Branch
 
 pytest.importorskip("rtde_control")
@@ -181,6 +181,19 @@ def test_an_arc_stretches_nothing(branch_folder):
     turn = Rotation.from_matrix(frames[-1, :3, :3]).as_rotvec()
     assert np.linalg.norm(turn) > 0.04 / np.linalg.norm(point - skeleton.nodes[0])
     assert abs(turn @ way) < 0.3 * np.linalg.norm(turn)
+
+
+def test_a_suggested_pull_is_taken_where_it_holds_the_branch(branch_folder):
+    branch, point = Branch.open(branch_folder), np.array([0.0, 0.0, 0.4])
+    with pytest.raises(BranchFolderError, match="suggest"):
+        suggested_pull(branch, point)
+    best = {"grasp_point_m": [0.0, 0.0, 0.4], "end_m": [0.03, 0.0, 0.396], "travel_m": 0.0303}
+    with branch.stage("suggest-pull") as stage:
+        stage.path("suggested_pull.json").write_text(json.dumps({"best": best, "others": []}))
+    direction, distance = suggested_pull(branch, point + 0.004)
+    assert direction == pytest.approx([0.03, 0, 0]) and distance == 0.0303
+    with pytest.raises(InputError, match="20 mm from where the suggested pull"):
+        suggested_pull(branch, point - [0, 0, 0.02])
 
 
 def test_way_points_begin_at_the_gripper(tmp_path):

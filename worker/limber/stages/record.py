@@ -43,7 +43,8 @@ class RecordSettings(Settings):
     """
 
     groups: ClassVar[Groups] = {
-        "pull": ("direction", "distance", "shape", "waypoints", "speed", "cycles", "pause")}
+        "pull": ("direction", "distance", "shape", "waypoints", "suggested", "speed", "cycles",
+                 "pause")}
 
     direction: tuple[float, float, float] = Field(
         (1.0, 0.0, 0.0), description="Where to pull, branch frame; its length does not count.")
@@ -54,6 +55,9 @@ class RecordSettings(Settings):
     waypoints: str | None = Field(
         None, description="CSV of the gripper's way instead: x_m,y_m,z_m, and rx_rad,ry_rad,rz_rad "
         "where it turns; branch frame, from where the gripper is.")
+    suggested: bool = Field(
+        False, description="The pull that `limber suggest-pull` found best: its direction and "
+        "distance; the gripper has to be at its place.", json_schema_extra={"switch": True})
     speed: float = Field(0.03, gt=0, le=0.25, description="Speed of the gripper [m/s].")
     cycles: int = Field(1, ge=1, le=20, description="Times out and back.")
     pause: float = Field(0.5, ge=0, le=10, description="Standing still at each end [s].")
@@ -205,9 +209,11 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, gripper: np.ndarray,
           settings: RecordSettings, progress: Progress) -> Trajectory:
     """The motion of the gripper, which is at ``gripper`` [6], branch frame."""
     from limber.robot.kinematics import matrices
-    from limber.stages.record_way import there_and_back, way_on_arc, way_through
+    from limber.stages.record_way import suggested_pull, there_and_back, way_on_arc, way_through
 
-    direction = np.array(settings.direction, float)
+    direction, distance = np.array(settings.direction, float), settings.distance
+    if settings.suggested:
+        direction, distance = suggested_pull(branch, point)
     length = np.linalg.norm(direction)
     if length < 1e-9 and settings.waypoints is None:
         raise InputError("--direction 0 0 0.", "It points nowhere.", "Give a direction.")
@@ -219,10 +225,10 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, gripper: np.ndarray,
     if settings.waypoints is not None:
         frames = way_through(Path(settings.waypoints), gripper)
     elif settings.shape == "arc":
-        frames = way_on_arc(branch, point, direction, settings.distance, progress) @ here
+        frames = way_on_arc(branch, point, direction, distance, progress) @ here
     else:
         frames = np.array([here, here])
-        frames[1, :3, 3] += settings.distance * direction / length
+        frames[1, :3, 3] += distance * direction / length
     return there_and_back(cell, frames, speed=settings.speed, cycles=settings.cycles,
                           pause=settings.pause)
 

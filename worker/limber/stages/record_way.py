@@ -3,10 +3,11 @@
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from limber.errors import InputError
 from limber.progress import Progress
-from limber.reading import read_columns
+from limber.reading import read_columns, read_json_as
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.cell import Cell
 from limber.robot.joint_path import joint_path
@@ -17,8 +18,26 @@ from limber.store import Branch
 GRASP_RADIUS_M = 0.012
 """Half width of what a gripper takes hold of along the branch."""
 
+_SAME_PLACE_M = 0.01  # from where a suggested pull holds the branch
 _STATES = 12  # of an arc: a chord of 4 mm on a bend of 0.3 m stretches a branch by 7 micrometres
 _NEAR_M = 0.005  # from the gripper, where given places begin
+
+
+_Vector = tuple[float, float, float]
+
+
+class _Pull(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    grasp_point_m: _Vector
+    end_m: _Vector
+    travel_m: float = Field(gt=0, le=0.5)
+
+
+class _Suggested(BaseModel):
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+
+    best: _Pull
 
 
 def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distance: float,
@@ -58,6 +77,29 @@ def way_on_arc(branch: Branch, point: np.ndarray, direction: np.ndarray, distanc
     # The force was found to some percent; a bend that is a little longer has the same shape.
     frames = matrices(np.array(poses))
     return frames @ inverted(frames[0])
+
+
+def suggested_pull(branch: Branch, point: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return direction [3] across the branch and distance [m] of the pull that was found best.
+
+    Args:
+        point: Where the gripper is on the branch, branch frame [m], shape [3].
+
+    Raises:
+        BranchFolderError: none was suggested. InputError: it is to be held elsewhere.
+    """
+    path = branch.require("suggested_pull.json", "suggest-pull")
+    found = read_json_as(path, _Suggested, "a suggested pull").best
+    place = np.array(found.grasp_point_m)
+    away = float(np.linalg.norm(place - point))
+    if away > _SAME_PLACE_M:
+        raise InputError(
+            f"The gripper is {1000 * away:.0f} mm from where the suggested pull holds the branch, "
+            f"({', '.join(f'{x:.3f}' for x in place)}) m.", "Held elsewhere the same way tells "
+            "something else, and strains the branch otherwise.", "Move the gripper there.")
+    # The end lies on the arc, nearer to the root, which is the origin: the pull is across.
+    way, out = np.array(found.end_m) - place, place / max(float(np.linalg.norm(place)), 1e-9)
+    return way - (way @ out) * out, found.travel_m
 
 
 def way_through(path: Path, gripper: np.ndarray) -> np.ndarray:
