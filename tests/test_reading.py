@@ -80,6 +80,15 @@ def test_an_array_that_announces_more_than_there_is(tmp_path, shape):
             read_arrays(tmp_path / name, "arrays")
 
 
+def test_a_header_that_is_no_header(tmp_path):
+    """One that Python's own parser of words gives up on."""
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': ((3,"
+    path = tmp_path / "a.npy"
+    path.write_bytes(np.lib.format.magic(1, 0) + struct.pack("<H", len(header)) + header)
+    with pytest.raises(InputError, match=r"a\.npy"):
+        read_arrays(path, "numbers")
+
+
 def test_an_archive_that_would_flood_the_memory(tmp_path):
     """A megabyte that expands to a gigabyte is refused before it does."""
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:

@@ -2,7 +2,8 @@
 # Young's modulus of one branch from recordings, without a window:
 #   estimate.sh NAME.branch RECORDING...
 # In Blender instead: LIMBER="blender -b --command limber" estimate.sh ...
-# Run again it keeps what is up to date. Options of the import: IMPORT="--unit mm" (see --help).
+# Run again it keeps what is up to date. Options of the two stages: IMPORT="--unit mm",
+# ESTIMATE="--fractions 0.3,0.7" (see --help).
 set -euo pipefail
 limber=${LIMBER:-limber}
 branch=$1
@@ -13,4 +14,5 @@ for recording in "$@"; do
   $limber import-pull "$branch" "$recording" --name "$name" ${IMPORT:-}
 done
 # The last line is one JSON object; the rest is for people.
-$limber estimate "$branch" --json | tail -n 1 > "${branch%.branch}-estimate.json"
+# shellcheck disable=SC2086
+$limber estimate "$branch" ${ESTIMATE:-} --json | tail -n 1 > "${branch%.branch}-estimate.json"

@@ -83,7 +83,8 @@ def test_no_header_is_believed(reader, data, tmp_path):
     objects = io.BytesIO()
     np.save(objects, np.array([None], dtype=object), allow_pickle=True)
     for name, content in (("huge", huge.getvalue()), ("objects", objects.getvalue()),
-                          ("text", b"no array")):
+                          ("text", b"no array"),
+                          ("words", np.lib.format.magic(1, 0) + b"\x0b\0{'shape': ((")):
         path = tmp_path / f"{name}.npz"
         data.write(path)
         with zipfile.ZipFile(path, "a") as archive:

@@ -47,6 +47,17 @@ def test_a_branch_that_is_stiffer_everywhere(small_model, bent):
     assert doubt_of(small_model, [0.08]).risk(small_model, bent, wide, 0.95).is_kept
 
 
+def test_what_is_left_to_a_motion_is_what_the_moduli_leave(small_model, bent):
+    """At the pose where the force is nearest its limit, standing still takes as much of what is
+    left for the estimate's branch as the stiffest branch in question takes of the limit."""
+    peak = bent.ahead.force_sizes.max()
+    limits = Limits(force=1.3 * peak, strain=0.5)
+    found = doubt_of(small_model, [0.08]).risk(small_model, bent, limits, 0.95)
+    left = found.left(limits, bent)
+    assert left.force == pytest.approx(peak / found.excess["force"])
+    assert peak < left.force < limits.force and left.strain == limits.strain
+
+
 def test_the_log_of_a_force_is_linear_in_the_logs_of_the_moduli(small_model, bent):
     """What the slopes say of moduli that change against each other, against the full model."""
     doubt = doubt_of(small_model, [0.1, 0.15], -0.5)

@@ -135,6 +135,22 @@ def test_saved_field_is_the_same(tmp_path, ridge_field):
         assert wanted <= set(file.files)
 
 
+@pytest.mark.parametrize(("name", "change"), [
+    ("chart_layers", lambda values: values[:1]),
+    ("chart_layers", lambda values: np.repeat(values, 2, axis=0)),
+    ("energy_fit_value_weights", lambda values: values * 1e300)])
+def test_a_field_of_odd_numbers_is_refused(tmp_path, ridge_field, name, change):
+    """One chart too many or too few, weights whose sums are not finite."""
+    path = tmp_path / "energy.npz"
+    ridge_field.write(path)
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {key: file[key] for key in file.files}
+    arrays[name] = change(arrays[name])
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match="is not an energy field"):
+        EnergyField.read(path)
+
+
 def test_damaged_file_is_named(tmp_path):
     """A file that is no energy field is an input error that says what to run."""
     path = tmp_path / "energy.npz"

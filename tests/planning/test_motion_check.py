@@ -1,16 +1,22 @@
 """Motions in time on the full model: slow ones are static, fast ones are slowed until they hold."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import limber.planning.plan as plan_module
+from limber.errors import NoPathError
 from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings
 from limber.planning.limits import Limits
-from limber.planning.motion_check import check_motion
+from limber.planning.motion_check import MotionCheck, check_motion
+from limber.planning.plan_file import read_plan
 from limber.planning.resolve import resolve_path
+from limber.planning.settings import PlanSettings
 from limber.planning.timing import Pace, poses_at, time_law
+from limber.stages.plan import plan as plan_paths
 
 BRISK = Pace(0.25, 2.0)
 
@@ -74,3 +80,18 @@ def test_what_no_pace_keeps_is_broken_with_its_place(small_model, bent):
     found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=4, workers=1)
     assert found.slowings == 0 and found.excess["force"] > 1.0
     assert "force in motion" in found.broken[0] and "at (" in found.broken[0]
+
+
+def test_a_plan_that_inertia_breaks_is_refused(planned_branch, tmp_path, monkeypatch):
+    """With exit code 3, where and what, however slow it was tried; and nothing is written."""
+    folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")
+    known = read_plan(folder / "plans/there.json")
+    there, most = known.plan, 1.5 * float(known.motion.force_sizes.max())
+    words = "force in motion [N] 99 where 60 is allowed, at (0.1, 0.2, 0.3) m"
+    monkeypatch.setattr(plan_module, "check_motion", lambda *_, **__: MotionCheck(
+        Pace(0.001, 0.001), [words], {"force": 99.0}, {"force": 10.0}, 4, {"force": 1.65}, 9, 0.1))
+    with pytest.raises(NoPathError, match="force in motion") as refused:
+        plan_paths(folder, PlanSettings(
+            max_force=most, replans=0, iterations=100, start=tuple(there.poses[0, :3]),
+            goal=tuple(there.poses[-1, :3])), name="shaken", workers=1)
+    assert refused.value.exit_code == 3 and not (folder / "plans/shaken.json").exists()

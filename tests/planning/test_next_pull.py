@@ -95,6 +95,8 @@ def test_the_stage_writes_the_best_pull_and_answers_for_a_plan(planned_branch, t
     shares = [pull["bits_per_percent_strain"] for pull in [written["best"], *written["others"]]]
     assert shares == sorted(shares, reverse=True) and len(shares) > 4
     assert written["best"]["peak_strain"] <= 0.05
+    assert written["most_telling"]["bits"] == max(
+        pull["bits"] for pull in [written["best"], *written["others"]])
     assert all(after < now for after, now in zip(
         written["best"]["young_deviation"], written["young_deviation_now"], strict=True))
     assert result["plan"]["worth"] is False and "no limit" in result["plan"]["why"]

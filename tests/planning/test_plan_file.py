@@ -17,6 +17,7 @@ from limber.planning.plan_file import (
     whole_motion,
 )
 from limber.planning.resolve import ResolvedPath, SolvedPoses
+from limber.planning.settings import PlanSettings
 from limber.planning.timing import Pace
 
 OLD = Path(__file__).parent / "plan_format_1.json"  # written by the last version before format 2
@@ -133,3 +134,12 @@ def test_joints_are_carried(path, tmp_path):
     file = tmp_path / "plan.json"
     file.write_text(plan_text(summary, way, way, way, {}))
     np.testing.assert_array_equal(read_plan(file).motion.joints, np.ones((3, 6)))
+
+
+def test_a_wood_limits_the_strain_to_half_of_what_it_breaks_at():
+    """Cherry, 8,000 psi over 1.31 million psi, half of it; not together with another limit."""
+    assert Limits.of(PlanSettings(wood="cherry")).strain == pytest.approx(0.00305, abs=1e-5)
+    for wood in ("ash", "maple", "oak", "walnut"):
+        assert 0.0025 < Limits.of(PlanSettings(wood=wood)).strain < 0.0035
+    with pytest.raises(InputError, match="--max-strain and --wood"):
+        Limits.of(PlanSettings(wood="oak", max_strain=0.01))

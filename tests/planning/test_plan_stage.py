@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from limber.planning.goals import default_goal
 from limber.planning.plan import _doubts
 from limber.planning.resolve import resolve_path
 from limber.progress import Progress
-from limber.report.plan_figures import report_figures
+from limber.report.plan_figures import convergence, report_figures
 from limber.stages.energy import EnergySettings, sample_energy_field
 from limber.stages.loading import load_grasp_model
 from limber.stages.plan import plan as plan_paths
@@ -233,3 +234,12 @@ def test_figures_draw(planned_branch, tmp_path):
                                                               "there")):
         figure.savefig(tmp_path / f"{number}.png")
         assert caption and (tmp_path / f"{number}.png").stat().st_size > 5000
+
+
+def test_a_planner_that_found_its_first_path_late_is_drawn():
+    """Grids without a path yet have no cost: the curve begins where there is one."""
+    plan = SimpleNamespace(summary={"convergence": {"baseline": [], "plan": [
+        {"iteration": 1, "cost": None}, {"iteration": 2, "cost": 2.0},
+        {"iteration": 3, "cost": 1.0}]}})
+    (line,) = convergence(plan).axes[0].lines
+    assert line.get_xdata().tolist() == [2, 3] and line.get_ydata().tolist() == [2.0, 1.0]

@@ -109,3 +109,15 @@ def test_yolo_says_what_is_missing(weights, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ultralytics", None)
     with pytest.raises(MissingDependencyError, match="ultralytics"):
         YoloSegmenter(weights)
+
+
+def test_an_image_that_announces_more_than_it_has(tmp_path):
+    """No memory is taken for a part of two gigabytes in a file of a hundred bytes."""
+    path = tmp_path / "mask.png"
+    Image.fromarray(np.zeros((8, 8), np.uint8)).save(path)
+    content = bytearray(path.read_bytes())
+    at = content.index(b"IDAT") - 4
+    content[at:at + 4] = (2**31 + 43).to_bytes(4, "big")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is announced"):
+        read_mask(path)

@@ -188,3 +188,9 @@ def test_a_swing_has_a_section(meshed):
     page, sections = draw_page(meshed)
     found = next(section for section in sections if section.title == "Swing let-go")
     assert len(found.pictures) == 1 and found.text == ["a word"] and "2.4 to 2.7" in page
+
+
+def test_a_deviation_that_is_not_known_is_told_so():
+    rows = deviation_rows({"fractions": [0.2, 0.8], "young_deviation": {
+        "sensor": [0.1, None], "geometry": None, "mesh": None, "total": [0.1, 0.2]}})
+    assert rows[2][2:] == ["not known", "not examined", "not examined", "20.0 %"]

@@ -75,3 +75,14 @@ def test_camera_file_round_trip_and_named_error(tmp_path):
     with pytest.raises(InputError, match="intrinsics"):
         read_camera(tmp_path / "none.toml")
     assert Camera(width=4, height=3, fx=1, fy=1, cx=0, cy=0).depth_scale == 1000
+
+
+def test_numbers_that_no_camera_has_are_refused(tmp_path):
+    """With them a pixel would lie at no finite place."""
+    for line in ("fy = 1e-300", "cx = 1e200", "depth_scale = 1e-12"):
+        text = {"width": "32", "height": "24", "fx": "40.0", "fy": "40.0", "cx": "15.5",
+                "cy": "11.5"} | dict([line.split(" = ")])
+        path = tmp_path / "camera.toml"
+        path.write_text("".join(f"{name} = {value}\n" for name, value in text.items()))
+        with pytest.raises(InputError, match=line.split()[0]):
+            read_camera(path)

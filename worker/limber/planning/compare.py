@@ -22,6 +22,7 @@ from limber.progress import SILENT, Progress
 
 _SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
 _AT_START = 1e-4  # [m] the approach ends that near
+_ANY = 1e6  # gap: any path will do
 
 
 @dataclass(frozen=True)
@@ -206,10 +207,15 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     line = np.linspace(field.rest, start, 40)
     points, least = refine(line, way)
     if not np.isfinite(least):
-        rough = plan_path(PathProblem(
-            field.rest, start[None], lambda points: np.linalg.norm(points - start, axis=1) < 1e-9,
-            field, problem.limits, cost.weights), Search(iterations=1500, seed=settings.seed))
-        points, _ = refine(rough.points, way)
+        try:
+            rough = plan_path(PathProblem(
+                field.rest, start[None],
+                lambda points: np.linalg.norm(points - start, axis=1) < 1e-9, field,
+                problem.limits, cost.weights), Search(iterations=1500, seed=settings.seed)).points
+            points, _ = refine(rough, way)
+        except NoPathError:
+            # A tree that misses a narrow way is no verdict: the grid finds it, or says why not.
+            points = plan_gentle(way, enough=_ANY).points
     return np.concatenate([points, start[None]])
 
 

@@ -14,6 +14,7 @@ from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
 from limber.planning.obstacles import Obstacle, closeness, closest
 from limber.planning.resolve import SolvedPoses
 from limber.planning.settings import PlanSettings
+from limber.planning.woods import strain_limit
 
 UNITS = {"energy": "J", "force": "N", "strain": "", "stress": "Pa", "axial_force": "N",
          "torque": "Nm", "closeness": ""}
@@ -111,8 +112,14 @@ class Limits:
         the stress be than what a model with the estimate says.
 
         Raises:
-            InputError: the workspace is empty.
+            InputError: the workspace is empty, or the strain limited twice.
         """
+        strain = settings.max_strain or np.inf
+        if settings.wood is not None:
+            if settings.max_strain is not None:
+                raise InputError("--max-strain and --wood are given.", "Both limit the strain.",
+                                 "Give one of them.")
+            strain = strain_limit(settings.wood)
         low = np.array(settings.workspace_low or [-np.inf] * 3, float)
         high = np.array(settings.workspace_high or [np.inf] * 3, float)
         if not (low < high).all():
@@ -120,7 +127,7 @@ class Limits:
                              "Its lower corner must be below the upper one in x, y and z.",
                              "Correct --workspace-low and --workspace-high.")
         return cls(settings.max_energy or np.inf, settings.max_force or np.inf,
-                   settings.max_strain or np.inf, (settings.max_stress or np.inf) / stiffer,
+                   strain, (settings.max_stress or np.inf) / stiffer,
                    settings.max_axial_force or np.inf, settings.max_torque or np.inf, low=low,
                    high=high)
 

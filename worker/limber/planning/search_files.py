@@ -42,8 +42,9 @@ class CostToGo:
         return map_coordinates(self.costs, places.T, order=1, cval=np.nan)
 
     def write(self, path: Path) -> None:
-        """Write it as plain arrays."""
-        np.savez_compressed(path, origin_m=self.origin, axes=self.axes, costs=self.costs,
+        """Write it as plain arrays; -1 where it is not known."""
+        np.savez_compressed(path, origin_m=self.origin, axes=self.axes,
+                            costs=np.nan_to_num(self.costs, nan=-1.0),
                             spacing_m=np.array(self.spacing))
 
     @classmethod
@@ -56,8 +57,8 @@ class CostToGo:
         arrays = read_arrays(path, _WHAT)
         require_shapes(path, arrays, {"origin_m": (3,), "axes": (3, 3), "spacing_m": (),
                                       "costs": ("x", "y", "z")}, _WHAT)
-        return cls(arrays["origin_m"], arrays["axes"], float(arrays["spacing_m"]),
-                   arrays["costs"])
+        costs = np.where(arrays["costs"] < 0.0, np.nan, arrays["costs"])
+        return cls(arrays["origin_m"], arrays["axes"], float(arrays["spacing_m"]), costs)
 
 
 def read_trees(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -30,7 +30,8 @@ class PlanSettings(Settings):
                            "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
-                               "max_stress", "workspace_low", "workspace_high", "confidence"),
+                               "wood", "max_stress", "workspace_low", "workspace_high",
+                               "confidence"),
         "timing": ("speed", "acceleration", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
@@ -74,6 +75,9 @@ class PlanSettings(Settings):
         "does needs nearly none."))
     max_strain: float | None = Field(None, gt=0, lt=1, description=(
         "Largest principal strain anywhere in the branch that no pose may exceed (0.01 is 1 %)."))
+    wood: Literal["ash", "cherry", "maple", "oak", "walnut"] | None = Field(None, description=(
+        "Limit the strain to half of what green wood of this kind breaks at (0.3 %; Wood Handbook "
+        "FPL-GTR-190); young shoots bear more: --max-strain."))
     max_stress: float | None = Field(None, gt=0, description=(
         "Largest principal stress anywhere in the branch that no pose may exceed [Pa]; held for "
         "the stiff end of the estimate's intervals."))

@@ -189,6 +189,8 @@ def convergence(plan: PlanFile) -> "Figure":
     figure = Figure(figsize=(6, 3.2), layout="constrained")
     axis = figure.subplots()
     for key, history in plan.summary["convergence"].items():
+        # On a first, coarse grid there may be no path yet.
+        history = [entry for entry in history if entry["cost"] is not None]
         if history:
             cost = np.array([entry["cost"] for entry in history])
             axis.plot([entry["iteration"] for entry in history], cost / cost[-1],

@@ -68,8 +68,9 @@ def suggest_pull(branch_folder: Path, settings: SuggestPullSettings, *, plan: st
         ``best`` and ``others``, each with ``grasp_fraction``, ``grasp_point_m``, ``end_m``,
         ``travel_m``, ``peak_strain``, ``peak_force_n``, ``bits``, ``bits_per_percent_strain`` and
         ``young_deviation`` (of log E at the control points, to be expected after it);
-        ``young_deviation_now``; ``too_much_count`` and ``failed_count``; ``plan`` with ``worth``
-        and ``why`` where one is named.
+        ``most_telling``, that of them which tells most; ``young_deviation_now``;
+        ``too_much_count`` and ``failed_count``; ``plan`` with ``worth`` and ``why`` where one is
+        named.
 
     Raises:
         InputError: no such plan. WorkError: no pull keeps the limits.
@@ -148,7 +149,8 @@ def _cell(branch: Branch) -> Cell:
 
 def _told(found: Suggested, known: Known) -> dict[str, Any]:
     best, *others = [_entry(pull, known) for pull in found.pulls]
-    return {"best": best, "others": others,
+    most = max(range(len(found.pulls)), key=lambda k: found.pulls[k].bits)
+    return {"best": best, "others": others, "most_telling": [best, *others][most],
             "young_deviation_now": np.sqrt(np.diag(known.total)),
             "too_much_count": len(found.too_much), "failed_count": found.failed_count}
 
