@@ -48,7 +48,8 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     data.info["goal"] = _goal(summary.get("goal") or {}, data.arrays.get("path:plan"))
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
-        data.info["notes"].append(f"energy {-saved:+.0f} %, length {added:+.0f} % against RRT*")
+        data.info["notes"].append(f"energy {round(-saved):+d} %, length {round(added):+d} % "
+                                  "against RRT*")
     return plan
 
 
