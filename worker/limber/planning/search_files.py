@@ -35,11 +35,17 @@ class CostToGo:
     costs: np.ndarray
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """Return it at ``points`` [n, 3] between the centres, for pictures; NaN where unknown."""
-        from scipy.ndimage import map_coordinates
+        """Return it at ``points`` [n, 3] between the centres, for pictures.
 
+        A region may be thinner than a cell: where a cell is not known the nearest one that is
+        stands for it. NaN outside the grid.
+        """
+        from scipy.ndimage import distance_transform_edt, map_coordinates
+
+        nearest = distance_transform_edt(np.isnan(self.costs), return_distances=False,
+                                         return_indices=True)
         places = ((points - self.origin) @ self.axes.T) / self.spacing - 0.5
-        return map_coordinates(self.costs, places.T, order=1, cval=np.nan)
+        return map_coordinates(self.costs[tuple(nearest)], places.T, order=1, cval=np.nan)
 
     def write(self, path: Path) -> None:
         """Write it as plain arrays; -1 where it is not known."""
