@@ -163,3 +163,21 @@ def test_too_few_samples(well):
     """A handful of samples cannot make a field; the message asks for more."""
     with pytest.raises(WorkError, match="Sample more"):
         fit_field(well.samples(count=12))
+
+
+def test_a_sample_at_a_snap_costs_the_others_no_slopes(well):
+    """Where the tangent of one state is not known, the tip is foretold as well from the others."""
+    def tip(points):
+        return 1.5 * points + [0.0, 0.0, 0.3] + 0.02 * np.sin(25.0 * points)
+
+    samples = well.samples(count=60)
+    slopes = np.zeros((60, 3, 6))
+    slopes[:, 0, 1], slopes[:, 1, 0] = 1.0, -1.0
+    slopes[:, [0, 1, 2], [3, 4, 5]] = 1.5 + 0.5 * np.cos(25.0 * samples.positions)
+    samples = replace(samples, tips=tip(samples.positions))
+    places = well.samples(count=40, radius=0.12, seed=4).positions
+    missed = []
+    for known in (slopes, np.where(np.arange(60)[:, None, None] == 17, np.nan, slopes), None):
+        field = fit_field(replace(samples, shape_slopes=known))
+        missed.append(np.sqrt(np.mean((field.tip(places) - tip(places))**2)))
+    assert missed[1] < 1.5 * missed[0] < 0.7 * missed[2]

@@ -356,8 +356,11 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
 def _shape_choice(samples: GraspSamples, choices: list[FitChoice], chart: Chart, face: np.ndarray,
                   ) -> FitChoice:
     """Return the choice that misses the tips of samples left out by least."""
+    sure = _with_slopes(samples)
+    samples, inside = samples.take(sure), ~face[sure]
+
     def missed(choice: FitChoice) -> float:
-        size = np.linalg.norm(_tips_missed(samples, choice, chart)[~face], axis=1)
+        size = np.linalg.norm(_tips_missed(samples, choice, chart)[inside], axis=1)
         return float(np.median(size) * size.mean())
     return min(choices, key=missed)
 
@@ -369,6 +372,16 @@ def _tips_missed(samples: GraspSamples, choice: FitChoice, chart: Chart) -> np.n
     return RadialInterpolant.leave_one_out(
         chart.map(samples.positions), samples.tips, None if slopes is None else slopes[:, :, 3:6],
         kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, 0]
+
+
+def _with_slopes(samples: GraspSamples) -> np.ndarray:
+    """Return which samples the shape is fitted to: those whose slopes are known, which they are not
+    at a snap; all where hardly any are."""
+    everything = np.arange(len(samples.poses))
+    if samples.shape_slopes is None:
+        return everything
+    known = np.flatnonzero(np.isfinite(samples.shape_slopes).all(axis=(1, 2)))
+    return known if len(known) >= 0.5 * len(everything) else everything
 
 
 def _slopes_on(chart: Chart, samples: GraspSamples) -> np.ndarray | None:
@@ -474,12 +487,14 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
     shape_chart = bent.on(region.chart)
     places = shape_chart.map(samples.positions)
     options = {"kernel": bent.kernel, "shape": bent.shape, "smoothing": _SMOOTHING}
-    shape = RadialInterpolant.fit(places, samples.shape, _slopes_on(shape_chart, samples),
+    sure = _with_slopes(samples)
+    bending = samples.take(sure)
+    shape = RadialInterpolant.fit(places[sure], bending.shape, _slopes_on(shape_chart, bending),
                                   **options)
     loads = RadialInterpolant.fit(places, samples.load_table, **options)
     off = -RadialInterpolant.leave_one_out(places, samples.load_table, **options)[:, 0]
-    tips = _tips_missed(samples, bent, region.chart)
-    inside = ~region.is_face()
+    tips = _tips_missed(bending, bent, region.chart)
+    inside = ~region.is_face()[sure]
     errors["tip_error_median_m"] = float(np.median(np.linalg.norm(tips[inside], axis=1)))
     return EnergyField(samples, chart, shape_chart, energy, shape, loads, region, errors,
                        np.column_stack([missed, off]))
