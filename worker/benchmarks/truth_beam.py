@@ -51,7 +51,7 @@ def rows(progress: Progress, seed: int) -> list[Row]:
             found.append(_estimated(folder, cells))
         table = [_refinement_row(found), _drop_row(folder, young, drawn)]
         progress(0.8, "the real beam")
-        return [*table, _real_row(folder)]
+        return [*table, real_row(folder)]
 
 
 def _estimated(folder: Path, cells: tuple[int, int, int]) -> dict:
@@ -192,7 +192,7 @@ def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
     return read_sections(path, "mm")
 
 
-def _real_row(folder: Path) -> Row:
+def real_row(folder: Path) -> Row:
     """Its place of rest, on the mesh of its surface, and its swing, on coarse bricks: quick, and
     corrected by what they are too stiff by."""
     measure = "silicone beam: static and dynamic E of the given recording"
@@ -204,6 +204,7 @@ def _real_row(folder: Path) -> Row:
     _imported(bricks, silicone_beam.RECORDING, "swing", "swing")
     swung = swing(bricks.folder, SwingSettings(poisson=silicone_beam.POISSON, density_sigma=0.02))
     soft, stiff = swung["young_interval_pa"]
+    least_damped, most_damped = swung["damping_ratio_interval"]
     found = silicone_beam.estimate_beam(silicone_beam.made_branch(folder), silicone_beam.RECORDING,
                                         silicone_beam.LOAD_N, "csv")
     low, high = found.interval
@@ -215,5 +216,7 @@ def _real_row(folder: Path) -> Row:
                f"static {found.young / 1e3:.0f} kPa ({low / 1e3:.0f} to {high / 1e3:.0f}), dynamic "
                f"{swung['young_pa'] / 1e3:.0f} ({soft / 1e3:.0f} to {stiff / 1e3:.0f}); outside: "
                + (", ".join(dict.fromkeys(outside)) or "none")
-               + f"; drop {1e3 * found.simulated_drop:.2f} of {1e3 * found.measured_drop:.2f} mm",
+               + f"; damping ratio {swung['damping_ratio']:.4f} ({least_damped:.4f} to "
+               f"{most_damped:.4f}); drop {1e3 * found.simulated_drop:.2f} of "
+               f"{1e3 * found.measured_drop:.2f} mm",
                not outside and max(low, soft) <= min(high, stiff))

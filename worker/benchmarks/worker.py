@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from benchmarks import truth_beam
 from benchmarks.table import Row
 from benchmarks.worker_batches import killed, memory, on_dask, speed_up
 from benchmarks.worker_exports import rows as exported
@@ -63,6 +64,11 @@ def _kills(setting: Setting, progress: Progress) -> list[Row]:
     return [killed(kills, branches, setting.seed, progress)]
 
 
+def _silicone_beam(_setting: Setting, _progress: Progress) -> list[Row]:
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        return [truth_beam.real_row(Path(place))]
+
+
 def _readme(setting: Setting, progress: Progress) -> list[Row]:
     return [run_readme(setting.seed, progress)]
 
@@ -109,7 +115,8 @@ def _fuzzed(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple
 
 
 WHOLE: dict[str, Callable[[Setting, Progress], list[Row]]] = {
-    "start-up": _start_up, "exports": _exports, "ringing": _ringing, "fuzz": _fuzzed,
+    "start-up": _start_up, "exports": _exports, "ringing": _ringing,
+    "silicone-beam": _silicone_beam, "fuzz": _fuzzed,
     "readme": _readme, "memory": _memory, "kills": _kills, "dask": _dask,
     "two-cores": _two_cores}
 """The table's parts, in its order."""
