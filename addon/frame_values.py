@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from . import branch_folder
 from .scene_data import SceneData
 
 _FOLDER = ".viewport"
@@ -59,6 +60,12 @@ def path_of(folder: Path, motion: str) -> Path:
     return folder / _FOLDER / f"{motion}.npz"
 
 
+def _frames_sha256(folder: Path, motion: str) -> str:
+    """Return the checksum of the motion itself, which may be made anew; nothing without one."""
+    path = folder / "frames" / f"{motion}.pc2"
+    return branch_folder.file_sha256(path) if path.is_file() else ""
+
+
 def keep(folder: Path, motion: str, values: FrameValues) -> None:
     """Write the values of a motion into the branch folder; OSError where that cannot be."""
     path = path_of(folder, motion)
@@ -69,7 +76,8 @@ def keep(folder: Path, motion: str, values: FrameValues) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     try:
         with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, about=np.array(json.dumps({"format": _FORMAT})), **arrays)
+            about = {"format": _FORMAT, "frames_sha256": _frames_sha256(folder, motion)}
+            np.savez(stream, about=np.array(json.dumps(about)), **arrays)
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)
@@ -77,10 +85,12 @@ def keep(folder: Path, motion: str, values: FrameValues) -> None:
 
 
 def read(folder: Path, motion: str) -> FrameValues | None:
-    """Return what was kept of a motion; None where there is nothing, or nothing whole."""
+    """Return what was kept of a motion; None where there is nothing whole, or of other frames."""
     try:
         with np.load(path_of(folder, motion), allow_pickle=False) as content:
-            if json.loads(str(content["about"])).get("format") != _FORMAT:
+            about = json.loads(str(content["about"]))
+            if about.get("format") != _FORMAT or (
+                    about.get("frames_sha256") != _frames_sha256(folder, motion)):
                 return None
             parts: dict[str, dict[str, np.ndarray]] = {"scalar": {}, "level": {}, "palette": {}}
             for name in content.files:

@@ -111,6 +111,9 @@ def test_a_motion_of_another_size_is_not_shown(addon, tmp_path):
     assert read.names(3, 4) == {"strain"}
     assert read.names(3, 5) == read.names(2, 4) == set()
     assert frame_values.read(tmp_path, "another") is None
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames" / "swing.pc2").write_bytes(b"made anew")
+    assert frame_values.read(tmp_path, "swing") is None, "of the motion before"
     values.scalars["strain"][0, 0] = np.nan
     frame_values.keep(tmp_path, "swing", values)
     assert frame_values.read(tmp_path, "swing") is None
