@@ -2,6 +2,7 @@
 
 import io
 import json
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -119,8 +120,8 @@ def _array_changed(content: bytes, rng: np.random.Generator) -> bytes:
     try:
         with np.load(io.BytesIO(content)) as file:
             arrays = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, KeyError, TypeError, NotImplementedError,
-            zipfile.BadZipFile, zlib.error):
+    except (ValueError, OSError, EOFError, KeyError, TypeError, NotImplementedError, SyntaxError,
+            tokenize.TokenError, zipfile.BadZipFile, zlib.error):
         return _bytes_changed(content, rng)
     name = list(arrays)[int(rng.integers(len(arrays)))]
     array = arrays[name]
