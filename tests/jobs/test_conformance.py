@@ -122,6 +122,7 @@ class InAddon:
         assert limits is None
         outcome = Outcome()
         job = self.jobs.Job("test", [sys.executable, "-u", str(PROGRAM), behaviour])
+        job.launch()
         outcome.processes = [psutil.Process(job.pid)]
         while job.poll() is self.jobs.JobState.RUNNING:
             if (job.fraction, job.message) not in outcome.reports and job.message != "starting":
@@ -237,7 +238,7 @@ def test_a_killed_parent_leaves_nothing(runner, behaviour: str, tmp_path):
     started: list[psutil.Process] = []
     deadline = time.monotonic() + 30
     # The pool has a process of Python's own beside its worker; both are up when the job is.
-    while not any(p.cpu_times().user > 0.1 for p in started) and time.monotonic() < deadline:
+    while not any(p.cpu_times().user > 0.01 for p in started) and time.monotonic() < deadline:
         time.sleep(0.2)
         started = family.children(recursive=True)
     assert started and parent.poll() is None
