@@ -10,13 +10,14 @@ from tests.subjects.paper_branches import measured
 from limber.errors import WorkError
 from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
 from limber.estimation.doubt.path_error import led_by_path, path_error
-from limber.estimation.fit import FALL, _evaluated, fit_pulls
+from limber.estimation.fit import fit_pulls
 from limber.estimation.forward.watched import WatchedForward
-from limber.estimation.nuisances import eliminated, in_words
+from limber.estimation.nuisances import eliminated, in_words, unlikely
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import is_watched
 from limber.estimation.settings import EstimateSettings
+from limber.estimation.start import FALL, standing_start
 from limber.recordings.alignment import frames_of
 from limber.recordings.calibration import EXACT, CalibrationEntry
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
@@ -131,7 +132,8 @@ def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small
 
 
 def test_a_start_without_equilibrium_gives_way(small_bench, small_pull, monkeypatch):
-    """Moduli that fall outwards are tried next, from the force as it was read."""
+    """The same stiffer and moduli that fall outwards are tried, from the force as it was read; the
+    better one leads."""
     pull = replace(small_pull, entry=small_pull.entry.model_copy(update={"calibration": None}))
     objective = objective_of(small_bench, pull)
     forward, evaluate, tried = objective.forwards[0], Objective.evaluate, []
@@ -145,8 +147,8 @@ def test_a_start_without_equilibrium_gives_way(small_bench, small_pull, monkeypa
 
     monkeypatch.setattr(Objective, "evaluate", refusing)
     uniform = objective.space.base
-    start, found = _evaluated(objective, replace(uniform, young=30.0 * uniform.young), uniform)
-    assert found is not None and len(tried) == 2
+    start, found = standing_start(objective, replace(uniform, young=30.0 * uniform.young), uniform)
+    assert found is not None and len(tried) > 2
     assert np.diff(np.log(start.young)) == pytest.approx(-FALL)
     assert np.abs(tried[0] - read).max() > 1.0 * np.abs(read).max()
     # Of the reading at rest, the zero alone is taken off.
@@ -179,3 +181,11 @@ def test_a_path_that_leads_says_so_and_widens_the_interval(small_bench, small_pu
     assert found(pose_sigma_m=1e-4)[1] == pytest.approx(wide / 10, rel=0.05)
     assert np.all(found(pose_sigma_m=1e-3, pose_sigma_rad=0.02)[1] > wide)
     assert led_by_path(small_bench.objective([small_pull], SETTINGS).forwards) == []
+
+
+def test_an_error_far_beyond_what_the_cell_states_gives_no_result():
+    """Named with how far it is; what may well be is none."""
+    gain = {"name": "force gain", "unit": "", "pull": "", "value": -0.7, "prior_sigma": 0.02}
+    place = {"name": "gripper place x", "unit": "m", "pull": "", "value": 3e-3, "prior_sigma": 1e-3}
+    assert "force gain would be -70 % off, 35 deviations" in unlikely([place, gain])
+    assert unlikely([place]) is None and unlikely([]) is None

@@ -30,14 +30,14 @@ from limber.estimation.doubt.shape_error import hung_error, shape_error
 from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward, under_its_weight
-from limber.estimation.nuisances import in_words, told
-from limber.estimation.objective import Evaluation, Objective, Stopped, held_out, without
+from limber.estimation.nuisances import in_words, told, unlikely
+from limber.estimation.objective import Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
 from limber.estimation.parameters import Values
 from limber.estimation.preparation import forwards_of, parameter_space, require_scale_in_principle
 from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.start import led_start, scaled_start
+from limber.estimation.start import led_start, scaled_start, standing_start
 from limber.estimation.subject import Subject
 from limber.progress import SILENT, Progress
 from limber.recordings.calibration import calibration_of
@@ -56,9 +56,6 @@ UNEXPLAINED_FACTOR = 1.5
 WIDE = 0.15
 """Standard deviation of a log E from which it is worth a word what would narrow it."""
 
-
-FALL = 0.9
-"""By which log E falls from one control point to the next of a start, as the paper's branches."""
 
 
 class _ForceLeadsNowhereError(WorkError):
@@ -148,6 +145,8 @@ class Estimate:
             return (f"{', '.join(bound)} ran to a bound: the data ask for a value beyond it, as "
                     "they do with a wrong unit, grasp point or frame of reference, or with "
                     "markers that are mirrored or mistaken for each other.")
+        if error := unlikely(self.cell_errors):
+            return error
         scale = identifiability(self.fit.evaluation, space).scale_deviation
         if not np.isfinite(scale) or scale > SCALE_DEVIATION:
             return ("The data do not tell the moduli: all of them together are known only to "
@@ -249,7 +248,10 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     uniform = start
     if settings.method == "gauss-newton" and reduction is None:
         start = led_start(judged_on, uniform)
-    start, first = _evaluated(judged_on, start, uniform)
+    standing = standing_start(judged_on, start, uniform)
+    if standing is None:
+        raise _without_equilibrium(judged_on)
+    start, first = standing
     judged = identifiability(first, objective.space)
     if not _force_is_measured(objective):
         require_scale(judged)
@@ -283,29 +285,6 @@ def _force_is_measured(objective: Objective) -> bool:
         if forward.uses_force and np.nanmax(np.abs(force), initial=0.0) > 5 * sigma:
             return True
     return False
-
-
-def _evaluated(objective: Objective, start: Values, uniform: Values,
-               ) -> tuple[Values, Evaluation]:
-    """Evaluate with derivatives at the start, or near it where there is an equilibrium.
-
-    A fit by force alone can end at moduli that carry no force at all; then the uniform modulus is
-    tried, and one that falls outwards as of branches, softer or stiffer.
-    """
-    place = np.arange(len(uniform.young))
-    falling = np.exp(FALL * (place.mean() - place))
-    trials = [start]
-    trials += [replace(uniform, young=uniform.young * factor * course)
-               for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)]
-    for number, trial in enumerate(trials):
-        if number:
-            for forward in objective.forwards:
-                if forward.watches_pose:
-                    forward.forget()
-        found = objective.evaluate(objective.space.pack(trial), jacobian=True)
-        if found is not None:
-            return trial, found
-    raise _without_equilibrium(objective)
 
 
 def _without_equilibrium(objective: Objective) -> WorkError:

@@ -26,6 +26,9 @@ NAMED = 3.0
 """An error so many of its deviations from zero is told: without it the fit would be poor."""
 NAMED_SHARE = 0.3
 """If it also is more than this part of what was expected beforehand."""
+UNLIKELY = 10.0
+"""An error so many of its deviations beforehand gives no result: seen was a gain of force 35 off,
+at moduli that were five times too high with narrow intervals."""
 
 
 @dataclass(frozen=True)
@@ -281,6 +284,21 @@ def in_words(listed: Sequence[dict]) -> list[str]:
     named = sorted((each for each in listed if each["explains_misfit"]),
                    key=lambda each: -abs(each["value"] / each["prior_sigma"]))
     return [_sentence(each) for each in named]
+
+
+def unlikely(listed: Sequence[dict]) -> str | None:
+    """Return in words the error that is far beyond what the cell states, if there is one."""
+    def deviations(each: dict) -> float:
+        return abs(each["value"]) / each["prior_sigma"]
+
+    worst = max(listed, key=deviations, default=None)
+    if worst is None or deviations(worst) <= UNLIKELY:
+        return None
+    scale, unit = _SHOWN[worst["unit"]]
+    whose = f"{worst['pull']}: the" if worst["pull"] else "The"
+    return (f"{whose} {worst['name']} would be {scale * worst['value']:+.2g} {unit} off, "
+            f"{deviations(worst):.0f} deviations of what the pull's [calibration] states: the fit "
+            "may have ended in a wrong place, or the cell is not as it is stated.")
 
 
 _SHOWN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "degrees"), "N": (1.0, "N"),

@@ -6,7 +6,7 @@ import numpy as np
 
 from limber.errors import WorkError
 from limber.estimation.forward.forward import Forward
-from limber.estimation.objective import Objective
+from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
 
@@ -17,6 +17,11 @@ ROUGH_KEYS = 5
 """Simulated frames of a first fit by force alone: chosen, it only has to lead near."""
 FEWEST_FRAMES = 6
 """Fewer frames say nothing of a motion."""
+FALL = 0.9
+"""By which log E falls from one control point to the next of a start, as the paper's branches."""
+STIFFER = (1.6, 2.5, 4.0)
+"""What moduli without an equilibrium are raised by: a fit by a drifting force ended with the right
+course along the branch, its tip half as stiff as one that stands; chosen, not tuned."""
 
 
 def scaled_start(objective: Objective, values: Values) -> Values:
@@ -148,3 +153,41 @@ def _scanned(objective: Objective, values: Values) -> Values:
         if abs(centre) > 6:
             break
     return replace(values, young=np.clip(values.young * 10**centre, *YOUNG_BOUNDS_PA))
+
+
+def standing_start(objective: Objective, start: Values, uniform: Values,
+                   ) -> tuple[Values, Evaluation] | None:
+    """Return the start, or one near it where there is an equilibrium, and what is found there.
+
+    A fit by force alone can end at moduli that carry no force at all. Then the same ones stiffer
+    are tried, and the uniform modulus and one that falls outwards as of branches, softer or
+    stiffer; the better of what both lead to. None: none of them stands.
+    """
+    found = objective.evaluate(objective.space.pack(start), jacobian=True)
+    if found is not None:
+        return start, found
+    place = np.arange(len(uniform.young))
+    falling = np.exp(FALL * (place.mean() - place))
+    likely = [replace(uniform, young=uniform.young * factor * course)
+              for factor in (1.0, 3.0, 0.3, 10.0, 0.1) for course in (falling, 1.0)]
+    stiffer = [replace(start, young=start.young * factor) for factor in STIFFER]
+    standing = [first for trials in (stiffer, likely)
+                if (first := _first_standing(objective, trials)) is not None]
+    if not standing:
+        return None
+    best = min(standing, key=lambda each: each[1].objective)
+    # The simulations go on from where they were last.
+    return best if best is standing[-1] else _first_standing(objective, [best[0]]) or standing[-1]
+
+
+def _first_standing(objective: Objective, trials: list[Values],
+                    ) -> tuple[Values, Evaluation] | None:
+    """Return the first that has an equilibrium; the force is taken as it was read."""
+    for trial in trials:
+        for forward in objective.forwards:
+            if forward.watches_pose:
+                forward.forget()
+        found = objective.evaluate(objective.space.pack(trial), jacobian=True)
+        if found is not None:
+            return trial, found
+    return None
