@@ -10,6 +10,7 @@ from gpu_extras.batch import batch_for_shader
 
 from .. import branches
 from ..bridge import animation
+from . import covered_width
 
 NONE = "none"
 GRAPHS = {"young": "Young's modulus along the branch", "energy": "Energy along the paths",
@@ -82,7 +83,7 @@ def _draw() -> None:
     if graph is None:
         return
     size = context.preferences.system.ui_scale
-    right = context.region.width - _covered(context) - (_MARGIN + _RIGHT + _WIDTH) * size
+    right = context.region.width - covered_width(context, "UI") - (_MARGIN + _RIGHT + _WIDTH) * size
     frame = _Frame(right, (_MARGIN + _BELOW) * size, size)
     _draw_paper(frame, graph)
     _draw_content(frame, graph, _cursor(graph, surface, context.scene))
@@ -133,12 +134,6 @@ def _cursor(graph: dict, surface: bpy.types.Object, scene: bpy.types.Scene) -> f
         return None
     number = round(animation.cache_frame(surface, scene.frame_current))
     return places[min(max(number, 0), len(places) - 1)]
-
-
-def _covered(context: bpy.types.Context) -> float:
-    """The sidebar lies upon the view; the graph stands beside it."""
-    sidebar = next((region for region in context.area.regions if region.type == "UI"), None)
-    return 0.0 if sidebar is None or sidebar.width <= 1 else float(sidebar.width)
 
 
 def register() -> None:

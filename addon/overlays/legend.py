@@ -9,6 +9,7 @@ import gpu
 from gpu_extras.batch import batch_for_shader
 
 from .. import branches, frame_colours
+from . import covered_width
 
 _MARGIN, _WIDTH, _HEIGHT, _TEXT = 24, 16, 160, 12
 _BETWEEN, _LINE_LETTERS = 20, 20
@@ -59,7 +60,7 @@ def _draw() -> None:
     if shading.type == "WIREFRAME" or (shading.type == "SOLID" and shading.color_type != "VERTEX"):
         return
     size = context.preferences.system.ui_scale
-    x, y = _left(context) + _MARGIN * size, _GAP * size
+    x, y = covered_width(context, "TOOLS") + _MARGIN * size, _GAP * size
     for scale in shown_scales(surface):
         places, colours, triangles = bar(scale["stops"], x, y, _WIDTH * size, _HEIGHT * size)
         shader = gpu.shader.from_builtin("SMOOTH_COLOR")
@@ -87,12 +88,6 @@ def _write(scale: dict, x: float, y: float, size: float) -> float:
         blf.draw(0, line)
     blf.disable(0, blf.SHADOW)
     return max(blf.dimensions(0, line)[0] for line in lines)
-
-
-def _left(context: bpy.types.Context) -> float:
-    """The toolbar lies upon the view; the legend stands beside it."""
-    tools = next((region for region in context.area.regions if region.type == "TOOLS"), None)
-    return 0.0 if tools is None or tools.width <= 1 else float(tools.width)
 
 
 def register() -> None:
