@@ -2,10 +2,14 @@
 
 import json
 import shutil
+import subprocess
+import sys
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
+from limber import store
 from limber.cli import call
 from limber.errors import InputError, MeshingError
 from limber.geometry import reconstruct as reconstruction
@@ -13,10 +17,14 @@ from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.files import read_skeleton, read_swc
+from limber.geometry.skeleton.found import FoundSkeleton
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeletonise import given_skeleton
+from limber.plain import plain
 from limber.progress import Progress
 from limber.scene.data import scene_data
 from limber.scene.shape import EDITED
-from limber.stages.reconstruct import reconstruct
+from limber.stages.reconstruct import load_search, reconstruct
 from limber.stages.skeleton import review_skeleton
 from limber.store import Branch
 
@@ -110,6 +118,74 @@ def test_edits_in_the_branchs_frame_come_after_those_before(made, tmp_path) -> N
     assert set(marked) == {moved, *np.flatnonzero(arrays["skeleton_parent"] == moved)}
     assert not (scene_data(Branch.open(folder / "a.branch")).arrays["skeleton_flags"] & EDITED
                 ).any()
+
+
+_DYING = """
+import os, sys
+from pathlib import Path
+from limber.geometry import reconstruct as reconstruction
+from limber.geometry.settings import ReconstructSettings
+from limber.stages.reconstruct import reconstruct
+reconstruction.mesh_skeleton = lambda *given: os._exit(9)
+scan, target = map(Path, sys.argv[1:3])
+reconstruct(scan, target, ReconstructSettings.model_validate_json(sys.argv[3]))
+"""
+
+
+def test_one_killed_after_its_skeleton_goes_on_from_there(made, tmp_path, monkeypatch) -> None:
+    """kill -9 between skeleton and mesh: nothing is sought again, and every byte is the same."""
+    folder, result = made
+    scan, target = folder / "cloud.ply", tmp_path / "k.branch"
+    died = subprocess.run([sys.executable, "-c", _DYING, str(scan), str(target),
+                           SETTINGS.model_dump_json()], check=False)
+    assert died.returncode == 9
+    before = Branch.open(target, verify=True).manifest
+    assert set(before.stages) == {"skeleton"}
+    # Other settings, other programs and --force know nothing of it.
+    branch, digests = Branch.open(target), before.stages["skeleton"].reads
+    assert load_search(branch, SETTINGS, digests) is not None
+    assert load_search(branch, SETTINGS.model_copy(update={"prune": 2.0}), digests) is None
+    with monkeypatch.context() as other:
+        other.setattr(store, "program_versions", lambda: before.stages["skeleton"].programs | {
+            "numpy": "0"})
+        assert load_search(branch, SETTINGS, digests) is None
+
+    def search(*_given, **_named):
+        raise AssertionError("the skeleton is sought again")
+    with monkeypatch.context() as other:
+        other.setattr(reconstruction, "skeletonise", search)
+        with pytest.raises(AssertionError):
+            reconstruct(scan, target, SETTINGS, force=True)
+        again = reconstruct(scan, target, SETTINGS)
+    after, undisturbed = (Branch.open(place, verify=True).manifest
+                          for place in (target, folder / "a.branch"))
+    assert after.stages["skeleton"] == before.stages["skeleton"]
+    assert after.files == undisturbed.files and not (target / "scan_skeleton.npz").exists()
+    assert {key: again[key] for key in result.keys() - {"peak_memory_mb"}} == {
+        key: result[key] for key in result.keys() - {"peak_memory_mb"}}
+
+
+def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
+    """All that it found, with gaps, pieces and places; a mangled file is refused."""
+    rng = np.random.default_rng(3)
+    skeleton = Skeleton.from_edges(rng.normal(size=(6, 3)), np.arange(6) - 1, rng.random(6) + 0.1)
+    place, points = rng.normal(size=3), rng.normal(size=(40, 3))
+    found = replace(
+        given_skeleton(skeleton, points), noise=0.1 / 3, loops=[1 / 7], pruned=4, leafy=True,
+        second_base=place, bridges=[{"from": place, "to": -place, "length": 1 / 3, "price": 2.0}],
+        split_off=[{"points": 7, "distance": 0.7 / 3, "at": place}],
+        unlikely=[{"length": 1e-9 / 3, "at": place, "probability": 0.3}])
+    path = tmp_path / "found.npz"
+    FoundSkeleton(found, leaves_cut=True).write(path)
+    read = FoundSkeleton.read(path)
+    assert read.leaves_cut
+    assert plain(asdict(read.result)) == plain(asdict(found))
+    arrays = dict(np.load(path))
+    for name, value in (("parent", np.arange(6)), ("node_of_point", np.full(40, 6)),
+                        ("told", np.array("{}")), ("nodes", np.full((6, 3), np.nan))):
+        np.savez(path, **arrays | {name: value})
+        with pytest.raises(InputError, match=r"found\.npz"):
+            FoundSkeleton.read(path)
 
 
 def test_a_failed_mesh_leaves_the_skeleton(made, tmp_path, monkeypatch, capsys) -> None:

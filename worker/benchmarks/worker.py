@@ -14,9 +14,10 @@ from pathlib import Path
 
 from benchmarks import truth_beam
 from benchmarks.table import Row
-from benchmarks.worker_batches import killed, memory, on_dask, speed_up
+from benchmarks.worker_batches import memory, on_dask, speed_up
 from benchmarks.worker_exports import rows as exported
 from benchmarks.worker_fuzz import fuzz
+from benchmarks.worker_kills import killed
 from benchmarks.worker_readers import READERS
 from benchmarks.worker_readme import run_readme
 from benchmarks.worker_ringing import rows as rung
@@ -27,11 +28,15 @@ TEMPLATE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 @dataclass(frozen=True)
 class Setting:
-    """How much is measured: ``quick`` takes a tenth of the files, branches and jobs."""
+    """How much is measured: ``quick`` takes a tenth of the files, branches and jobs.
+
+    Harmful files go to ``keep``; ``out`` is where a campaign may go on, if one was named.
+    """
 
     quick: bool
     seed: int
     keep: Path
+    out: Path | None
 
 
 def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
@@ -40,7 +45,7 @@ def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
     table = []
     chosen = only or WHOLE
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
-        setting = Setting(quick, seed, (out or Path(place)) / "harmful")
+        setting = Setting(quick, seed, (out or Path(place)) / "harmful", out)
         for number, name in enumerate(chosen):
             table += PARTS[name](setting, progress.part(
                 number / len(chosen), (number + 1) / len(chosen)))
@@ -61,7 +66,8 @@ def _memory(setting: Setting, progress: Progress) -> list[Row]:
 
 def _kills(setting: Setting, progress: Progress) -> list[Row]:
     kills, branches = (3, 1) if setting.quick else (30, 2)
-    return [killed(kills, branches, setting.seed, progress)]
+    kept = None if setting.out is None else setting.out / "kills.jsonl"
+    return [killed(kills, branches, setting.seed, kept, progress)]
 
 
 def _silicone_beam(_setting: Setting, _progress: Progress) -> list[Row]:

@@ -6,7 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -154,6 +154,33 @@ _TARGETS = {"format_version": 1, "targets": [
     {"name": "fruit", "position_m": [0.0, 0.0, 0.3], "mass_kg": 0.1}]}
 
 
+def _search_file(template: Path, folder: Path) -> list[Path]:
+    """What a search of the template's cloud would have come to, with a bit of everything."""
+    from limber.geometry.cloud.files import read_points
+    from limber.geometry.skeleton.files import read_skeleton
+    from limber.geometry.skeleton.found import FoundSkeleton
+    from limber.geometry.skeleton.skeletonise import given_skeleton
+
+    found = given_skeleton(read_skeleton(template / "skeleton.csv"),
+                           read_points(template / "cloud.ply").points[::10])
+    place = np.array([0.1, 0.2, 0.3])
+    found = replace(found, loops=[0.1], second_base=place, other_root=place, bridges=[
+        {"from": place, "to": 2 * place, "length": 0.1, "price": 1.5}], split_off=[
+        {"points": 3, "distance": 0.1, "at": place}], unlikely=[
+        {"length": 0.01, "at": place, "probability": 0.2}])
+    path = folder / "scan_skeleton.npz"
+    FoundSkeleton(found, leaves_cut=False).write(path)
+    return [path]
+
+
+def _searched(branch: Branch) -> Any:
+    """A search as reconstruct takes it over: moved, told, and matched with points."""
+    from limber.geometry.skeleton.found import FoundSkeleton
+
+    found = FoundSkeleton.read(branch.path("scan_skeleton.npz")).result
+    return found.moved(lambda points: points + 1.0).report(), found.warnings, found.residual
+
+
 def _load(branch: Branch) -> Any:
     from limber.report.loads import load_rows, read_load
 
@@ -203,6 +230,7 @@ BRANCH_READERS: dict[str, Reader] = {
     "branch.json": _branch_file("branch.json", "json", _opened),
     "QSM CSV": _branch_file("skeleton.csv", "text", _shown_and_computed),
     "VTU": _branch_file("mesh.vtu", "text", _shown_and_computed),
+    "scan_skeleton.npz": _branch_file("scan_skeleton.npz", "npz", _searched, _search_file),
     "cloud.ply": _branch_file("cloud.ply", "binary", _shown),
     "point_masses.json": _branch_file("point_masses.json", "json", _masses,
                                       _json_file("point_masses.json", _MASSES)),

@@ -23,6 +23,7 @@ from limber.geometry.left_out import (
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, edited
+from limber.geometry.skeleton.found import FoundSkeleton
 from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
@@ -37,6 +38,9 @@ from limber.geometry.tets.quality import measure_quality
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.geometry.tets.tetrahedra import MeshResult, mesh_branch
 from limber.progress import SILENT, Progress
+
+Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
+"""Takes in a skeleton as it was found, and all that the search for it came to."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +83,7 @@ class Reconstruction:
 
 def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleton | None = None,
                       edits: Sequence[Edit] = (), eye: np.ndarray | None = None,
-                      keep: Callable[[Alignment, Skeleton], None] | None = None,
+                      known: FoundSkeleton | None = None, keep: Keep | None = None,
                       progress: Progress = SILENT) -> Reconstruction:
     """Make skeleton, surface and tetrahedra of a scan.
 
@@ -90,8 +94,9 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         edits: What its user changed in the skeleton, in the file's coordinates; those that no
             longer fit are left out and told.
         eye: Where the depth camera stood [m], shape [3], if the scan is its image.
-        keep: Gets the alignment and the skeleton as soon as it is found, before anything that may
-            still refuse it or fail.
+        known: What an earlier run found of this scan with these settings, and did not come to use.
+        keep: Gets the alignment, the skeleton and what the search came to as soon as it is found,
+            before anything that may still refuse it or fail; not what is ``known``.
         progress: Called as it goes; gets what the user should know.
 
     Raises:
@@ -101,20 +106,17 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
                        up=np.array(settings.up, float))
     for text in prepared.warnings:
         progress.warn(text)
-    found = _skeleton(prepared, settings, own, progress.part(0.02, 0.55))
-    wood, leaves = prepared, []
-    if own is None and settings.leaves == "cut" and _may_be_leafy(found, prepared, settings):
-        wood, leaves = without_leaves(prepared)
-        if leaves:
-            found = _skeleton(wood, settings, own, progress.part(0.3, 0.55))
+    found, wood, leaves = (
+        _searched(prepared, settings, own, progress.part(0.02, 0.55)) if known is None
+        else _found_before(prepared, known, progress))
     whole = found
     if wood.view is not None and own is None:
         found, text = seen_skeleton(found, wood, settings.silhouette_reach)
         if text:
             progress.warn(text)
     alignment, cloud, found = _aligned(wood, found, settings)
-    if keep is not None:
-        keep(alignment, found.skeleton)
+    if keep is not None and known is None:
+        keep(alignment, found.skeleton, FoundSkeleton(whole, bool(leaves)))
     if own is None:
         check_explained(whole, settings.unexplained)
     # Kept beside the mesh's own, which edits of the skeleton make anew.
@@ -140,6 +142,28 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         "point_count": len(cloud), "dropped_points": prepared.counts, "gravity_m_s2": gravity,
         "skeleton_warnings": told}
     return Reconstruction(alignment, cloud, meshed, gravity, numbers)
+
+
+def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton | None,
+              progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
+    """The skeleton, the part of the scan that it was found of, and the leaves cut off that."""
+    found = _skeleton(prepared, settings, own, progress)
+    if own is None and settings.leaves == "cut" and _may_be_leafy(found, prepared, settings):
+        wood, leaves = without_leaves(prepared)
+        if leaves:
+            return _skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves
+    return found, prepared, []
+
+
+def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
+                  ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
+    wood, leaves = without_leaves(prepared) if known.leaves_cut else (prepared, [])
+    if len(known.result.node_of_point) != len(wood.cloud):
+        raise InputError(f"The skeleton that was found before is of {len(known.result.residual)} "
+                         f"points, the scan has {len(wood.cloud)}.", "It is of another scan.",
+                         "Reconstruct again with --force.")
+    progress(0.55, "skeleton, as it was found before")
+    return known.result, wood, leaves
 
 
 def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:

@@ -25,8 +25,12 @@ if TYPE_CHECKING:
     from limber.geometry.cloud.cloud import Cloud
     from limber.geometry.reconstruct import MeshedBranch
     from limber.geometry.skeleton.edits import Edit
+    from limber.geometry.skeleton.found import FoundSkeleton
     from limber.geometry.skeleton.skeleton import Skeleton
 
+SEARCH = f"{FOUND_SKELETON}.npz"
+"""All that the search for the skeleton came to, until there is a mesh: a reconstruct that is
+stopped between goes on from there."""
 EDITS = "edits.json"
 """The edits that a branch keeps, in the coordinates of the scan's file."""
 
@@ -61,7 +65,8 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     """Make a branch folder of a scan: skeleton, surface and tetrahedra.
 
     The skeleton is kept in the scan's own coordinates as soon as it is found
-    (``scan_skeleton.swc`` and ``.csv``), also where a later step fails.
+    (``scan_skeleton.swc`` and ``.csv``), also where a later step fails or the program is killed:
+    the next run with the same scan and settings goes on from there.
 
     Args:
         cloud_path: The scan. A ``truth.json`` beside it (`limber generate`) is taken along.
@@ -109,20 +114,24 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
     if edits_path is None and not edits and branch.has(EDITS):
         progress.keeping(warnings).warn(
             "The edits of edits.json are not applied: the given skeleton is used as it is.")
-    kept: list[Skeleton] = []
+    searched = {name: value for name, value in digests.items() if name != "edits"}
+    known = None if force else load_search(branch, settings, searched)
+    is_kept = known is not None
 
-    def keep(alignment: Alignment, skeleton: Skeleton) -> None:
-        with branch.stage("skeleton", settings, digests=digests) as early:
+    def keep(alignment: Alignment, skeleton: Skeleton, found: FoundSkeleton) -> None:
+        nonlocal is_kept
+        with branch.stage("skeleton", settings, digests=searched) as early:
             _keep_skeleton(early, alignment, skeleton, settings.unit)
-        kept.append(skeleton)
+            found.write(early.path(SEARCH))
+        is_kept = True
     with branch.stage("reconstruct", settings, digests=digests) as stage:
         own = None if skeleton_path is None else read_skeleton(
             skeleton_path, scale=UNIT_METRES[settings.unit])
         try:
             made = reconstruct_cloud(raw, settings, own=own, edits=edits, eye=_eye(camera_path),
-                                     keep=keep, progress=progress.keeping(warnings))
+                                     known=known, keep=keep, progress=progress.keeping(warnings))
         except LimberError as error:
-            if kept and not isinstance(error, Cancelled):
+            if is_kept and not isinstance(error, Cancelled):
                 progress.warn(
                     f"The skeleton as it was found is in {branch.folder / FOUND_SKELETON}.swc, "
                     "in the scan's coordinates: mend it and give it back (--skeleton), or edit it "
@@ -132,6 +141,7 @@ def reconstruct(cloud_path: Path, folder: Path, settings: ReconstructSettings | 
         stage.manifest.source = {"file": Path(cloud_path).name, "unit": settings.unit,
                                  "sha256": digests["cloud"]}
         write_branch(stage, made.cloud, made.meshed)
+        stage.remove(SEARCH)
         if edits:
             stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
         elif edits_path is not None:
@@ -194,6 +204,25 @@ def _keep_skeleton(stage: Stage, alignment: Alignment, skeleton: Skeleton, unit:
     write_cylinders(in_file, stage.path(f"{FOUND_SKELETON}.csv"))
     stage.result.update(node_count=skeleton.node_count, length_m=skeleton.length,
                         alignment=alignment)
+
+
+def load_search(branch: Branch, settings: ReconstructSettings, digests: dict[str, str],
+                ) -> FoundSkeleton | None:
+    """Return what an earlier run of these programs found of a scan, if it came to no mesh.
+
+    Raises:
+        InputError: the file has been changed, its checksum as well.
+    """
+    from limber.geometry.skeleton.found import FoundSkeleton
+    from limber.store import program_versions
+
+    entry = branch.manifest.stages.get("skeleton")
+    if entry is None or not branch.has(SEARCH) or not branch.is_current(
+            "skeleton", settings, digests=digests):
+        return None
+    if program_versions().items() - entry.programs.items():
+        return None
+    return FoundSkeleton.read(branch.path(SEARCH))
 
 
 def write_branch(stage: Stage, cloud: Cloud, meshed: MeshedBranch) -> None:
@@ -283,4 +312,5 @@ def run(inputs: ReconstructInputs, settings: ReconstructSettings, options: RunOp
 STAGE = StageDescription(
     "reconstruct", 20, run, ReconstructInputs, ReconstructSettings, RunOptions, key="reconstruct",
     writes=("cloud.ply", "skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu",
-            "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", EDITS, "truth/"))
+            "point_masses.json", f"{FOUND_SKELETON}.swc", f"{FOUND_SKELETON}.csv", SEARCH, EDITS,
+            "truth/"))

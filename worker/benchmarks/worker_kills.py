@@ -1,0 +1,155 @@
+"""Kill -9 of a batch with its workers, or of one worker, at random moments; then it goes on.
+
+A stopped campaign goes on as well: with ``--out`` and ``--seed`` the kills that were made count.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.table import Row
+from benchmarks.worker_batches import (
+    RECONSTRUCT,
+    digests,
+    make_scans,
+    manifests,
+    start_batch,
+    write_jobs,
+)
+from limber.progress import Progress
+
+_DRAWS = 4  # for each kill, until the batch is still running at the moment drawn
+_STAGES = RECONSTRUCT + """[[job.stage]]
+run = "load"
+name = "gale"
+wind = [3.0, 0.0, 0.0]
+"""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """What came of one: ``moment`` is the share of an undisturbed run's time.
+
+    ``found`` are the entries that were stored when it fell, ``redone`` those of them that the next
+    run made once more; ``apart`` the files that differ from an undisturbed run's.
+    """
+
+    number: int
+    seed: int
+    sources: str
+    moment: float
+    is_alone: bool
+    found: tuple[str, ...]
+    redone: tuple[str, ...]
+    apart: int
+    code: int
+
+
+def killed(kills: int, branches: int, seed: int, kept: Path | None, progress: Progress) -> Row:
+    """``kills`` moments, each in a new run of the batch, which then goes on to its end.
+
+    Args:
+        kills: How many moments; only those count at which the batch was still running.
+        branches: In each run.
+        seed: Draws scans, moments, and who is killed.
+        kept: File of the kills that were made already.
+        progress: Called as it goes.
+    """
+    sources = source_digest(("store", "batch", "jobs", "stages", "geometry"), __file__)
+    made = {kill.number: kill for kill in read_trials(Kill, kept)
+            if (kill.seed, kill.sources) == (seed, sources)}
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        folder = Path(place)
+        make_scans(folder, branches, seed)
+        started = time.perf_counter()
+        code = start_batch(write_jobs(folder, "undisturbed", _STAGES), 1).wait()
+        whole = time.perf_counter() - started
+        wanted = digests(folder / "undisturbed")
+        for number in range(kills):
+            progress(number / kills, f"kill {number + 1} of {kills}")
+            if number not in made:
+                made[number] = _kill(folder, number, seed, sources, whole, wanted)
+                keep(made[number], kept)
+            print(f"kill {made[number]}", flush=True)
+    return _row([made[number] for number in range(kills)], branches, bool(wanted) and code == 0)
+
+
+def _row(kills: Sequence[Kill], branches: int, is_valid: bool) -> Row:
+    redone = Counter(key for kill in kills for key in kill.redone)
+    again = ", ".join(f"{key} {count} times" for key, count in redone.items()) or "nothing"
+    apart = sum(kill.apart > 0 for kill in kills)
+    ended = sum(kill.code == 0 for kill in kills)
+    stored = Counter(key for kill in kills for key in kill.found)
+    told = (f"{len(kills)} kills, {sum(kill.is_alone for kill in kills)} of one worker alone, "
+            f"{branches} branches each; stored when they fell: "
+            f"{', '.join(f'{key} {count}' for key, count in stored.items()) or 'nothing'}; "
+            f"{apart} runs with other files, redone: {again}, {ended} went on to the end")
+    return Row("kill -9 of batch and workers, or of a worker, at random moments (30 asked)",
+               "identical, nothing stored redone", told,
+               is_valid and apart == 0 and not redone and ended == len(kills))
+
+
+def _kill(folder: Path, number: int, seed: int, sources: str, whole: float,
+          wanted: dict[tuple[str, str], str]) -> Kill:
+    rng = np.random.default_rng([seed, number])
+    name = f"killed-{number}"
+    jobs, out = write_jobs(folder, name, _STAGES), folder / name
+    for _ in range(_DRAWS):
+        moment = float(rng.uniform(0.2 / whole, 1.0))
+        process = start_batch(jobs, 1)
+        time.sleep(moment * whole)
+        if process.poll() is None:
+            break
+        shutil.rmtree(out)
+    family = _family(process)
+    is_alone = bool(rng.random() >= 0.5 and family)
+    if is_alone:
+        _end([family[int(rng.integers(len(family)))]])
+    else:
+        _end([process.pid, *family])
+    # One whose worker was killed goes on to its own end first.
+    stored = _entries(out)
+    process.wait()
+    code = start_batch(jobs, 1, "--retry-failed").wait()
+    now, files = _entries(out), digests(out)
+    shutil.rmtree(out)
+    return Kill(number, seed, sources, round(moment, 4), is_alone,
+                tuple(sorted(key for _, key in stored)),
+                tuple(sorted(key for (branch, key), value in stored.items()
+                             if now.get((branch, key)) != value)),
+                sum(files.get(key) != wanted.get(key) for key in files.keys() | wanted.keys()),
+                code)
+
+
+def _family(process: subprocess.Popen) -> list[int]:
+    """The processes that a batch has started."""
+    import psutil
+
+    try:
+        return [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return []
+
+
+def _end(processes: Sequence[int]) -> None:
+    for one in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(one, signal.SIGKILL)
+
+
+def _entries(out: Path) -> dict[tuple[str, str], str]:
+    """When each stored entry was made."""
+    return {(branch, key): f"{entry['finished']} {entry['seconds']}"
+            for branch, manifest in manifests(out).items()
+            for key, entry in manifest["stages"].items()}
