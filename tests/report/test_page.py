@@ -45,6 +45,21 @@ def test_unfinished_folder_says_what_is_missing(meshed: Branch):
     assert "<title>beam &amp; co" in html
 
 
+def test_a_page_of_an_unchanged_folder_is_left_as_it_is(meshed: Branch):
+    """Drawn again when something has been added, or when it is asked for."""
+    first = write_report(meshed.folder)
+    entry = Branch.open(meshed.folder).manifest.stages["report"]
+    assert write_report(meshed.folder) == first
+    assert Branch.open(meshed.folder).manifest.stages["report"] == entry
+    write_report(meshed.folder, force=True)
+    assert Branch.open(meshed.folder).manifest.stages["report"] != entry
+    with meshed.stage("note") as stage:
+        stage.result["said"] = "something"
+    entry = Branch.open(meshed.folder).manifest.stages["report"]
+    write_report(meshed.folder)
+    assert Branch.open(meshed.folder).manifest.stages["report"] != entry
+
+
 def test_picture_must_be_a_png(meshed: Branch, tmp_path):
     """Another file, or none, is refused with its name; no report is left behind."""
     (tmp_path / "x.png").write_bytes(b"JFIF")

@@ -1,6 +1,8 @@
 """Weather and cuts in a session: as `limber load` has them, on the branch that is held."""
 
+import json
 from concurrent.futures import Future
+from dataclasses import replace
 from threading import Event
 
 import numpy as np
@@ -11,11 +13,13 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.mechanics.added import PointMass
 from limber.mechanics.load_effects import load_effects
 from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
+from limber.progress import SILENT
 from limber.session import protocol
-from limber.session.effects import EffectsTeller
+from limber.session.effects import EffectsTeller, effects_of, gusts_of
 from limber.session.held import HeldBranch
 from limber.session.loading import load_held
 from limber.session.settings import SessionSettings
+from limber.stages.load import LoadSettings, load
 from limber.stages.loading import load_branch, load_skeleton
 from limber.store import Branch
 
@@ -83,6 +87,34 @@ class Said:
         self.over.set()
 
 
+_GUSTY = json.dumps({"command": "effects", "id": 8, "gust_record": {
+    "time_s": [k / 10 for k in range(100)], "speed_m_s": [6.0] * 100}}).encode()
+
+
+def test_gusts_in_a_session(with_axes):
+    """They push as `limber load` has it; without a wind, or with a record of none, it is said."""
+    held = load_held(with_axes, SessionSettings())
+    loads = Outdoors(wind=(6.0, 0.0, 0.0))
+    question = protocol.parse_command(b'{"command": "effects", "gust": 0.3}')
+    told = effects_of(with_axes, SessionSettings(), held.young, loads, gusts_of(question),
+                      question, SILENT)
+    as_load = load(with_axes, LoadSettings(wind=(6.0, 0.0, 0.0), gust=0.3))
+    assert told["gusts"]["factor"] == pytest.approx(as_load["gusts"]["factor"], rel=1e-6)
+    assert told["greatest_strain"] == pytest.approx(as_load["greatest_strain"], rel=1e-6)
+    teller = EffectsTeller(with_axes, SessionSettings(), Said())
+    held.set_outdoors(Outdoors(snow=1.0))
+    with pytest.raises(InputError, match="without wind"):
+        teller.ask(question, held)
+    held.set_outdoors(loads)
+    for times in ([0.0], [1.0] * 20):
+        record = {"time_s": times, "speed_m_s": [6.0] * len(times)}
+        with pytest.raises(InputError, match="no record of a wind"):
+            teller.ask(protocol.parse_command(json.dumps(
+                {"command": "effects", "gust_record": record}).encode()), held)
+    with pytest.raises(protocol.NotUnderstood, match="not both"):
+        protocol.parse_command(_GUSTY.replace(b'"id": 8', b'"gust": 0.3'))
+
+
 def test_what_loads_do_is_told(with_axes):
     """As `limber load` tells it, of the branch as it is now; one question at a time."""
     held = load_held(with_axes, SessionSettings())
@@ -99,9 +131,12 @@ def test_what_loads_do_is_told(with_axes):
         with pytest.raises(InputError, match="One question"):
             teller.ask(question, held)
         assert said.over.wait(120)
+        said.over.clear()
+        teller.ask(protocol.parse_command(_GUSTY), held)
+        assert said.over.wait(120)
     finally:
         teller.close()
-    (reply,) = said.lines
+    reply, gusty = said.lines
     branch = Branch.open(with_axes)
     model = load_branch(branch).model
     _, told = load_effects(
@@ -111,6 +146,13 @@ def test_what_loads_do_is_told(with_axes):
     for name in ("sag_m", "greatest_strain", "bears_times"):
         assert reply[name] == pytest.approx(told[name], rel=1e-6), name
     assert reply["held_by"] == told["held_by"] and reply["sag_interval_m"] is None
+    # An even wind of the record's own speed, blowing the way that the session's does.
+    loads = replace(loads, wind=(6.0, 0.0, 0.0))
+    _, told = load_effects(
+        LoadedOutdoors(model.with_young(2.0 * model.young), load_skeleton(branch), loads),
+        strain_limit=0.01, deviation=None)
+    assert reply["gusts"] is None and gusty["gusts"]["factor"] == pytest.approx(1.0)
+    assert gusty["sag_m"] == pytest.approx(told["sag_m"], rel=1e-6)
     held.set_gravity(False)
     with pytest.raises(InputError, match="switched off"):
         held.outdoors()

@@ -45,6 +45,25 @@ def test_targets_are_set_replaced_and_removed(folder, capsys):
     assert [t.name for t in load_targets(Branch.open(folder))] == ["leaf"]
 
 
+def test_one_that_is_there_is_left_as_it_is(folder):
+    """Unless it was moved, taken out or asked for again; so is one that is not there."""
+    def finished(name="flower"):
+        return Branch.open(folder).manifest.stages[f"target:{name}"]
+    wish = TargetSettings(at=(0.0, 0.0, 0.2))
+    first = set_target(folder, "flower", wish)
+    before = finished()
+    set_target(folder, "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
+    again = set_target(folder, "flower", wish)
+    assert finished() == before and again["targets"] == ["flower", "leaf"]
+    assert again["position_m"] == list(first["position_m"])
+    set_target(folder, "flower", wish, force=True)
+    assert finished() != before
+    set_target(folder, "flower", TargetSettings(remove=True))
+    assert set_target(folder, "flower", TargetSettings(remove=True))["targets"] == ["leaf"]
+    set_target(folder, "flower", wish)
+    assert {one.name for one in load_targets(Branch.open(folder))} == {"flower", "leaf"}
+
+
 @pytest.mark.parametrize(("name", "settings", "words"), [
     ("flower", {"at": (0.2, 0.0, 0.2)}, "off the branch"),
     ("flower", {"at": (0.0, 0.0, 200.0)}, "unit"),

@@ -1,6 +1,7 @@
 """Every reader of files that others may have written: good files of each kind, and who reads them.
 
-Those of a branch folder stand in :mod:`benchmarks.worker_branch_readers`.
+Those of a branch folder stand in :mod:`benchmarks.worker_branch_readers`, bags in
+:mod:`benchmarks.worker_bag_readers`.
 """
 
 import json
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.worker_bag_readers import BAG_READERS
 from benchmarks.worker_branch_readers import BRANCH_READERS, Reader, template_file
 from limber.errors import InputError
 from limber.store import Branch
@@ -253,10 +255,11 @@ def _ring(_template: Path, path: Path) -> Any:
 
 
 def _wind(_template: Path, path: Path) -> Any:
+    from limber.mechanics.gust_loads import WindRecord
     from limber.mechanics.gusts import Swaying, recorded
-    from limber.stages.load import read_wind
 
-    return recorded(Swaying(np.ones(1), np.full(1, 0.05), np.ones(1)), *read_wind(path))
+    wind = WindRecord.read(path)
+    return recorded(Swaying(np.ones(1), np.full(1, 0.05), np.ones(1)), wind.times, wind.speeds)
 
 
 def _edits(_template: Path, folder: Path) -> list[Path]:
@@ -314,7 +317,9 @@ def _commands(_template: Path, folder: Path) -> list[Path]:
         {"command": "young", "young_pa": [1e8, 1e8]},
         {"command": "loads", "loads": [{"point": [0, 0, 0.3], "force_n": [0, 0, -1]}]},
         {"command": "outdoors", "wind_m_s": [4, 0, 0], "snow_kg_m2": 2, "cuts": [[0, 0, 0.3]],
-         "fruit": [{"point": [0, 0, 0.2], "mass_kg": 0.1}]})) + "\n")
+         "fruit": [{"point": [0, 0, 0.2], "mass_kg": 0.1}]},
+        {"command": "effects", "limit_load": True, "gust_record": {
+            "time_s": [0.0, 0.5, 1.0], "speed_m_s": [3.0, 5.0, 4.0]}})) + "\n")
     return [path]
 
 
@@ -392,23 +397,23 @@ def _matlab_73(template: Path, folder: Path) -> list[Path]:
     return [path]
 
 
-def _mcap(template: Path, folder: Path) -> list[Path]:
-    from limber.stages.export_pull import export_pull
-
-    path = folder / "pull.mcap"
-    export_pull(template, "pull-1", path)
+def _rtde(_template: Path, folder: Path) -> list[Path]:
+    """A robot's log as ur-rtde records it."""
+    path, times = folder / "rtde.csv", np.linspace(0, 1, 40)
+    rows = np.column_stack([times, 0.05 * times, *np.tile([[0.0], [0.5], [0.1], [0.2], [0.3]], 40),
+                            2.5 * times, *np.zeros((5, 40))])
+    np.savetxt(path, rows, "%.9g", ",", comments="", header=",".join([
+        "timestamp", *(f"actual_TCP_pose_{k}" for k in range(6)),
+        *(f"actual_TCP_force_{k}" for k in range(6))]))
     return [path]
 
 
-def _bag(_template: Path, path: Path) -> Any:
-    """A bag up to the pull that is made of it."""
-    from limber.recordings.bags.pull import pull_of_bag
-    from limber.recordings.bags.reading import read_bag
-    from limber.recordings.settings import ImportSettings
+def _log(_template: Path, path: Path) -> Any:
+    """A robot's log up to the pull that is made of it."""
+    from limber.recordings.tables import is_robot_table, read_table, robot_stream, split_title
 
-    with tempfile.TemporaryDirectory() as folder:
-        made = pull_of_bag(read_bag(path), Path(folder), ImportSettings())
-    return made.robot, made.seen
+    return is_robot_table([split_title(title) for title in read_table(path).titles]), robot_stream(
+        path)
 
 
 def _swc(_template: Path, path: Path) -> Any:
@@ -443,7 +448,7 @@ READERS: dict[str, Reader] = {
     "nominal CSV": Reader("text", _nominal, _read_nominal),
     "calipers CSV": Reader("text", _calipers, _read_calipers),
     "MAT v7.3": Reader("binary", _matlab_73, _skeleton),
-    "MCAP": Reader("binary", _mcap, _bag, True),
+    "RTDE CSV": Reader("text", _rtde, _log, True),
     "MAT": Reader("binary", partial(_cylinder_models, ".mat"), _skeleton),
     "rTwig CSV": Reader("text", partial(_cylinder_models, ".csv"), _skeleton),
     "ring CSV": Reader("text", partial(_decay, "ring.csv", "a_m_s2"), _ring),
@@ -460,6 +465,6 @@ READERS: dict[str, Reader] = {
     "job TOML": Reader("text", _jobs, _read_jobs),
     "cell TOML": Reader("text", _cell, _read_cell),
     "session commands": Reader("text", _commands, _read_commands),
-    **BRANCH_READERS,
+    **BAG_READERS, **BRANCH_READERS,
 }
 """Readers by name."""

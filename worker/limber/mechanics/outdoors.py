@@ -107,6 +107,11 @@ class LoadedOutdoors:
         return self._plain
 
     @property
+    def wind(self) -> tuple[float, float, float]:
+        """Velocity of the even wind [m/s]."""
+        return self._loads.wind
+
+    @property
     def dead_forces(self) -> np.ndarray:
         """All of it as forces on the nodes that keep their direction [N], shape [node_count, 3]."""
         added = self._model_under(1.0).mass_load - self._model.mass_load

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -139,10 +140,21 @@ class InteractiveSession:
         frequencies and, with ``limit_load=True``, how many times as much it bears; intervals where
         an estimate has left them. Takes seconds; the branch can be moved meanwhile.
 
+        ``gust=0.3`` adds turbulence of that intensity, ``gust_record`` the gusts of a CSV file
+        (``time_s``, ``speed_m_s``) along the wind's direction: then all is of their peak.
+
         Raises:
             InputError: there is nothing outdoors, or the branch finds no rest under it.
             WorkError: it was not told within ``seconds``.
         """
+        record = question.get("gust_record")
+        if isinstance(record, str | os.PathLike):
+            # It loads the mechanics, which a client has no other need of.
+            from limber.mechanics.gust_loads import WindRecord
+
+            wind = WindRecord.read(Path(record))
+            question["gust_record"] = {"time_s": wind.times.tolist(),
+                                       "speed_m_s": wind.speeds.tolist()}
         return self.request("effects", seconds, **question)
 
     def set_dynamics(self, on: bool) -> dict[str, Any]:

@@ -5,6 +5,7 @@ it, with the moduli and the loads that the session had when it was asked.
 """
 
 from concurrent.futures import CancelledError, Future
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from limber.errors import Cancelled, InputError, LimberError
 from limber.jobs import Pool
+from limber.mechanics.gust_loads import Gusts, Turbulence, WindRecord, blown, with_peak
 from limber.mechanics.load_effects import load_effects
 from limber.mechanics.outdoors import Outdoors
 from limber.progress import Progress
@@ -21,6 +23,8 @@ from limber.session.held import HeldBranch
 from limber.session.loading import load_held
 from limber.session.protocol import Effects
 from limber.session.settings import SessionSettings
+from limber.stages.loading import known_damping
+from limber.store import Branch
 
 
 class EffectsTeller:
@@ -40,16 +44,18 @@ class EffectsTeller:
         """Have a question answered: its ``reply``, or its ``error``, comes when that is known.
 
         Raises:
-            InputError: another one is being answered, no load acts, or the weight is off.
+            InputError: another one is being answered, no load acts, the weight is off, or gusts
+                are asked for without a wind.
         """
         if self._asked is not None and not self._asked.done():
             raise InputError("The effects of loads are being worked out.",
                              "One question is answered at a time.", "Wait for its reply.")
-        loads = held.outdoors()
+        loads, gusts = held.outdoors(), gusts_of(question)
+        loads = replace(loads, wind=blown(loads.wind, gusts))
         # It stays for the next question: most of the first one's time is its beginning.
         self._pool = self._pool or Pool(1, name="the effects of loads")
         self._asked = self._pool.submit(effects_of, self._folder, self._settings, held.young,
-                                        loads, question)
+                                        loads, gusts, question)
         self._asked.add_done_callback(partial(self.tell, question))
 
     def close(self) -> None:
@@ -73,8 +79,21 @@ class EffectsTeller:
             self._events.say(event="reply", **about, **told)
 
 
+def gusts_of(question: Effects) -> Gusts | None:
+    """Return the gusts that a question is about.
+
+    Raises:
+        InputError: its record is none of a wind.
+    """
+    if question.gust_record is not None:
+        return WindRecord.checked(np.array(question.gust_record.time_s),
+                                  np.array(question.gust_record.speed_m_s), "gust_record")
+    return None if question.gust is None else Turbulence(
+        question.gust, question.gust_length_m, question.gust_time_s)
+
+
 def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads: Outdoors,
-               question: Effects, progress: Progress) -> dict[str, Any]:
+               gusts: Gusts | None, question: Effects, progress: Progress) -> dict[str, Any]:
     """Return what loads do to a branch with these moduli at its control points [Pa].
 
     Raises:
@@ -82,8 +101,10 @@ def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads
     """
     held = load_held(folder, settings, progress)
     held.set_young(young)
+    outdoors, peak = held.set_outdoors(loads), None
+    if gusts is not None:
+        outdoors, peak = with_peak(outdoors, gusts, known_damping(Branch.open(folder), progress))
     _, told = load_effects(
-        held.set_outdoors(loads), strain_limit=question.strain_limit,
-        deviation=held.young_deviation, most=question.most if question.limit_load else None,
-        progress=progress)
-    return told
+        outdoors, strain_limit=question.strain_limit, deviation=held.young_deviation,
+        most=question.most if question.limit_load else None, progress=progress)
+    return told | {"gusts": peak}

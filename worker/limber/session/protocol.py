@@ -136,13 +136,36 @@ class Weather(_Command):
     cuts: list[_Vector] = Field([], max_length=1000)
 
 
+class RecordedWind(BaseModel):
+    """A wind as it was measured: times, and speeds along its mean direction."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    time_s: list[Annotated[float, Field(ge=-1e12, le=1e12)]] = Field(max_length=30_000)
+    speed_m_s: list[_Component] = Field(max_length=30_000)
+
+
 class Effects(_Command):
-    """Ask what wind, snow, fruit and cuts do to the branch, as `limber load` tells it."""
+    """Ask what wind, snow, fruit and cuts do to the branch, as `limber load` tells it.
+
+    With ``gust``, or a ``gust_record``, all of it is of the peak of the gusts; of a record the
+    wind's direction counts alone.
+    """
 
     command: Literal["effects"]
     strain_limit: float = Field(0.01, gt=0, lt=1)
     limit_load: bool = False
     most: float = Field(50.0, gt=1, le=1e4)
+    gust: float | None = Field(None, gt=0, le=1)
+    gust_length_m: float = Field(27.0, gt=0, le=1000)
+    gust_time_s: float = Field(600.0, ge=10, le=1e5)
+    gust_record: RecordedWind | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Effects":
+        if self.gust is not None and self.gust_record is not None:
+            raise ValueError("gusts are those of `gust` or of `gust_record`, not both")
+        return self
 
 
 class Status(_Command):

@@ -27,7 +27,9 @@ Commands, one JSON object a line (UTF-8, at most 1 MiB) on standard input. Each 
   the branch that nothing holds. The reply comes seconds later, between others, and says what
   `limber load` does: ``sag_m``, ``greatest_strain``, ``strain_over_limit``, ``along``,
   ``frequencies_hz``, ``bears_times`` and ``held_by``, with intervals where an estimate has left
-  them.
+  them. With ``"gust": 0.3`` (turbulence; ``gust_length_m``, ``gust_time_s``) or ``"gust_record":
+  {"time_s": [...], "speed_m_s": [...]}`` it is of the peak of the gusts, and ``gusts`` says how
+  that came.
 - ``{"command": "gravity", "on": false}``: let the branch bear its weight, or not. It hangs where it
   was scanned; without weight it rises from there.
 - ``{"command": "young", "young_pa": [...]}``: Young's modulus at the control points; the

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -9,21 +10,21 @@ import numpy as np
 from pydantic import Field
 
 from limber.errors import InputError
+from limber.files import file_digest
 from limber.progress import SILENT, Progress
-from limber.reading import read_columns
+from limber.reading import read_json
 from limber.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
-    from limber.mechanics.materials import RayleighDamping
+    from limber.mechanics.gust_loads import Gusts
     from limber.mechanics.model import BranchModel
-    from limber.mechanics.outdoors import Bent, LoadedOutdoors
+    from limber.mechanics.outdoors import Bent
 
 _Place = tuple[float, float, float]
 _Fruit = tuple[float, float, float, float]
-_LEAST_RECORD, _MOST_STEPS, _FASTEST = 16, 2e6, 150.0
 
 
 class LoadSettings(Settings):
@@ -70,26 +71,27 @@ class LoadSettings(Settings):
         "this name: report and scene then show the branch as it comes to rest.")
 
 
-def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -> dict[str, Any]:
+def load(folder: Path, settings: LoadSettings, *, force: bool = False,
+         progress: Progress = SILENT) -> dict[str, Any]:
     """Bring the branch to rest under loads.
 
     With a name it writes ``loads/NAME.json``, and ``frames/load-NAME.pc2``, ``.json`` and ``.npz``:
-    the branch as scanned, and at rest under the loads. Else it writes nothing.
+    the branch as scanned, and at rest under the loads; what is stored of the same branch and loads
+    is not worked out again, unless ``force``. Without a name it writes nothing.
 
     Returns:
         What :func:`~limber.mechanics.load_effects.load_effects` tells (sag, greatest strain and
         strain along the main path, frequencies; with ``limit_load`` how many times the loads it
         bears; each with its interval, None where nothing has told how sure the moduli are), and
-        ``frequencies_before_hz``. With gusts all of it is of their peak, and ``gusts`` has
-        ``factor`` (peak load over mean load), ``deviation``, ``peak_factor``, ``crossing_hz``,
-        ``dynamic`` (over a branch that follows at once), ``damping`` of the first mode,
-        ``mean_tip_displacement_m`` and ``mean_speed_m_s``.
+        ``frequencies_before_hz``. With gusts all of it is of their peak, and ``gusts`` has what
+        :func:`~limber.mechanics.gust_loads.with_peak` tells.
 
     Raises:
         InputError: no load, one off the branch, or gusts without wind. WorkError: it finds no
             rest under it.
     """
     from limber.mechanics.added import PointMass
+    from limber.mechanics.gust_loads import blown, with_peak
     from limber.mechanics.load_effects import load_effects
     from limber.mechanics.outdoors import LoadedOutdoors, Outdoors
     from limber.mechanics.vibration import lowest_modes
@@ -100,39 +102,52 @@ def load(folder: Path, settings: LoadSettings, *, progress: Progress = SILENT) -
         young_deviation,
     )
 
-    record = _record(settings)
+    gusts = _gusts(settings)
+    wind = blown(settings.wind or (0.0, 0.0, 0.0), gusts)
     if not (settings.wind or settings.snow or settings.fruit or settings.cut):
         raise InputError("No load is given.", "Its own weight has bent the scanned branch already.",
                          "Give --wind, --snow, --fruit or --cut.")
     if any(not one[3] > 0 for one in settings.fruit):
         raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
-    wind = settings.wind or (0.0, 0.0, 0.0)
-    if record is not None:
-        wind = tuple(map(float, _mean_speed(record) * np.array(wind) / np.linalg.norm(wind)))
     branch = Branch.open(folder)
+    inputs = _inputs(branch, settings)
+    if settings.name is not None and not force and branch.is_current(
+            f"load:{settings.name}", settings, **inputs):
+        return read_json(branch.path(f"loads/{settings.name}.json"), "the effects of loads")
     skeleton = load_skeleton(branch)
     hanging = load_branch(branch, progress=progress).model
     _require_near(hanging.mesh.nodes, [one[:3] for one in settings.fruit])
     loads = Outdoors(wind, settings.drag, settings.snow, tuple(
         PointMass(one[:3], one[3]) for one in settings.fruit), settings.cut)
     outdoors = LoadedOutdoors(hanging, skeleton, loads)
-    gusts: dict[str, Any] | None = None
-    if record is not None or settings.gust is not None:
+    told = None
+    if gusts is not None:
         progress(0.1, "gusts")
-        gusts = _gusts(outdoors, settings, record, known_damping(branch, progress))
-        outdoors = outdoors.with_gusts(gusts["factor"])
+        outdoors, told = with_peak(outdoors, gusts, known_damping(branch, progress))
     bent, result = load_effects(
         outdoors, strain_limit=settings.strain_limit, deviation=young_deviation(branch),
         most=settings.most if settings.limit_load else None, progress=progress.part(0.2, 1.0))
     result |= {"frequencies_before_hz": lowest_modes(hanging, len(bent.frequencies)).frequencies,
-               "gusts": gusts}
+               "gusts": told}
     if settings.name is not None:
-        _keep(branch, settings, hanging, bent, result)
+        _keep(branch, settings, inputs, hanging, bent, result)
     return result
 
 
-def _keep(branch: Branch, settings: LoadSettings, hanging: BranchModel, bent: Bent,
-          result: dict[str, Any]) -> None:
+def _inputs(branch: Branch, settings: LoadSettings) -> dict[str, Any]:
+    """What the result depends on beside the settings, as the store takes it."""
+    reads = [file for file in ("mesh.vtu", "skeleton.swc", "skeleton.csv", "point_masses.json",
+                               "targets.json", "estimate.json") if branch.has(file)]
+    # Damping and the interval may come from a swing's result alone.
+    told = {key: hashlib.sha256(branch.manifest.stages[key].model_dump_json().encode()).hexdigest()
+            for key in ("estimate", "swing", "vibration") if key in branch.manifest.stages}
+    record = settings.gust_record
+    return {"reads": reads, "digests": told | (
+        {} if record is None else {"gust_record": file_digest(record)})}
+
+
+def _keep(branch: Branch, settings: LoadSettings, inputs: dict[str, Any], hanging: BranchModel,
+          bent: Bent, result: dict[str, Any]) -> None:
     """Write the result, and the branch before and under the loads as frames."""
     import json
 
@@ -143,9 +158,7 @@ def _keep(branch: Branch, settings: LoadSettings, hanging: BranchModel, bent: Be
     nodes, name = surface_nodes(hanging.mesh), f"frames/load-{settings.name}"
     ways = np.stack([np.zeros_like(bent.displacement), bent.displacement])
     states = [strain_state(hanging, way) for way in ways]
-    reads = [file for file in ("mesh.vtu", "skeleton.swc", "point_masses.json", "targets.json",
-                               "estimate.json", "swing.json") if branch.has(file)]
-    with branch.stage(f"load:{settings.name}", settings, reads=reads) as stage:
+    with branch.stage(f"load:{settings.name}", settings, **inputs) as stage:
         stage.path(f"loads/{settings.name}.json").write_text(
             json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         write_pc2(stage.path(f"{name}.pc2"), hanging.mesh.nodes[nodes] + ways[:, nodes])
@@ -158,69 +171,17 @@ def _keep(branch: Branch, settings: LoadSettings, hanging: BranchModel, bent: Be
                              if key != "along"})
 
 
-def _record(settings: LoadSettings) -> tuple[np.ndarray, np.ndarray] | None:
-    """Times [s] and speeds [m/s] of the recorded wind, if there is one."""
-    if (settings.gust is not None or settings.gust_record is not None) and not (
-            settings.wind and np.any(settings.wind)):
-        raise InputError("Gusts without wind.", "They are of a wind that has a direction.",
-                         "Give --wind X Y Z.")
-    if settings.gust_record is None:
-        return None
-    if settings.gust is not None:
+def _gusts(settings: LoadSettings) -> Gusts | None:
+    """The gusts that were asked for."""
+    from limber.mechanics.gust_loads import Turbulence, WindRecord
+
+    if settings.gust is not None and settings.gust_record is not None:
         raise InputError("Both --gust and --gust-record are given.", "The record has the gusts.",
                          "Leave one out.")
-    return read_wind(settings.gust_record)
-
-
-def read_wind(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a recorded wind: times [s] and speeds [m/s], shape [n] each.
-
-    Raises:
-        InputError: it cannot be read, is too short, or does not blow forward on average.
-    """
-    columns = read_columns(path, ("time_s", "speed_m_s"), "a record of the wind")
-    times, speeds = columns["time_s"], columns["speed_m_s"]
-    if len(times) < _LEAST_RECORD or not (np.diff(times) > 0).all() or not speeds.mean() > 0 or (
-            not np.abs(speeds).max() < _FASTEST):
-        raise InputError(
-            f"{path} is no record of a wind.", f"It has at least {_LEAST_RECORD} rows, ascending "
-            f"times, and a wind under {_FASTEST:g} m/s that blows along --wind on average.",
-            "Give another one.")
-    if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
-        raise InputError(f"{path} has gaps that are far longer than its steps.",
-                         "It is taken in even steps.", "Give a part of it without gaps.")
-    return times, speeds
-
-
-def _mean_speed(record: tuple[np.ndarray, np.ndarray]) -> float:
-    """The even wind [m/s] that pushes as hard as the recorded one does on average."""
-    push = float((record[1] * np.abs(record[1])).mean())
-    if not push > 0:
-        raise InputError("The recorded wind pushes against --wind on average.", "",
-                         "Turn --wind round.")
-    return float(np.sqrt(push))
-
-
-def _gusts(outdoors: LoadedOutdoors, settings: LoadSettings,
-           record: tuple[np.ndarray, np.ndarray] | None, damping: RayleighDamping,
-           ) -> dict[str, Any]:
-    """What gusts make of the mean load, by how the tip sways."""
-    from limber.mechanics.gusts import recorded, turbulent
-    from limber.mechanics.load_effects import required_rest, tip_node
-
-    mean, tip = required_rest(outdoors), tip_node(outdoors)
-    sway = outdoors.sways(mean, tip, damping)
-    if record is not None:
-        speed = float(record[1].mean())
-        found = recorded(sway, *record)
-    else:
-        speed = float(np.linalg.norm(settings.wind))
-        found = turbulent(sway, speed, settings.gust, settings.gust_length, settings.gust_time)
-    return {"factor": found.factor, "deviation": found.deviation,
-            "peak_factor": found.peak_factor, "crossing_hz": found.crossing,
-            "dynamic": found.dynamic, "damping": float(sway.damping[0]),
-            "first_frequency_hz": float(sway.frequencies[0]), "mean_speed_m_s": speed,
-            "mean_tip_displacement_m": mean.displacement[tip]}
+    if settings.gust_record is not None:
+        return WindRecord.read(settings.gust_record)
+    return None if settings.gust is None else Turbulence(
+        settings.gust, settings.gust_length, settings.gust_time)
 
 
 def _require_near(nodes: np.ndarray, places: list[_Place]) -> None:
@@ -239,14 +200,14 @@ def _tables(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
            f"{100 * limit * row['strain']:.0f} %"] for row in result["along"])])]
 
 
-def run(inputs: BranchInputs, settings: LoadSettings, _options: NoOptions,
+def run(inputs: BranchInputs, settings: LoadSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
-    return load(inputs.branch_folder, settings, progress=progress)
+    return load(inputs.branch_folder, settings, force=options.force, progress=progress)
 
 
 STAGE = StageDescription(
-    "load", 45, run, BranchInputs, LoadSettings, NoOptions, key="load:{name}",
+    "load", 45, run, BranchInputs, LoadSettings, RunOptions, key="load:{name}",
     reads=("mesh.vtu", "skeleton.swc"),
     writes=("loads/{name}.json", "frames/load-{name}.pc2", "frames/load-{name}.json"),
     tables=_tables)

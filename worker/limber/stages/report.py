@@ -1,15 +1,19 @@
 """One self-contained HTML page with figures and tables of all results."""
 
+import hashlib
+import json
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import Field
 
+from limber.files import file_digest, require_file
 from limber.progress import SILENT, Progress
 from limber.settings import Groups
-from limber.stages.inputs import BranchInputs, NoOptions, NoSettings
+from limber.stages.inputs import BranchInputs, NoSettings, RunOptions
 from limber.stages.registry import StageDescription
 from limber.store import Branch
+from limber.version import VERSION
 
 
 class ReportInputs(BranchInputs):
@@ -25,7 +29,7 @@ class ReportInputs(BranchInputs):
 
 
 def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Path | None = None,
-                 progress: Progress = SILENT) -> dict[str, Any]:
+                 force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
     """Write ``report.html`` into a branch folder from whatever stages have been run.
 
     Args:
@@ -46,8 +50,11 @@ def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Pat
 
     branch = Branch.open(folder)
     calipers = [] if caliper_path is None else read_calipers(caliper_path)
+    settings, digests = {"picture": bool(picture)}, _shown(branch, picture, caliper_path)
+    if not force and branch.is_current("report", settings, digests=digests):
+        return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
     html, page = draw_page(branch, picture=picture, calipers=calipers, progress=progress)
-    with branch.stage("report", {"picture": bool(picture)}) as stage:
+    with branch.stage("report", settings, digests=digests) as stage:
         stage.path("report.html").write_text(html, encoding="utf-8")
         stage.result.update(
             figure_count=sum(len(section.pictures) for section in page),
@@ -59,13 +66,27 @@ def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Pat
     return branch.manifest.stages["report"].result | {"report": branch.path("report.html")}
 
 
-def run(inputs: ReportInputs, _settings: NoSettings, _options: NoOptions,
+def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> dict[str, str]:
+    """Digests of all that the page is drawn from."""
+    manifest = branch.manifest
+    held = {"files": {name: entry.sha256 for name, entry in manifest.files.items()
+                      if entry.stage != "report"},
+            "stages": {key: entry.model_dump(mode="json") for key, entry in manifest.stages.items()
+                       if key != "report"}}
+    text = json.dumps(held, sort_keys=True).encode()
+    outside = {"picture": picture, "caliper": caliper_path}
+    return {"folder": hashlib.sha256(text).hexdigest(), "limber": VERSION} | {
+        name: file_digest(require_file(path, f"A {name} file"))
+        for name, path in outside.items() if path is not None}
+
+
+def run(inputs: ReportInputs, _settings: NoSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     return write_report(inputs.branch_folder, picture=inputs.picture, caliper_path=inputs.caliper,
-                        progress=progress)
+                        force=options.force, progress=progress)
 
 
 STAGE = StageDescription(
-    "report", 110, run, ReportInputs, NoSettings, NoOptions, key="report",
+    "report", 110, run, ReportInputs, NoSettings, RunOptions, key="report",
     writes=("report.html",))

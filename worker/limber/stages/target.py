@@ -12,7 +12,7 @@ from pydantic import Field
 from limber.errors import InputError
 from limber.progress import Progress
 from limber.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, NoOptions, argument
+from limber.stages.inputs import BranchInputs, RunOptions, argument
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -46,8 +46,11 @@ class TargetSettings(Settings):
     remove: bool = Field(False, description="Forget this target.")
 
 
-def set_target(branch_folder: Path, name: str, settings: TargetSettings) -> dict[str, Any]:
+def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, force: bool = False,
+               ) -> dict[str, Any]:
     """Write a target into ``targets.json``, in place of one of that name, or take it out.
+
+    One that is there already as wished is left as it is, unless ``force``.
 
     It keeps the place that was given, and moves and turns with the nearest place of the branch.
 
@@ -64,12 +67,19 @@ def set_target(branch_folder: Path, name: str, settings: TargetSettings) -> dict
     _check_wishes(name, settings)
     branch = Branch.open(branch_folder)
     branch.require("mesh.vtu", "reconstruct")
-    with branch.stage(f"target:{name}", settings, reads=["mesh.vtu"]) as stage:
-        others = [target for target in load_targets(branch) if target.name != name]
-        if settings.remove and len(others) == len(load_targets(branch)):
-            known = ", ".join(target.name for target in others) or "none"
-            raise InputError(f"{branch.folder} has no target {name}.", f"It has {known}.",
-                             "Nothing was removed.")
+    key, known = f"target:{name}", load_targets(branch)
+    others = [target for target in known if target.name != name]
+    wished = [] if settings.at is None else [(name, settings.at, settings.mass)]
+    is_there = wished == [(one.name, one.position, one.mass) for one in known if one.name == name]
+    if not force and is_there and branch.is_current(key, settings, reads=["mesh.vtu"]):
+        return branch.manifest.stages[key].result | {
+            "targets": sorted(target.name for target in known)}
+    with branch.stage(key, settings, reads=["mesh.vtu"]) as stage:
+        if settings.remove and len(others) == len(known):
+            raise InputError(
+                f"{branch.folder} has no target {name}.",
+                f"It has {', '.join(target.name for target in others) or 'none'}.",
+                "Nothing was removed.")
         found = {} if settings.at is None else _placed(load_mesh(branch), name, settings)
         targets = others if settings.at is None else [*others, found.pop("target")]
         stage.path(FILE).write_text(_text(targets), encoding="utf-8")
@@ -125,12 +135,12 @@ def _text(targets: list[NamedTarget]) -> str:
     return json.dumps({"format_version": TARGETS_FORMAT, "targets": entries}, indent=1) + "\n"
 
 
-def run(inputs: TargetInputs, settings: TargetSettings, _options: NoOptions,
+def run(inputs: TargetInputs, settings: TargetSettings, options: RunOptions,
         _progress: Progress) -> dict[str, Any]:
     """Run the stage."""
-    return set_target(inputs.branch_folder, inputs.name, settings)
+    return set_target(inputs.branch_folder, inputs.name, settings, force=options.force)
 
 
 STAGE = StageDescription(
-    "target", 35, run, TargetInputs, TargetSettings, NoOptions, key="target:{name}",
+    "target", 35, run, TargetInputs, TargetSettings, RunOptions, key="target:{name}",
     reads=("mesh.vtu",), writes=("targets.json",))
