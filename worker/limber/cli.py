@@ -23,6 +23,7 @@ import click
 
 from limber.errors import LimberError
 from limber.heartbeat import Heartbeat
+from limber.machine_errors import machine_error
 from limber.progress import BarSink, JsonSink, Progress, Sink
 from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
 from limber.terminal import result_lines, table_lines
@@ -211,15 +212,14 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
     except KeyboardInterrupt:
         code = 130
         outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}
-    except MemoryError:
-        code = 3
-        outcome |= {"status": "failed",
-                    "error": "Out of memory. Use a coarser mesh or a thinner cloud."}
     except Exception as error:
-        # A bug of ours: the trace goes to standard error, the contract of the last line holds.
-        code = 3
-        traceback.print_exc()
-        outcome |= {"status": "failed", "error": f"internal error: {error!r}; please report it"}
+        told = machine_error(error)
+        code = told.exit_code if told else 3
+        if told is None:
+            # A bug of ours: the trace goes to standard error, the contract of the last line holds.
+            traceback.print_exc()
+            told = f"internal error: {error!r}; please report it"
+        outcome |= {"status": "failed", "error": str(told)}
     outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
     _print_outcome(outcome, result or {}, as_json)
     return code

@@ -12,7 +12,7 @@ from limber.batch.log import BatchLog
 from limber.batch.records import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
 from limber.batch.staging import AT_ONCE, Staging
 from limber.batch.task import run_task
-from limber.errors import Cancelled, LimberError
+from limber.errors import Cancelled, LimberError, WorkError
 from limber.jobs import Pool, worker_count
 from limber.progress import SILENT, Progress
 from limber.version import VERSION
@@ -100,6 +100,7 @@ class _Course:
         self.waiting = deque(jobs.branches)
         self.running: dict[Future, tuple[BranchJob, int, float]] = {}
         self.ended = 0
+        self.place = _identity(jobs.out)
         # While some are moved others are computed.
         self.ahead = AT_ONCE if any(branch.is_moved for branch in jobs.branches) else 0
 
@@ -149,10 +150,23 @@ class _Course:
         if self.is_given_up(branch, number):
             self.ended += 1
             return
+        self.require_place()
         task = branch.tasks[number]
         self.records.begin(branch, task)
         future = self.machines.submit(task, branch.folder)
         self.running[future] = branch, number, time.monotonic()
+
+    def require_place(self) -> None:
+        """Stop where the folder of results was lost: a new one would hide what is in it."""
+        try:
+            is_there = _identity(self.jobs.out) == self.place
+        except OSError:
+            is_there = False
+        if not is_there:
+            raise WorkError(f"{self.jobs.out} is not there any more.",
+                            "Results and records go there; it was moved, or its disk or network "
+                            "folder was lost.",
+                            "Bring it back and run this again: what was stored is kept.")
 
     def end(self, branch: BranchJob) -> None:
         """Have what came of a branch put where it belongs, or count it as ended."""
@@ -220,6 +234,11 @@ class _Course:
         status = FAILED if told["error"] else KEPT if told["is_kept"] else DONE
         return Record(status, told["error"], told["seconds"], told["memory_mb"],
                       tuple(told["warnings"]), numbers_of(told["result"]))
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    about = folder.stat()
+    return about.st_dev, about.st_ino
 
 
 def _step(branch: BranchJob, number: int) -> str:

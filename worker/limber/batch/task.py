@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from limber.batch.job_file import StageTask
-from limber.errors import BranchBusyError, BranchFolderError, Cancelled, LimberError
+from limber.errors import BranchBusyError, Cancelled, LimberError
 from limber.jobs.pool import memory_mb
+from limber.machine_errors import machine_error
 from limber.plain import plain
 from limber.progress import Progress
 from limber.stages.registry import stage_description
@@ -41,6 +42,11 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
             raise
         except LimberError as error:
             outcome["error"] = str(error)
+        except (OSError, MemoryError) as error:
+            told = machine_error(error, folder)
+            if told is None:
+                raise
+            outcome["error"] = str(told)
     after = _finished(task, folder)
     return outcome | {
         "warnings": warnings, "seconds": round(time.perf_counter() - started, 3),
@@ -55,7 +61,7 @@ def _finished(task: StageTask, folder: Path) -> str | None:
     name = getattr(task.inputs, "name", None) or getattr(task.settings, "name", "")
     try:
         entry = read_manifest(folder).stages.get(key.replace("{name}", str(name)))
-    except BranchFolderError:
+    except (LimberError, OSError):
         # The stage says what is wrong with it.
         return None
     return entry.finished + str(entry.seconds) if entry else None

@@ -79,10 +79,17 @@ def command(run: Run, job_file: Path, dry_run: bool, retry_failed: bool, emit: s
     try:
         run_jobs(jobs, records, retry_failed=retry_failed, workers=workers,
                  cluster=cluster, scheduler=scheduler, progress=run.progress)
-    finally:
-        if jobs.out.is_dir():
-            write_table(jobs, records)
-            write_page(jobs, records)
+    except BaseException:
+        # What it came to is told as far as it can be: the error is what counts.
+        try:
+            if jobs.out.is_dir():
+                write_table(jobs, records)
+                write_page(jobs, records)
+        except OSError as error:
+            run.progress.warn(f"The summary could not be written ({error}).")
+        raise
+    write_table(jobs, records)
+    write_page(jobs, records)
     put_summary(jobs)
     failed = failures(jobs, records)
     if failed:

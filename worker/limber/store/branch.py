@@ -13,6 +13,8 @@ writes (:mod:`limber.store.lock`), any number read. What killed programs left be
 the next one that writes.
 """
 
+import errno
+import math
 import os
 import shutil
 import time
@@ -27,6 +29,7 @@ from pydantic import BaseModel
 from limber.constants import GRAVITY
 from limber.errors import BranchFolderError, WorkError
 from limber.files import file_digest, flush_folder, write_atomically
+from limber.machine_errors import machine_error
 from limber.owner import is_owned_name, owned_name, sweep, sweep_beside
 from limber.plain import plain
 from limber.store import journal
@@ -46,6 +49,7 @@ from limber.store.verify import Checker, Damage, damage_error
 _STREAMS = ".streams"
 RESULTS = "results"
 """Among a stage's programs: the version of its settings' results; see limber.settings."""
+_NOTHING_FREE_BYTES = 1e6
 LEAST_FREE_BYTES = 200e6
 """A stage does not begin with less room on the disk: it would lose its work at the end."""
 
@@ -62,8 +66,15 @@ class Stage:
         self.adopted: list[Path] = []
 
     def path(self, name: str) -> Path:
-        """Return where to write file ``name`` (relative, ``/``) of the branch folder."""
+        """Return where to write file ``name`` (relative, ``/``) of the branch folder.
+
+        Raises:
+            WorkError: the branch folder is gone.
+        """
         path = self._folder / checked_name(name)
+        if not self._folder.is_dir():
+            # Not made anew: below the empty place of a lost disk there is another disk.
+            raise _gone(self._folder.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
@@ -138,12 +149,13 @@ class Branch:
             BranchFolderError: not a branch folder, damaged, or of a newer format.
         """
         folder = Path(folder)
-        if not folder.is_dir():
-            raise BranchFolderError(
-                f"There is no folder {folder}.", "A branch folder was expected.",
-                "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
-        _finish_pending(folder)
-        branch = cls(folder, read_manifest(folder))
+        with _in_words(folder):
+            if not folder.is_dir():
+                raise BranchFolderError(
+                    f"There is no folder {folder}.", "A branch folder was expected.",
+                    "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+            _finish_pending(folder)
+            branch = cls(folder, read_manifest(folder))
         if verify:
             branch.verify()
         return branch
@@ -216,9 +228,10 @@ class Branch:
 
         Raises:
             BranchFolderError: another program holds it; says who and since when.
-            WorkError: the disk is nearly full.
+            WorkError: the disk is full or nearly so, or the folder is lost, now or until the end.
         """
-        with run_lock(self.folder, purpose) as is_first:
+        _require_there(self.folder)
+        with _in_words(self.folder), run_lock(self.folder, purpose) as is_first:
             if is_first:
                 sweep(self.folder)
                 _require_room(self.folder, purpose)
@@ -296,6 +309,7 @@ class Branch:
         written = {name: FileEntry(sha256=file_digest(work / name),
                                    bytes=(work / name).stat().st_size, stage=key)
                    for name in entry.writes}
+        _require_there(self.folder)
         with commit_lock(self.folder):
             # One that a killed program left comes first: its files count already.
             journal.roll_forward(self.folder)
@@ -379,6 +393,50 @@ def _results_version(settings: BaseModel | Mapping[str, Any] | None) -> str:
 def _told_version(settings: BaseModel | Mapping[str, Any] | None) -> dict[str, str]:
     version = _results_version(settings)
     return {} if version == "1" else {RESULTS: version}
+
+
+@contextmanager
+def _in_words(folder: Path) -> Iterator[None]:
+    """Say what a full disk or a lost folder does to a stage as the user can read it."""
+    try:
+        yield
+    except OSError as error:
+        if _is_gone(folder):
+            raise _gone(folder) from error
+        told = machine_error(error, folder)
+        if told is None and _free_bytes(folder) < _NOTHING_FREE_BYTES:
+            # Native writers tell that something was not written, not why.
+            told = machine_error(OSError(errno.ENOSPC, str(error)), folder)
+        if told is None:
+            raise
+        raise told from error
+
+
+def _require_there(folder: Path) -> None:
+    """Refuse a folder that was there and is not any more: locks would make an empty one."""
+    if _is_gone(folder):
+        raise _gone(folder)
+
+
+def _is_gone(folder: Path) -> bool:
+    try:
+        return not (folder / MANIFEST).is_file() and not journal.is_pending(folder)
+    except OSError:
+        # The place does not answer: another error says so better.
+        return False
+
+
+def _gone(folder: Path) -> WorkError:
+    return WorkError(f"{folder} is not there any more.",
+                     "It was moved or removed, or the disk or network folder that it is on was "
+                     "lost.", "Bring it back, and run this again: what was stored before is kept.")
+
+
+def _free_bytes(folder: Path) -> float:
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return math.inf
 
 
 def _require_room(folder: Path, purpose: str) -> None:

@@ -58,9 +58,11 @@ def run_lock(folder: Path, purpose: str) -> Iterator[bool]:
             }) + "\n")
         yield is_first
     finally:
-        if lock.lock_counter == 1:
-            (folder / _HOLDER).unlink(missing_ok=True)
-        lock.release()
+        try:
+            if lock.lock_counter == 1:
+                (folder / _HOLDER).unlink(missing_ok=True)
+        finally:
+            lock.release()
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """The manifest ``branch.json``: what a branch folder holds, and what it was made from."""
 
+import functools
 import json
 import platform
 import uuid
@@ -11,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.alignment import Alignment
 from limber.errors import BranchFolderError, InputError
+from limber.machine_errors import machine_error
 from limber.reading import read_json
 from limber.version import VERSION
 
@@ -75,6 +77,7 @@ def read_manifest(folder: Path) -> Manifest:
 
     Raises:
         BranchFolderError: there is none, or it is damaged or of a newer format.
+        WorkError: the disk that it is on does not answer.
     """
     path = folder / MANIFEST
     if not path.is_file():
@@ -84,6 +87,8 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         content = read_json(path, "a manifest")
     except InputError as error:
+        if isinstance(error.__cause__, OSError) and (told := machine_error(error.__cause__, path)):
+            raise told from error
         raise BranchFolderError(
             error.seen, "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
@@ -120,10 +125,15 @@ def checked_name(name: str) -> str:
 
 def program_versions() -> dict[str, str]:
     """Return the versions of Limber, Python and the numerical packages that are installed."""
+    return dict(_installed())
+
+
+@functools.cache
+def _installed() -> tuple[tuple[str, str], ...]:
     found = {"limber": VERSION, "python": platform.python_version()}
     for name in _PROGRAMS:
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return tuple(found.items())

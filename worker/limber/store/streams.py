@@ -14,6 +14,7 @@ from filelock import FileLock, Timeout
 
 from limber.errors import BranchFolderError, InputError, WorkError
 from limber.files import flush_folder, write_atomically
+from limber.machine_errors import machine_error
 
 _WRITE_SECONDS = 0.25
 _FLUSH_SECONDS = 0.75
@@ -117,9 +118,10 @@ class Stream:
 
     def _raise_error(self) -> None:
         if self._error is not None:
+            told = machine_error(self._error, self.path)
             raise WorkError(f"{self.path} could not be written ({self._error.strerror}).",
-                            "What was appended last is lost.", "Make room on the disk.",
-                            ) from self._error
+                            f"{told.why if told else ''} What was appended last is lost.".strip(),
+                            told.fix if told else "Make room on the disk.") from self._error
 
 
 def stream_lines(path: Path) -> Iterator[str]:
