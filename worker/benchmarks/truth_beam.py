@@ -212,10 +212,14 @@ def real_row(folder: Path) -> Row:
     outside = [f"{value / 1e3:.0f} ({kind})" for kind, (least, most) in (
         ("static", (low, high)), ("dynamic", (soft, stiff))) for value in values
         if not least <= value <= most]
+    drops = {value: 1e3 * silicone_beam.drop(value, silicone_beam.LOAD_N)
+             for value in values if not low <= value <= high}
     return Row(measure, asked,
                f"static {found.young / 1e3:.0f} kPa ({low / 1e3:.0f} to {high / 1e3:.0f}), dynamic "
                f"{swung['young_pa'] / 1e3:.0f} ({soft / 1e3:.0f} to {stiff / 1e3:.0f}); outside: "
                + (", ".join(dict.fromkeys(outside)) or "none")
+               + "".join(f"; a beam of {value / 1e3:.0f} kPa drops by {drop:.2f} mm alone"
+                         for value, drop in drops.items())
                + f"; damping ratio {swung['damping_ratio']:.4f} ({least_damped:.4f} to "
                f"{most_damped:.4f}); drop {1e3 * found.simulated_drop:.2f} of "
                f"{1e3 * found.measured_drop:.2f} mm",
