@@ -264,3 +264,18 @@ def test_motion_against_the_load_is_named():
     load = np.array([0.0, 0.0, -1.0])
     assert _against(np.array([[0.02, 0.0, -0.001], [0.001, 0.0, 0.001]]), load) == ""
     assert "170 degrees" in _against(np.array([[0.0, 0.00353, 0.02]]), load)
+
+
+@pytest.mark.parametrize("sag", [0.7e-3, 3e-3, 20e-3])
+def test_a_sag_of_few_deviations_keeps_its_start_and_its_end_apart(sag):
+    """0.2 mm of noise hides when a small sag begins: its frames must not count as rest."""
+    rng = np.random.default_rng(5)
+    times = np.arange(300) / 100
+    part = np.where(times > 0.5, 1 - np.exp(-12 * np.maximum(times - 0.5, 0)), 0.0)
+    way = sag * np.linspace(0.2, 1.0, 5)[:, None]**2 * [0.0, 0.0, -1.0]
+    found = [settled(Observations(times, part[:, None, None] * way
+                                  + 2e-4 * rng.standard_normal((300, 5, 3))), "sag")
+             for _ in range(40)]
+    drops = np.array([(each.positions.mean(axis=0) - each.rest)[-1, 2] for each in found]) / -sag
+    assert abs(drops.mean() - 1) < 0.012 and drops.std() < 1.5e-4 / sag / np.sqrt(5) + 0.003
+    assert np.abs([each.rest[-1, 2] for each in found]).max() < 2e-4

@@ -15,6 +15,16 @@ FRAMES = 4
 """Frames that the settled part is averaged into."""
 STILL_SHARE = 0.005
 """Settled means: within this share of the whole displacement of where it ends: chosen."""
+HIDDEN_SHARE = 0.1
+"""Where the noise is above so much of the displacement, start and end of the motion are sought in
+the mean of all markers: chosen."""
+SURE = 4.0
+"""Deviations by which a mean must differ to have moved."""
+STRAY = 5.5
+"""Deviations per axis that no marker of a still recording strays by: in 1 of 1,000 recordings of
+1,000 places."""
+MEAN_WIDTH = 5
+"""Frames of the running mean."""
 REGISTRATION_SHARE = 0.25
 """A marker whose place on the body is off by 1 mm is off by so much of that when it moves: the
 displacement changes along a bent body by about its slope."""
@@ -69,20 +79,23 @@ def settled(seen: Observations, name: str) -> Settled:
                          "It must show the branch without the load.",
                          "Trim the recording so that it starts before the load.")
     noise = _noise(positions[:, whole])
-    rest = _rest(positions, noise)
     last = max(len(times) // 20, 3)
     end = np.nanmean(positions[-last:], axis=0)
+    count = _still_frames(positions, end, noise)
+    rest = _mean(positions[:count])
     off = np.linalg.norm(end - rest, axis=1)
     moved = float(np.nanmax(off[whole]))
-    if moved < 5 * noise:
+    if moved < 1.5 * SURE * noise * np.sqrt(1 / count + 1 / last):
         raise InputError(
             f"{name}: between start and end no marker moves more than {moved * 1e3:.2g} mm.",
             f"The markers' noise is {noise * 1e3:.2g} mm: no load shows.",
             "Hang a larger weight, or check that the recording starts without it.")
     away = np.linalg.norm(_running_mean(positions[:, whole]) - end[whole], axis=2)
-    band = max(STILL_SHARE * moved, 2 * noise)
+    band = max(STILL_SHARE * moved, STRAY * noise * np.sqrt(1 / MEAN_WIDTH + 1 / last))
     outside = np.flatnonzero(np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=1) > band)
     first = int(outside[-1]) + 1 if len(outside) else 0
+    if band > HIDDEN_SHARE * moved:
+        first = max(first, _settled_frame(positions, rest, end, noise, last))
     if len(times) - first < max(8, 0.03 * len(times)):
         swing = np.nanmax(np.ptp(positions[-last:, whole], axis=0))
         raise InputError(
@@ -117,7 +130,8 @@ def swung(seen: Observations, start: str, name: str) -> tuple[np.ndarray, float]
                          "Record again, with the markers towards the cameras.")
     noise = _noise(seen.positions[:, whole])
     if start == "held":
-        return _rest(seen.positions, noise), noise
+        last = _mean(seen.positions[-max(len(seen.times) // 20, 3):])
+        return _mean(seen.positions[:_still_frames(seen.positions, last, noise)]), noise
     last = seen.positions[-max(len(seen.times) // 10, 5):]
     way = np.nanmax(np.ptp(seen.positions[:, whole], axis=0))
     if np.nanmax(np.ptp(last[:, whole], axis=0)) > 0.05 * way + 6 * noise:
@@ -136,12 +150,52 @@ def _noise(positions: np.ndarray) -> float:
     return max(1.4826 * float(np.median(np.abs(second))) / np.sqrt(6), 1e-6)
 
 
-def _rest(positions: np.ndarray, noise: float) -> np.ndarray:
-    """Mean of the first frames, as long as nothing moves."""
+def _still_frames(positions: np.ndarray, end: np.ndarray, noise: float) -> int:
+    """Return how many first frames there are before anything moves; at least one."""
     away = np.linalg.norm(positions - positions[0], axis=2)
-    still = np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=1) < 6 * noise + 5e-5
-    count = int(np.argmin(still)) if not still.all() else len(still)
-    return _mean(positions[:max(count, 1)])
+    band = 6 * noise + 5e-5
+    still = np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=1) < band
+    count = max(int(np.argmin(still)) if not still.all() else len(still), 1)
+    if band < HIDDEN_SHARE * np.nanmax(np.linalg.norm(end - positions[0], axis=1)):
+        return count
+    for _ in range(3):
+        course, deviation = _course(positions, _mean(positions[:count]), end, noise)
+        # Half of the way is passed where the frames before it are below one half, those after it
+        # above, as nearly as can be.
+        half = max(int(np.argmin(np.cumsum(course - 0.5))) + 1, 1)
+        width = max(5, half // 4)
+        moving = _smoothed(course, width) > SURE * deviation / np.sqrt(width) + 0.02
+        begin = int(np.argmax(moving)) if moving.any() else half
+        count = max(min(begin, half) - width // 2, 1)
+    return count
+
+
+def _settled_frame(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noise: float,
+                   last: int) -> int:
+    """Return the first frame of those that stay at the end, in the mean of all markers.
+
+    The end is the mean of the ``last`` frames.
+    """
+    course, deviation = _course(positions, rest, end, noise)
+    width = max(5, len(course) // 12)
+    band = SURE * deviation * np.sqrt(1 / width + 1 / last) + STILL_SHARE
+    away = np.abs(_smoothed(course, width) - 1) > band
+    return int(np.flatnonzero(away)[-1]) + 1 + width // 2 if away.any() else 0
+
+
+def _course(positions: np.ndarray, rest: np.ndarray, end: np.ndarray, noise: float,
+            ) -> tuple[np.ndarray, float]:
+    """Return how far all markers are from rest, 0, to end, 1, shape [t], and its deviation."""
+    way = end - rest
+    whole = np.isfinite(way).all(axis=1)
+    length = float(np.linalg.norm(way[whole])) or noise
+    off = np.where(np.isfinite(positions), positions - rest, 0.0)[:, whole]
+    return np.einsum("tma,ma->t", off, way[whole]) / length**2, noise / length
+
+
+def _smoothed(course: np.ndarray, width: int) -> np.ndarray:
+    return np.convolve(np.pad(course, (width // 2, (width - 1) // 2), mode="edge"),
+                       np.full(width, 1 / width), mode="valid")
 
 
 def _mean(positions: np.ndarray) -> np.ndarray:
@@ -151,7 +205,7 @@ def _mean(positions: np.ndarray) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _running_mean(positions: np.ndarray, width: int = 5) -> np.ndarray:
+def _running_mean(positions: np.ndarray, width: int = MEAN_WIDTH) -> np.ndarray:
     pad = np.pad(positions, ((width // 2, width // 2), (0, 0), (0, 0)), mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(pad, width, axis=0)
     return np.nanmean(np.where(np.isfinite(windows), windows, np.nan), axis=-1) \
