@@ -34,6 +34,8 @@ MESHES = (SWING_MESH, (9, 3, 3), (12, 4, 4))
 OTHERS_PA = ((264e3, 264e3), (264e3, 295e3), (283e3, 283e3))
 """Of the real beam, by three other programs; one of them gives a range."""
 OTHER_LOADS_N = (0.2, 1.0)
+LEAST_SAG = 0.01
+"""Of the length: what sags less shows no modulus to 5 % in markers of 0.2 mm."""
 
 
 def rows(progress: Progress, seed: int) -> list[Row]:
@@ -139,7 +141,8 @@ def sag_row(count: int, progress: Progress, seed: int) -> Row:
         errors.append(error)
         held += is_held
     worst = 100 * max(errors, default=np.inf)
-    return Row("tapered beam with elliptic sections under its own weight", "5 %, covered",
+    return Row("tapered beam with elliptic sections under its own weight (by 1 % of its length "
+               "and more)", "5 %, covered",
                f"worst {worst:.1f} %, median {100 * np.median(errors or [np.inf]):.1f} %, "
                f"{held} of {count} covered{'; '.join(['', *refused[:2]])}",
                bool(worst <= 5 and held >= np.ceil(0.88 * count) and not refused))
@@ -150,19 +153,10 @@ def _sagging(folder: Path, rng: np.random.Generator) -> tuple[float, bool]:
 
     Density and hung masses are weighed to 1 %; Poisson's ratio is a book's.
     """
-    young = float(np.exp(rng.uniform(*np.log([3e8, 4e9]))))
-    density, poisson = rng.uniform(500, 1100), float(np.clip(rng.normal(0.35, 0.05), 0.2, 0.47))
-    table = _drawn_table(folder / "beam.csv", rng)
-    told = MeshSurfaceSettings(unit="mm", density=density * rng.normal(1, 0.01), young=1e9)
+    while (sag := _drawn_sag(folder, rng)) is None:
+        pass
+    young, told, places, moved = sag
     mesh_surface(folder / "beam.csv", folder / "beam.branch", told)
-    fine, masses = mesh_sections(table, told.model_copy(update={"elements_across": 4.0}))
-    model = BranchModel(
-        fine.mesh, young=young, poisson=poisson, density=density,
-        gravity=fine.numbers["gravity_m_s2"], point_masses=[
-            PointMass(tuple(m["attached_m"]), m["mass_kg"] * rng.normal(1, 0.01)) for m in masses])
-    places = fine.skeleton.nodes[1:]
-    moved = (point_operator(fine.mesh, places) @ solve_static(
-        model).require().displacement.ravel()).reshape(-1, 3)
     times = np.arange(300) / 100
     part = np.where(times > 0.5, 1 - np.exp(-12 * np.maximum(times - 0.5, 0)), 0.0)
     seen = places + part[:, None, None] * moved
@@ -175,6 +169,25 @@ def _sagging(folder: Path, rng: np.random.Generator) -> tuple[float, bool]:
                                                               density_sigma=0.01))
     low, high = found["young_interval_pa"][0]
     return abs(found["young_pa"][0] / young - 1), bool(low <= young <= high)
+
+
+def _drawn_sag(folder: Path, rng: np.random.Generator,
+               ) -> tuple[float, MeshSurfaceSettings, np.ndarray, np.ndarray] | None:
+    """Modulus, what is known of the beam, markers, and how they sag [m]; None: it hardly sags."""
+    young = float(np.exp(rng.uniform(*np.log([3e8, 4e9]))))
+    density, poisson = rng.uniform(500, 1100), float(np.clip(rng.normal(0.35, 0.05), 0.2, 0.47))
+    table = _drawn_table(folder / "beam.csv", rng)
+    told = MeshSurfaceSettings(unit="mm", density=density * rng.normal(1, 0.01), young=1e9)
+    fine, masses = mesh_sections(table, told.model_copy(update={"elements_across": 4.0}))
+    model = BranchModel(
+        fine.mesh, young=young, poisson=poisson, density=density,
+        gravity=fine.numbers["gravity_m_s2"], point_masses=[
+            PointMass(tuple(m["attached_m"]), m["mass_kg"] * rng.normal(1, 0.01)) for m in masses])
+    places = fine.skeleton.nodes[1:]
+    moved = (point_operator(fine.mesh, places) @ solve_static(
+        model).require().displacement.ravel()).reshape(-1, 3)
+    enough = np.linalg.norm(moved, axis=1).max() > LEAST_SAG * fine.skeleton.length
+    return (young, told, places, moved) if enough else None
 
 
 def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
