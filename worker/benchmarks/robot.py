@@ -5,6 +5,9 @@ virtual controller and the driver share it.
 """
 
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,27 +36,29 @@ from limber.robot.trajectory import Trajectory, along, densely
 _ADDRESS = "127.0.0.71"
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int = 0) -> list[Row]:
-    """Measure; ``quick`` does each fault once, takes one branch and records for 8 s."""
-    table = [*_kinematics(seed)]
-    progress(0.05, "stop times")
-    for model in ("ur5", "ur5e"):
-        table += _stop_time(model, seed, 2 if quick else 20)
-    progress(0.15, "path")
-    table.append(_path(seed))
-    progress(0.2, "faults")
-    table.append(_faults(seed, 1 if quick else 20, progress.part(0.2, 0.5)))
-    progress(0.5, "branches")
-    table += followed_paths(seed, 1 if quick else 10, _ADDRESS)
-    table.append(lost_branches(seed, 1 if quick else 20, _ADDRESS,
-                               FAULTS_OF_BRANCHES[:1] if quick else FAULTS_OF_BRANCHES))
-    progress(0.65, "stream")
-    table += recorded_stream(seed, 8.0 if quick else 600.0, _ADDRESS)
-    return table + closed_loops(seed, 1 if quick else 10, _ADDRESS, progress.part(0.75, 1.0), out)
+@dataclass(frozen=True)
+class Setting:
+    """How much is measured: ``quick`` does each fault once, takes one branch, records for 8 s."""
+
+    quick: bool
+    seed: int
+    out: Path | None
 
 
-def _kinematics(seed: int) -> list[Row]:
-    rng = np.random.default_rng(seed)
+def rows(quick: bool, progress: Progress, out: Path | None, seed: int = 0,
+         only: tuple[str, ...] = ()) -> list[Row]:
+    """Measure the parts named in ``only``, or all."""
+    table: list[Row] = []
+    chosen, setting = only or WHOLE, Setting(quick, seed, out)
+    for number, name in enumerate(chosen):
+        share = progress.part(number / len(chosen), (number + 1) / len(chosen))
+        share(0.0, name)
+        table += PARTS[name](setting, share)
+    return table
+
+
+def _kinematics(setting: Setting, _progress: Progress) -> list[Row]:
+    rng = np.random.default_rng(setting.seed)
     worst, missing, count = 0.0, 0, 10_000 // len(ARMS) + 1
     for arm in ARMS.values():
         joints = rng.uniform(-np.pi, np.pi, (count, 6))
@@ -90,13 +95,14 @@ def _kinematics(seed: int) -> list[Row]:
                 str(lacking), lacking == 0)]
 
 
-def _stop_time(model: str, seed: int, runs: int) -> list[Row]:
+def _stop_time(setting: Setting, _progress: Progress, model: str) -> list[Row]:
     """From the step at which the force goes over the limit until the stop command has come.
 
     An FT300 tells its force every 10 ms, which is part of it.
     """
     latencies, ways = [], []
-    with new_robot(_ADDRESS, model, seed) as robot:
+    runs = 2 if setting.quick else 20
+    with new_robot(_ADDRESS, model, setting.seed) as robot:
         for _ in range(runs):
             restored(robot)
             with RobotLink(cell_for(_ADDRESS, model)) as link:
@@ -123,9 +129,9 @@ def _stop_time(model: str, seed: int, runs: int) -> list[Row]:
                 f"{1000 * max(ways):.1f} mm", None)]
 
 
-def _path(seed: int) -> Row:
+def _path(setting: Setting, _progress: Progress) -> list[Row]:
     collected: list[np.ndarray] = []
-    with new_robot(_ADDRESS, "ur5e", seed) as robot:
+    with new_robot(_ADDRESS, "ur5e", setting.seed) as robot:
         start = np.array(robot.state["pose"])
         corners = start + np.array([[0, 0, 0, 0, 0, 0], [0, 0.08, 0, 0, 0, 0],
                                     [0, 0.08, 0.05, 0, 0.1, 0], [0.03, 0.02, 0.05, 0, 0, 0]])
@@ -138,20 +144,22 @@ def _path(seed: int) -> Row:
     samples = np.concatenate(collected)
     distance = max(float(np.linalg.norm(poses[:, :3] - row, axis=1).min())
                    for row in samples[:, 1:4])
-    return Row("following a path at 30 mm/s: distance from it, worst", "1 mm",
-               f"{1000 * distance:.2f} mm", distance < 1e-3)
+    return [Row("following a path at 30 mm/s: distance from it, worst", "1 mm",
+                f"{1000 * distance:.2f} mm", distance < 1e-3)]
 
 
-def _faults(seed: int, runs: int, progress: Progress) -> Row:
-    failed, total, slowest = [], 0, 0.0
-    for number, name in enumerate(FAULTS):
-        progress(number / len(FAULTS), name)
-        robot = new_robot(_ADDRESS, "ur5e", seed + number)
+def _faults(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple(FAULTS),
+            ) -> list[Row]:
+    failed, total, slowest, runs = [], 0, 0.0, 1 if setting.quick else 20
+    for number, name in enumerate(names):
+        progress(number / len(names), name)
+        seed = setting.seed + list(FAULTS).index(name)
+        robot = new_robot(_ADDRESS, "ur5e", seed)
         try:
             for _ in range(runs):
                 if robot.process.poll() is not None:
                     robot.close()
-                    robot = new_robot(_ADDRESS, "ur5e", seed + number)
+                    robot = new_robot(_ADDRESS, "ur5e", seed)
                 restored(robot)
                 total += 1
                 try:
@@ -163,8 +171,37 @@ def _faults(seed: int, runs: int, progress: Progress) -> Row:
                     slowest = max(slowest, outcome.standstill_s)
         finally:
             robot.close()
+        print(f"{name}: {runs} runs, {len(failed)} failed so far", flush=True)
     for line in failed:
         print(line)
-    return Row(f"{len(FAULTS)} faults while moving, {runs} runs each: standstill and a report",
-               "every one", f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s",
-               not failed)
+    told = f"{len(names)} faults" if len(names) > 1 else names[0]
+    return [Row(f"{told} while moving, {runs} runs each: standstill and a report", "every one",
+                f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s",
+                not failed)]
+
+
+def _followed(setting: Setting, _progress: Progress) -> list[Row]:
+    return followed_paths(setting.seed, 1 if setting.quick else 10, _ADDRESS)
+
+
+def _lost(setting: Setting, _progress: Progress) -> list[Row]:
+    return [lost_branches(setting.seed, 1 if setting.quick else 20, _ADDRESS,
+                          FAULTS_OF_BRANCHES[:1] if setting.quick else FAULTS_OF_BRANCHES)]
+
+
+def _stream(setting: Setting, _progress: Progress) -> list[Row]:
+    return recorded_stream(setting.seed, 8.0 if setting.quick else 600.0, _ADDRESS)
+
+
+def _loops(setting: Setting, progress: Progress) -> list[Row]:
+    return closed_loops(setting.seed, 1 if setting.quick else 10, _ADDRESS, progress, setting.out)
+
+
+WHOLE: dict[str, Callable[[Setting, Progress], list[Row]]] = {
+    "kinematics": _kinematics, "stop-125": partial(_stop_time, model="ur5"),
+    "stop-500": partial(_stop_time, model="ur5e"), "path": _path, "faults": _faults,
+    "branches": _followed, "lost": _lost, "stream": _stream, "loops": _loops}
+"""The table's parts, in its order."""
+PARTS = WHOLE | {f"fault:{name}".replace(" ", "-"): partial(_faults, names=(name,))
+                 for name in FAULTS}
+"""What ``--only`` knows: those, and each fault by itself."""
