@@ -56,24 +56,97 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
 @stage_command("calibrate")
 @click.argument("cell_file", type=click.Path(path_type=Path))
 @click.argument("branch_folder", type=click.Path(path_type=Path))
-@click.option("--points", "points_file", type=click.Path(path_type=Path), required=True,
+@click.option("--points", "points_file", type=click.Path(path_type=Path),
               help="CSV of points on the branch to touch: name,x_m,y_m,z_m (branch frame). With "
               "six more columns, robot_x_m .. robot_rz_rad, the robot is not asked.")
+@click.option("--views", "views_file", type=click.Path(path_type=Path),
+              help="Instead: CSV of a board or marker seen by the camera that scanned the branch, "
+              "a line a pose of the arm: robot_x_m .. robot_rz_rad of the gripper's middle, and "
+              "seen_x_m, seen_y_m, seen_z_m [m] in the camera's frame, with seen_rx_rad, "
+              "seen_ry_rad, seen_rz_rad of a board.")
+@click.option("--camera-on", type=click.Choice(["stand", "gripper"]), default="stand",
+              show_default=True, help="With --views: what carries the camera; the other one "
+              "carries the board.")
+@click.option("--scan-pose", type=float, nargs=6, metavar="X Y Z RX RY RZ",
+              help="With --camera-on gripper: where the gripper was, base frame [m, rad], when "
+              "the camera scanned the branch. Without it the scan is in the board's frame.")
 @click.option("--largest-residual", default=0.01, show_default=True,
-              help="A point that is farther off is refused [m].")
-def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path,
+              help="A point or view that is farther off is refused [m].")
+def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path | None,
+              views_file: Path | None, camera_on: str, scan_pose: tuple[float, ...] | None,
               largest_residual: float) -> dict[str, Any]:
-    """Write the robot's base in the branch's frame into the cell file, from touched points.
+    """Write the robot's base in the branch's frame into the cell file, from points or views.
 
-    Each point is touched with the middle of the gripper, the robot guided by hand; its pose is
-    read when Enter is pressed.
+    Points are touched with the middle of the gripper, the robot guided by hand; its pose is read
+    when Enter is pressed. Views are of a board or marker, found in the camera's pictures by
+    another program (OpenCV's solvePnP gives such poses): the branch's scan is in the frame of that
+    camera, so nothing need be touched.
     """
     from limber.errors import InputError
-    from limber.robot.calibration import fit_base
-    from limber.robot.cell import BaseEntry, read_cell, write_cell
+    from limber.robot.cell import read_cell
     from limber.store import Branch
 
     cell, branch = read_cell(cell_file), Branch.open(branch_folder)
+    if (points_file is None) == (views_file is None):
+        raise InputError("Neither --points nor --views is given, or both.",
+                         "The base is found from touched points or from a camera's views.",
+                         "Give one of them.")
+    if views_file is None:
+        assert points_file is not None
+        return _by_touching(run, cell_file, cell, branch, points_file, largest_residual)
+    if scan_pose is not None and camera_on == "stand":
+        raise InputError("--scan-pose is given, and the camera stands.",
+                         "Where a standing camera is, no pose of the arm says.",
+                         "Leave it out, or give --camera-on gripper.")
+    return _by_seeing(run, cell_file, cell, branch, views_file, camera_on, scan_pose,
+                      largest_residual)
+
+
+def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Path,
+               camera_on: str, scan_pose: tuple[float, ...] | None, largest_residual: float,
+               ) -> dict[str, Any]:
+    from limber.reading import read_columns
+    from limber.recordings.recording import POSE_COLUMNS
+    from limber.robot.hand_eye import base_from_camera, fit_camera
+    from limber.robot.kinematics import matrices, pose_vectors
+    from limber.stages.loading import load_skeleton
+
+    robot_columns = [f"robot_{name}" for name in POSE_COLUMNS]
+    seen_columns = [f"seen_{name}" for name in POSE_COLUMNS]
+    table = read_columns(views_file, [*robot_columns, *seen_columns[:3]],
+                         "a table of views (robot_x_m .. robot_rz_rad, seen_x_m .. seen_rz_rad)")
+    is_board = all(name in table for name in seen_columns)
+    robot = np.column_stack([table[name] for name in robot_columns])
+    seen = np.column_stack([table[name] for name in seen_columns[:6 if is_board else 3]])
+    fit = fit_camera(robot, seen, camera_on, largest_residual=largest_residual)
+    alignment = branch.manifest.alignment
+    scan = np.eye(4)
+    scan[:3, :3] = np.array(alignment.rotation)
+    scan[:3, 3] = -scan[:3, :3] @ np.array(alignment.origin)
+    pose, position_sigma, rotation_sigma = base_from_camera(
+        fit, scan, camera_on, None if scan_pose is None else np.array(scan_pose),
+        load_skeleton(branch).nodes.mean(axis=0))
+    camera = matrices(fit.camera)
+    camera = (matrices(pose) if camera_on == "stand"
+              else matrices(np.array(cell.tool.grasp_pose))) @ camera
+    mounted = {"pose": tuple(map(float, pose_vectors(camera))),
+               "mount": "branch" if camera_on == "stand" else "flange"}
+    if cell.camera is not None:
+        cell = cell.model_copy(update={"camera": cell.camera.model_copy(update=mounted)})
+    _write_base(cell_file, cell, branch.uuid, pose, position_sigma, rotation_sigma, fit.residual)
+    run.show("Views", [["view", "off [mm]"], *(
+        [str(number + 1), f"{1000 * off:.2f}"] for number, off in enumerate(fit.residuals))])
+    return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": pose,
+            "residual_m": fit.residual, "position_sigma_m": position_sigma,
+            "rotation_sigma_rad": rotation_sigma, "camera_pose": mounted["pose"],
+            "camera_mount": mounted["mount"]}
+
+
+def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
+                 largest_residual: float) -> dict[str, Any]:
+    from limber.errors import InputError
+    from limber.robot.calibration import fit_base
+
     names, on_branch, touched = _points(points_file)
     version = cell.robot.version
     if touched is None:
@@ -83,20 +156,26 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path,
                              "in the points file.")
         touched, version = _touch(run, cell, names)
     fit = fit_base(touched, on_branch, largest_residual=largest_residual)
-    base = BaseEntry(pose=tuple(map(float, fit.pose)),
-                     position_sigma_m=max(fit.position_sigma, 1e-4),
-                     rotation_sigma_rad=max(fit.rotation_sigma, 1e-4),
-                     residual_m=fit.residual)
-    entry = cell.model_copy(update={
-        "base": base, "branch": branch.uuid,
-        "calibrated": datetime.now(UTC).isoformat(timespec="seconds"),
-        "robot": cell.robot.model_copy(update={"version": version})})
-    write_cell(cell_file, entry)
+    cell = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": version})})
+    _write_base(cell_file, cell, branch.uuid, fit.pose, fit.position_sigma, fit.rotation_sigma,
+                fit.residual)
     run.show("Touched points", [["point", "off [mm]"], *(
         [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))])
     return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": fit.pose,
             "residual_m": fit.residual, "position_sigma_m": fit.position_sigma,
             "rotation_sigma_rad": fit.rotation_sigma}
+
+
+def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
+                rotation_sigma: float, residual: float) -> None:
+    """Write a cell whose base is calibrated for a branch, by its identity."""
+    from limber.robot.cell import BaseEntry, write_cell
+
+    base = BaseEntry(pose=tuple(map(float, pose)), position_sigma_m=max(position_sigma, 1e-4),
+                     rotation_sigma_rad=max(rotation_sigma, 1e-4), residual_m=residual)
+    write_cell(cell_file, cell.model_copy(update={
+        "base": base, "branch": branch,
+        "calibrated": datetime.now(UTC).isoformat(timespec="seconds")}))
 
 
 def _points(path: Path) -> tuple[list[str], np.ndarray, np.ndarray | None]:
