@@ -1,5 +1,6 @@
 """A planned path as motion of a robot: joints, times, expected wrenches, approach and return."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +9,16 @@ from scipy.spatial.transform import Rotation
 from limber.errors import InputError, NoPathError
 from limber.robot.cell import Cell
 from limber.robot.expected import ExpectedWrench, Predicted, at_places
-from limber.robot.joint_path import JointPath, joint_path
+from limber.robot.joint_path import JointPath, follow, no_branch
 from limber.robot.kinematics import inverted, matrices, pose_vectors
 from limber.robot.trajectory import Trajectory, along, densely
 
 _WITHIN = 7.815  # squared deviations that hold 95 % of a vector's draws
 _TURNS = 12  # directions about the branch from which the gripper may come
+_MOST_TRIED = 24  # ways of taking the path that are held against obstacles
+
+Blocked = Callable[[np.ndarray, np.ndarray], NoPathError | None]
+"""What is in the way of flange frames [n, 4, 4] at joint angles [n, 6]; None: nothing."""
 
 
 @dataclass(frozen=True)
@@ -46,42 +51,58 @@ class RobotMotion:
         return Trajectory(approach.duration - approach.times[::-1], approach.poses[::-1])
 
 
+@dataclass(frozen=True)
+class _Way:
+    """One way of taking the path: approach and steps of the gripper's middle, base frame."""
+
+    rotation: np.ndarray
+    approach: np.ndarray
+    steps: np.ndarray
+    path: np.ndarray
+    flange: np.ndarray
+    joints: JointPath
+
+
 def robot_motion(cell: Cell, predicted: Predicted, axis: np.ndarray, *,
                  speed: float, rotation: np.ndarray | None = None,
-                 start_joints: np.ndarray | None = None) -> RobotMotion:
+                 blocked: Blocked | None = None) -> RobotMotion:
     """Turn a path of the grasped piece of branch into motion of the robot.
+
+    Of all directions of approach across the branch and all branches of the inverse kinematics
+    that one is taken which keeps farthest from singularities, and is not blocked.
 
     Args:
         predicted: The grasped piece from its rest pose on, and what is felt of it.
         axis: Direction of the branch at the grasp, branch frame, shape [3].
         speed: Of the gripper [m/s].
-        rotation: Of the gripper at the grasp, branch frame [rad], shape [3]. Without it the
-            direction of approach across the branch that keeps farthest from singularities.
-        start_joints: Where the robot is [rad], shape [6].
+        rotation: Of the gripper at the grasp, branch frame [rad], shape [3], if it is given.
 
     Raises:
         InputError: the speed is over the cell's.
-        NoPathError: no branch of the inverse kinematics carries the motion; says where and why.
+        NoPathError: no branch of the inverse kinematics carries the motion, or all are blocked;
+            says where and why.
     """
     if speed > cell.limits.speed_m_s:
         raise InputError(f"{speed:g} m/s is over the cell's {cell.limits.speed_m_s:g} m/s.",
                          "The guard would slow it down and the force would not fit the time.",
                          "Ask for less, or raise limits.speed_m_s in the cell file.")
     wanted = across(axis) if rotation is None else [np.asarray(rotation, float)]
-    best: RobotMotion | None = None
+    ways: list[_Way] = []
     refusal: NoPathError | None = None
     for turn in wanted:
-        try:
-            motion = _motion(cell, predicted, turn, speed, start_joints)
-        except NoPathError as error:
-            refusal = refusal or error
-            continue
-        if best is None or motion.joints.singularity > best.joints.singularity:
-            best = motion
-    if best is None:
-        assert refusal is not None
-        raise refusal
-    return best
+        found = _ways(cell, predicted.poses, turn)
+        if isinstance(found, NoPathError):
+            refusal = refusal or found
+        else:
+            ways += found
+    ways.sort(key=lambda way: -way.joints.singularity)
+    for way in ways[:_MOST_TRIED]:
+        met = None if blocked is None else blocked(way.flange, way.joints.joints)
+        if met is None:
+            return _timed(cell, predicted, way, speed)
+        refusal = met if way is ways[0] else refusal
+    assert refusal is not None
+    raise refusal
 
 
 def across(axis: np.ndarray) -> list[np.ndarray]:
@@ -103,9 +124,8 @@ def across(axis: np.ndarray) -> list[np.ndarray]:
     return found
 
 
-def _motion(cell: Cell, predicted: Predicted, rotation: np.ndarray, speed: float,
-            start_joints: np.ndarray | None) -> RobotMotion:
-    poses = predicted.poses
+def _ways(cell: Cell, poses: np.ndarray, rotation: np.ndarray) -> list[_Way] | NoPathError:
+    """Return the ways of taking the grasp along ``poses`` [n, 6], or why there is none."""
     grip = inverted(matrices(poses[0])) @ matrices(np.r_[poses[0, :3], rotation])
     held = matrices(poses) @ grip
     back = held[0].copy()
@@ -116,19 +136,26 @@ def _motion(cell: Cell, predicted: Predicted, rotation: np.ndarray, speed: float
     steps = pose_vectors(base @ held)
     path = densely(steps)
     tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
-    limits = cell.limits
-    joints = joint_path(cell.arm, matrices(np.vstack([approach, path[1:]])) @ tool,
-                        start=start_joints, joint_limits=cell.joint_limits,
-                        singularity_margin=limits.singularity,
-                        joint_margin=limits.joint_margin_rad)
+    flange = matrices(np.vstack([approach, path[1:]])) @ tool
+    found, refusals = follow(cell.arm, flange, joint_limits=cell.joint_limits,
+                             singularity_margin=cell.limits.singularity,
+                             joint_margin=cell.limits.joint_margin_rad)
+    if not found:
+        return no_branch(refusals, flange)
+    return [_Way(rotation, approach, steps, path, flange, joints) for joints in found]
+
+
+def _timed(cell: Cell, predicted: Predicted, way: _Way, speed: float) -> RobotMotion:
+    """Return the motion on a way, with what is expected along it."""
+    limits, steps, path = cell.limits, way.steps, way.path
     times = along(path, speed, limits.acceleration_m_s2, turn_speed=0.8 * limits.turn_speed_rad_s)
     # What is predicted stands at the plan's poses: carried to the dense ones by the way between.
     ways = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1))]
     dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
     expected = at_places(predicted, ways, dense).felt(cell, path[0])
-    coming = along(approach, speed, limits.acceleration_m_s2)
-    return RobotMotion(Trajectory(coming, approach, ExpectedWrench.nothing(approach)),
-                       Trajectory(times, path, expected), joints, rotation)
+    coming = along(way.approach, speed, limits.acceleration_m_s2)
+    return RobotMotion(Trajectory(coming, way.approach, ExpectedWrench.nothing(way.approach)),
+                       Trajectory(times, path, expected), way.joints, way.rotation)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def joint_path(arm: Arm, frames: np.ndarray, *, start: np.ndarray | None = None,
     """
     paths, refusals = follow(arm, frames, joint_limits=joint_limits, **margins)
     if not paths:
-        raise _no_branch(refusals, np.asarray(frames))
+        raise no_branch(refusals, np.asarray(frames))
     if start is None:
         return paths[0]
     start = np.asarray(start, float)
@@ -148,7 +148,9 @@ def _margins(joints: np.ndarray, limits: np.ndarray) -> np.ndarray:
     return np.minimum(joints - limits[:, 0], limits[:, 1] - joints)
 
 
-def _no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
+def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
+    """Return the error that says how far the best of refused branches came along ``frames``
+    [n, 4, 4]."""
     farthest = max(refusals, key=lambda refusal: refusal.index)
     place = ", ".join(f"{value:.3f}" for value in frames[farthest.index, :3, 3])
     reasons = sorted({refusal.reason for refusal in refusals if refusal.index == farthest.index})

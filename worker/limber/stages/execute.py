@@ -110,24 +110,23 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     from limber.robot.execution import robot_motion
     from limber.robot.expected import Predicted
     from limber.stages.loading import load_grasp_model
-    from limber.stages.plan_cell import cell_obstacles, require_clear
+    from limber.stages.plan_cell import blocked_by, cell_obstacles
 
     progress(0.02, "inverse kinematics")
     model = load_grasp_model(branch, gravity=settings.gravity, progress=progress)
     # The plan's own turn of the gripper is the one that was checked against obstacles.
     rotation = settings.gripper_rotation or (told.get("robot") or {}).get("gripper_rotation")
-    asked = {"speed": settings.speed, "rotation": rotation}
-    obstacles = cell_obstacles(cell, Path(cell_file).parent)
+    asked = {"speed": settings.speed, "rotation": rotation,
+             "blocked": blocked_by(cell, cell_obstacles(cell, Path(cell_file).parent))}
     planned = _planned(branch, name, model.rest_position)
     if np.isfinite(planned).all():
         # By the plan's own poses: whether the arm reaches them is known at once, forces are not.
         at_once = Predicted.of_forces(planned, np.zeros((len(planned), 3)))
-        require_clear(cell, robot_motion(cell, at_once, model.reach.axis, **asked), obstacles)
+        robot_motion(cell, at_once, model.reach.axis, **asked)
     progress(0.05, "forces along the path")
     predicted = _predicted(branch, model, planned[:, :3], progress)
     progress(0.4, "inverse kinematics")
     motion = robot_motion(cell, predicted, model.reach.axis, **asked)
-    require_clear(cell, motion, obstacles)
     result = _summary(cell, motion)
     _check_limits(cell, predicted.poses, predicted.wrenches[:, :3])
     if not options.arm:

@@ -15,17 +15,20 @@ from limber.planning.plan_file import Way
 from limber.planning.regions import Ball, Region, View
 from limber.planning.settings import PlanSettings
 from limber.progress import Progress
+from limber.robot.arm_shape import rods_of
 from limber.robot.arms import arm_named
 from limber.robot.belonging import check_branch
 from limber.robot.cell import BoxEntry, Cell, read_cell
-from limber.robot.execution import RobotMotion, robot_motion
+from limber.robot.execution import Blocked, robot_motion
 from limber.robot.expected import Predicted
 from limber.robot.kinematics import inverse, inverted, matrices
 from limber.store import Branch
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _TURNS = 200  # directions from which a second arm may take a target
-_CAPSULE_POINTS = 9  # along a part of the gripper
+_ROD_SPACING = 0.02  # [m] of points along a part of gripper or arm
+_POSE_SPACING = 0.01  # [m] that a part goes at most between poses that are looked at
+_BETWEEN = 0.006  # [m] by which parts are thicker for what lies between both
 _LARGE = 20.0  # [m] an obstacle that is larger is in another unit
 
 
@@ -126,8 +129,7 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
     """
     there = np.array(motion.phases) != "return"
     predicted = Predicted.of_forces(motion.poses[there], motion.forces[there])
-    found = robot_motion(cell, predicted, axis, speed=speed)
-    require_clear(cell, found, obstacles)
+    found = robot_motion(cell, predicted, axis, speed=speed, blocked=blocked_by(cell, obstacles))
     return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
             "gripper_rotation": found.rotation,
             "duration_s": found.approach.duration + found.path.duration,
@@ -135,20 +137,54 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
             "joint_limit_margin_rad": found.joints.limit_margin}
 
 
-def require_clear(cell: Cell, motion: RobotMotion, obstacles: tuple[Obstacle, ...]) -> None:
-    """Raise NoPathError where the gripper's shape would be inside an obstacle; says where."""
+def blocked_by(cell: Cell, obstacles: tuple[Obstacle, ...]) -> Blocked:
+    """Return what tells where gripper or arm would be inside an obstacle."""
+    def blocked(flange: np.ndarray, joints: np.ndarray) -> NoPathError | None:
+        return None if not obstacles else _in_the_way(cell, obstacles, flange, joints)
+    return blocked
+
+
+def _in_the_way(cell: Cell, obstacles: tuple[Obstacle, ...], flange: np.ndarray,
+                joints: np.ndarray) -> NoPathError | None:
+    """Return the error that names what is deepest in an obstacle, None where nothing is.
+
+    Args:
+        flange: Frames in the robot's base, shape [n, 4, 4].
+        joints: The same by angles [rad], shape [n, 6].
+    """
     base = matrices(np.array(cell.base.pose))
-    tool = inverted(matrices(np.array(cell.tool.grasp_pose)))
-    flange = base @ matrices(np.vstack([motion.approach.poses, motion.path.poses])) @ tool
-    share = np.linspace(0.0, 1.0, _CAPSULE_POINTS)[:, None]
-    for part in cell.tool.parts:
-        start, end = np.array(part.start_m), np.array(part.end_m)
-        along = start + share * (end - start)
-        places = np.einsum("nij,kj->nki", flange[:, :3, :3], along) + flange[:, None, :3, 3]
-        if hit := closest(obstacles, places.reshape(-1, 3), part.radius_m):
-            name, depth, where = hit
-            raise NoPathError(
-                f"The gripper would be {1e3 * depth:.1f} mm inside {name} at "
-                f"({', '.join(f'{x:.3f}' for x in where)}) m.",
-                "Paths are checked against obstacles, and not yet led around them.",
-                "Choose another goal, or a workspace that keeps clear of it.")
+    arm = rods_of(cell.arm, joints)
+    parts = [(f"The arm's {name}", arm.starts[:, k], arm.ends[:, k], float(arm.radii[k]))
+             for k, name in enumerate(arm.names)]
+    parts += [("The gripper", *(flange[:, :3, :3] @ np.array(end) + flange[:, :3, 3]
+                                for end in (part.start_m, part.end_m)), part.radius_m)
+              for part in cell.tool.parts]
+    looked = _apart(np.stack([end for part in parts for end in part[1:3]], axis=1))
+    worst: tuple[float, str, str, np.ndarray] | None = None
+    for what, starts, ends, radius in parts:
+        length = float(np.linalg.norm(ends[0] - starts[0]))
+        share = np.linspace(0.0, 1.0, int(np.ceil(length / _ROD_SPACING)) + 1)[:, None]
+        places = starts[looked, None] + share * (ends - starts)[looked, None]
+        places = places.reshape(-1, 3) @ base[:3, :3].T + base[:3, 3]
+        hit = closest(obstacles, places, radius + _BETWEEN)
+        if hit and (worst is None or hit[1] > worst[0]):
+            worst = hit[1], what, hit[0], hit[2]
+    if worst is None:
+        return None
+    depth, what, name, where = worst
+    return NoPathError(
+        f"{what} would be inside {name}, by up to {1e3 * depth:.1f} mm, at "
+        f"({', '.join(f'{x:.3f}' for x in where)}) m.",
+        "So it is where the arm keeps farthest from singularities, and every other way of "
+        "holding the branch that was tried is blocked as well.",
+        "Choose another way for the branch, another place for the robot's base, or correct the "
+        "obstacle in the cell file.")
+
+
+def _apart(places: np.ndarray) -> np.ndarray:
+    """Return the numbers of poses between which no place [n, k, 3] goes farther than what is
+    looked at."""
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)
+    gone = np.r_[0.0, np.cumsum(steps)]
+    chosen = np.searchsorted(gone, np.arange(0.0, gone[-1], _POSE_SPACING))
+    return np.unique(np.r_[0, chosen, len(places) - 1])

@@ -20,6 +20,7 @@ from limber.store import Branch
 
 if TYPE_CHECKING:
     from limber.robot.cell import Cell
+    from limber.robot.execution import Blocked
     from limber.robot.link import RobotLink
     from limber.robot.recorder import MarkerStream, PullRecorder
     from limber.robot.trajectory import Trajectory
@@ -98,6 +99,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     """
     from limber.robot.belonging import check_branch, require_payload
     from limber.robot.cell import read_cell
+    from limber.stages.plan_cell import blocked_by, cell_obstacles
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise InputError(f"--name {name!r} cannot name a recording.",
@@ -114,9 +116,10 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         raise InputError(f"A recording {name} was cut off.", "It would be lost.",
                          "Take it over with --recover, or give another --name.")
     require_payload(cell)
+    blocked = blocked_by(cell, cell_obstacles(cell, cell_file.parent))
     require_confirmation(name, options.confirm)
     with branch.writing(f"the recording {name}"):
-        ended = _recorded(branch, cell, name, settings, options, progress)
+        ended = _recorded(branch, cell, name, settings, options, blocked, progress)
         result = _finish(branch, name, settings, ended)
     if ended["ended"] != "reached":
         raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
@@ -126,7 +129,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
 
 
 def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
-              options: RecordOptions, progress: Progress) -> dict[str, Any]:
+              options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
     from limber.robot.link import RobotLink
     from limber.robot.recorder import MarkerStream, PullRecorder
 
@@ -144,7 +147,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             recorders.append(recorder)
             link.wait_for_samples()
             # Before the tare: what takes long would be drift.
-            trajectory = _pull(branch, cell, point, recorder.last[1:7], settings,
+            trajectory = _pull(branch, cell, point, recorder.last, settings, blocked,
                                progress.part(0.02, 0.1))
             progress(0.1, "taring: keep the gripper free")
             tared = link.tare(1.0)
@@ -205,9 +208,9 @@ def _write_markers(tracker: MarkerStream | None, lines: Stream | None,
                                    *(f"{value:.6g}" for value in points.ravel())]))
 
 
-def _pull(branch: Branch, cell: Cell, point: np.ndarray, gripper: np.ndarray,
-          settings: RecordSettings, progress: Progress) -> Trajectory:
-    """The motion of the gripper, which is at ``gripper`` [6], branch frame."""
+def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
+          settings: RecordSettings, blocked: Blocked, progress: Progress) -> Trajectory:
+    """The motion of the gripper from where a sample of the robot has it."""
     from limber.robot.kinematics import matrices
     from limber.stages.record_way import suggested_pull, there_and_back, way_on_arc, way_through
 
@@ -221,6 +224,7 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, gripper: np.ndarray,
         raise InputError(f"--speed {settings.speed:g} is over the cell's "
                          f"{cell.limits.speed_m_s:g} m/s.", "The guard would slow it down.",
                          "Ask for less, or raise limits.speed_m_s in the cell file.")
+    gripper, joints = sample[1:7], sample[19:25]
     here = matrices(gripper)
     if settings.waypoints is not None:
         frames = way_through(Path(settings.waypoints), gripper)
@@ -230,7 +234,7 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, gripper: np.ndarray,
         frames = np.array([here, here])
         frames[1, :3, 3] += distance * direction / length
     return there_and_back(cell, frames, speed=settings.speed, cycles=settings.cycles,
-                          pause=settings.pause)
+                          pause=settings.pause, start=joints, blocked=blocked)
 
 
 def _grasp_point(branch: Branch, cell: Cell, link: RobotLink) -> np.ndarray:

@@ -10,6 +10,7 @@ from limber.progress import Progress
 from limber.reading import read_columns, read_json_as
 from limber.recordings.recording import POSE_COLUMNS
 from limber.robot.cell import Cell
+from limber.robot.execution import Blocked
 from limber.robot.joint_path import joint_path
 from limber.robot.kinematics import inverted, matrices, pose_vectors
 from limber.robot.trajectory import Trajectory, along, densely
@@ -127,20 +128,25 @@ def way_through(path: Path, gripper: np.ndarray) -> np.ndarray:
 
 
 def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int, pause: float,
-                   ) -> Trajectory:
+                   start: np.ndarray | None = None, blocked: Blocked | None = None) -> Trajectory:
     """Return the motion through frames of the gripper [n, 4, 4], branch frame, out and back.
 
     Args:
         speed: [m/s].
         pause: Standing still at each end [s].
+        start: Joint angles where the arm is [rad], shape [6].
 
     Raises:
-        NoPathError: the arm cannot follow it; says where and why.
+        NoPathError: the arm cannot follow it, or is blocked; says where and why.
     """
     out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
-    joint_path(cell.arm, matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose))),
-               joint_limits=cell.joint_limits, singularity_margin=cell.limits.singularity,
-               joint_margin=cell.limits.joint_margin_rad)
+    flange = matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
+    taken = joint_path(cell.arm, flange, start=start, joint_limits=cell.joint_limits,
+                       singularity_margin=cell.limits.singularity,
+                       joint_margin=cell.limits.joint_margin_rad)
+    met = None if blocked is None else blocked(flange, taken.joints)
+    if met is not None:
+        raise met
     passed = along(out, speed, cell.limits.acceleration_m_s2,
                    turn_speed=0.8 * cell.limits.turn_speed_rad_s)
     # The way back is the way out in time as well, so that speeds fit where it turns.
