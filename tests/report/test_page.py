@@ -60,6 +60,32 @@ def test_a_page_of_an_unchanged_folder_is_left_as_it_is(meshed: Branch):
     assert Branch.open(meshed.folder).manifest.stages["report"] != entry
 
 
+def test_an_execution_shows_felt_beside_predicted(meshed: Branch):
+    """A log of the robot becomes a table and a picture; one without a prediction says so."""
+    from limber.robot.link import COLUMNS
+
+    rows = np.full((400, len(COLUMNS)), np.nan)
+    rows[:, :25] = 0.0
+    rows[:, 0] = np.arange(400) * 0.002
+    rows[100:, 25:28] = rows[100:, 13:16] = np.linspace(0, 3, 300)[:, None]
+    rows[100:, 31:37] = 0.01
+
+    def executed(name: str, table: np.ndarray) -> None:
+        with meshed.stage(f"execute:{name}") as stage:
+            lines = [",".join("" if np.isnan(x) else f"{x:g}" for x in row) for row in table]
+            stage.path(f"executions/{name}/samples.csv").write_text(
+                "\n".join([",".join(COLUMNS), *lines]) + "\n", encoding="utf-8")
+            stage.result.update(reached=name == "led", stop_reason="slipped", peak_force_n=5.2,
+                                force_within_share=0.99, path_error_m=None)
+    executed("led", rows)
+    executed("lost", rows[:100])
+    html, page = draw_page(meshed)
+    led, lost = (section for section in page if section.title.startswith("By the robot"))
+    assert len(led.pictures) == 1 and ["peak force, felt [N]", "5.20"] in led.tables[0][1]
+    assert not lost.pictures and "no predicted force" in lost.text[0]
+    assert "a stop: slipped" in html
+
+
 def test_picture_must_be_a_png(meshed: Branch, tmp_path):
     """Another file, or none, is refused with its name; no report is left behind."""
     (tmp_path / "x.png").write_bytes(b"JFIF")

@@ -22,7 +22,7 @@ from limber.optional import require_extra
 from limber.planning.field.energy_field import EnergyField
 from limber.progress import SILENT, Progress
 from limber.reading import read_arrays
-from limber.report import figures, loads, swings
+from limber.report import executions, figures, loads, swings
 from limber.report.ringing import vibration_rows
 from limber.report.tables import (
     caliper_rows,
@@ -88,7 +88,7 @@ def draw_page(branch: Branch, *, picture: Path | None = None, calipers: Sequence
         _scan, partial(_cylinders, calipers=calipers), _mesh, *_pulls(branch), _estimate,
         *([_swing] if branch.has("swing.json") else []),
         *([_vibration] if branch.has("vibration.json") else []), *_simulations(branch),
-        *_loads(branch), _energy, *_plans(branch), _provenance]
+        *_loads(branch), _energy, *_plans(branch), *_executions(branch), _provenance]
     for number, build in enumerate(builders):
         progress(number / len(builders), "drawing")
         page.append(build(branch))
@@ -375,6 +375,25 @@ def _plan(branch: Branch, name: str) -> Section:
             f"mm/s, the whole motion keeps its limits: peaks {peaks}.")
     for figure, caption in plan_figures.report_figures(branch, name):
         section.draw(figure, caption)
+    return section
+
+
+def _executions(branch: Branch) -> list[Callable[[Branch], Section]]:
+    names = sorted(key.split(":", 1)[1] for key in branch.manifest.stages
+                   if key.startswith("execute:"))
+    return [lambda opened, name=name: _execution(opened, name) for name in names]
+
+
+def _execution(branch: Branch, name: str) -> Section:
+    section = Section(f"By the robot: {name}", tables=[
+        ("", executions.execution_rows(branch.manifest.stages[f"execute:{name}"].result))])
+    try:
+        section.draw(executions.force_along_the_way(
+            branch.path(f"executions/{name}/samples.csv")),
+            "Force of the gripper on the branch as felt (smoothed), and as predicted where the "
+            "gripper was: there, standing and back.")
+    except InputError as error:
+        section.text.append(f"Its forces cannot be drawn: {error}")
     return section
 
 
