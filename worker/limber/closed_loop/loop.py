@@ -9,7 +9,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,13 @@ import numpy as np
 
 from limber.closed_loop.places import base_beside, bending_modulus, gripper_at, write_touched
 from limber.closed_loop.watching import Watch
-from limber.errors import InputError, SafetyStop, WorkError
-from limber.estimation.gripper_path import force_for_travel
+from limber.closed_loop.wishes import Wish, wish_for
+from limber.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.estimation.settings import VirtualPullSettings
 from limber.estimation.virtual_pull import TrueBranch, true_branch
 from limber.geometry.generated import read_truth
 from limber.geometry.skeleton.files import read_swc
 from limber.jobs.process import run_stage
-from limber.mechanics import solve_static
 from limber.plain import plain
 from limber.progress import SILENT, Progress
 from limber.robot.arms import arm_named
@@ -33,11 +32,11 @@ from limber.robot.kinematics import matrices
 from limber.robot.virtual.held_branch import BranchSetting
 from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import MARKER_PORT
-from limber.stages.loading import load_grasp_model, load_skeleton
+from limber.stages.loading import load_skeleton
 from limber.store import Branch
 
 GRASP_FRACTION = 0.85
-FLOWER, PLAN, PULL = "flower", "to-light", "pull-1"
+FLOWER, PLAN = "flower", "to-light"
 GOAL_TOLERANCE_M = 0.01
 """So near its goal the flower is in it."""
 PLANNED_TOLERANCE_M = 0.006
@@ -45,16 +44,39 @@ PLANNED_TOLERANCE_M = 0.006
 
 _LENGTH_M = 0.4  # a virtual branch that is solved within some hundredths of a second
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
-_MOST_FORCE_N = 15.0  # of the gripper on the planned path: a branch that is bent, not stretched
+OPEN_FACTOR = 4.0
+"""Between the ends of a modulus' interval: where it is more, `limber suggest-pull` is asked whether
+another pull is worth it for the plan."""
+_MOST_PULLS = 3
+_FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 _TOUCH_SIGMA_M = 3e-4
 _SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8
 _PULL_SPEED_M_S = 0.02
 _PLAN_SPEED_M_S = 0.03
-_OVERLOAD = np.array([0.0, 0.0, 60.0, 0.0, 0.0, 0.0])
+_OVERLOAD_N = 30.0  # beyond the hard limit
 _DONE = {"generate": 0.02, "scan": 0.08, "reconstruct": 0.15, "calibrate": 0.16, "target": 0.17,
-         "record": 0.27, "estimate": 0.5, "energy": 0.6, "plan": 0.68, "dry run": 0.75,
+         "record": 0.27, "estimate": 0.5, "energy": 0.6, "plan": 0.66, "suggest": 0.68,
+         "dry run": 0.75,
          "execute": 0.88, "overload": 1.0}
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What pulls have told so far, and what was planned with it."""
+
+    estimated: dict[str, Any]
+    goal: np.ndarray
+    wish: Wish
+    plan: dict[str, Any]
+    pull_count: int = 1
+    reason: str = ""
+
+    @property
+    def open_factor(self) -> float:
+        """The widest interval of a modulus: its end over its beginning."""
+        low, high = np.array(self.estimated["young_interval_pa"], float).T
+        return float((high / low).max())
 
 
 @dataclass
@@ -112,11 +134,10 @@ class ClosedLoop:
         with VirtualRobot(self.model, self.address,
                           ["--branch", file, "--seed", self.seed]) as robot:
             moved = self._reconstructed(truth, cell)
-            estimated = self._estimated(robot)
-            goal, plan = self._planned()
+            told = self._told(robot)
             executed, watch = self._executed(robot)
             stopped = self._overloaded(robot, executed)
-        return self._compared(truth, moved, estimated, goal, plan, executed, watch, stopped)
+        return self._compared(truth, moved, told, executed, watch, stopped)
 
     # Parts
 
@@ -172,34 +193,67 @@ class ClosedLoop:
                    "--at", *tip)
         return moved
 
-    def _estimated(self, robot: VirtualRobot) -> dict[str, Any]:
+    def _told(self, robot: VirtualRobot) -> "_Told":
+        """Pull, estimate and plan, and pull again as long as that is worth it for the plan."""
         branch = Branch.open(self.branch)
         point, axis = _grasp_of(load_skeleton(branch))
+        self._pulled(robot, 1, point, axis, "--direction", *_sideways(point)[0], "--distance",
+                     _TRAVEL_M)
+        told = self._planned()
+        for number in range(2, _MOST_PULLS + 1):
+            if told.open_factor <= OPEN_FACTOR:
+                return replace(told, reason=f"no interval is open beyond {OPEN_FACTOR:g}")
+            reached = [part for part in _FRACTIONS if self._reaches(part)]
+            if not reached:
+                return replace(told, reason="the arm reaches no place for another pull")
+            found = self._part("suggest", "whether another pull is worth it", "suggest-pull",
+                               self.branch, "--plan", PLAN, "--fractions",
+                               ",".join(map(str, reached)), "--max-force",
+                               read_cell(self.cell_file).limits.soft_force_n)
+            if not found["plan"]["worth"]:
+                return replace(told, reason=found["plan"]["why"])
+            self._pulled(robot, number, *_grasp_of(load_skeleton(branch),
+                                                   found["best"]["grasp_fraction"]), "--suggested")
+            told = replace(self._planned(told.goal), pull_count=number)
+        return replace(told, reason=f"{_MOST_PULLS} pulls were made")
+
+    def _reaches(self, fraction: float) -> bool:
+        """Whether the arm reaches about a place of the main path."""
+        place = _grasp_of(load_skeleton(Branch.open(self.branch)), fraction)
+        try:
+            gripper_at(read_cell(self.cell_file), *place)
+        except NoPathError:
+            return False
+        return True
+
+    def _pulled(self, robot: VirtualRobot, number: int, point: np.ndarray, axis: np.ndarray,
+                *way: object) -> None:
+        """Record a pull with the gripper about ``point`` [3]."""
         joints, _rotation = gripper_at(read_cell(self.cell_file), point, axis)
         robot.ask("stand", joints=list(map(float, joints)))
+        name = f"pull-{number}"
         self._part("record", "a pull along the branch's arc", "record", self.branch, "--cell",
-                   self.cell_file, "--name", PULL, "--confirm", PULL, "--markers", MARKER_PORT,
-                   "--direction", *_sideways(point)[0], "--distance", _TRAVEL_M,
-                   "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
-        return self._part("estimate", "Young's modulus from the pull", "estimate", self.branch)
+                   self.cell_file, "--name", name, "--confirm", name, "--markers", MARKER_PORT,
+                   *way, "--speed", _PULL_SPEED_M_S, "--after-stop", "hold")
 
-    def _planned(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """Energy field and path; returns where the flower is to come, branch frame [m]."""
-        self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed", self.seed)
-        goal = self._flower_goal()
+    def _planned(self, goal: np.ndarray | None = None) -> "_Told":
+        """Estimate, sample the energy field and plan the flower's way to a place [3], or to one
+        that suits the branch."""
+        estimated = self._part("estimate", "Young's modulus from the pull", "estimate",
+                               self.branch)
+        branch = Branch.open(self.branch)
+        place, _axis = _grasp_of(load_skeleton(branch))
+        # A place that somebody wishes the flower at: where a pull to the other side takes it.
+        wish = wish_for(branch, _sideways(place)[1], _TRAVEL_M)
+        write_cell(self.cell_file, wish.limited(read_cell(self.cell_file)))
+        self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed",
+                   self.seed, "--deflection", wish.sampled_deflection)
+        goal = wish.place if goal is None else goal
         plan = self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
                           PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
-                          "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", _MOST_FORCE_N,
+                          "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", wish.max_force,
                           "--speed", _PLAN_SPEED_M_S, "--seed", self.seed)
-        return goal, plan
-
-    def _flower_goal(self) -> np.ndarray:
-        """A place that somebody wishes the flower at: where a pull to the other side takes it."""
-        model = load_grasp_model(Branch.open(self.branch), gravity=True)
-        way = _sideways(model.rest_position)[1]
-        size = force_for_travel(model.model, model.grasp, way, _TRAVEL_M)
-        state = solve_static(model.model, grasp=model.grasp, grasp_force=size * way).require()
-        return model.branch.target_positions(state.displacement)[0]
+        return _Told(estimated, goal, wish, plan)
 
     def _executed(self, robot: VirtualRobot) -> tuple[dict[str, Any], Watch]:
         dry = self._part("dry run", "the path checked for the arm", "execute", self.branch,
@@ -213,14 +267,16 @@ class ClosedLoop:
     def _overloaded(self, robot: VirtualRobot, executed: dict[str, Any]) -> tuple[str, Watch]:
         """Follow the path again and overload the sensor on the way; returns what stopped it."""
         robot.ask("stand", joints=executed["start_joints_rad"])
-        with Watch(robot, overload=_OVERLOAD) as watch:
+        limit = read_cell(self.cell_file).limits.hard_force_n
+        overload = np.array([0.0, 0.0, limit + _OVERLOAD_N, 0.0, 0.0, 0.0])
+        with Watch(robot, overload=overload) as watch:
             try:
                 self._part("overload", "the path again, with an overload", "execute", self.branch,
                            *self._armed(executed))
             except SafetyStop:
                 told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
                 return told["stop_reason"], watch
-        raise WorkError("The overload stopped nothing.", f"{_OVERLOAD[2]:.0f} N were added to the "
+        raise WorkError("The overload stopped nothing.", f"{overload[2]:.0f} N were added to the "
                         "sensor while the branch was led.", "See the robot's log.")
 
     def _armed(self, dry: dict[str, Any]) -> list[object]:
@@ -230,10 +286,11 @@ class ClosedLoop:
 
     # Both sides
 
-    def _compared(self, truth: TrueBranch, moved: np.ndarray, estimated: dict[str, Any],
-                  goal: np.ndarray, plan: dict[str, Any], executed: dict[str, Any], watch: Watch,
-                  stopped: tuple[str, Watch]) -> dict[str, Any]:
+    def _compared(self, truth: TrueBranch, moved: np.ndarray, told: "_Told",
+                  executed: dict[str, Any], watch: Watch, stopped: tuple[str, Watch],
+                  ) -> dict[str, Any]:
         """Return recovered against true E, force along the path, the flower, the overload."""
+        estimated, goal = told.estimated, told.goal
         seen = watch.at_the_end()
         flower = None if seen is None else seen[-1] + moved
         off = np.inf if flower is None else float(np.linalg.norm(flower - goal))
@@ -251,7 +308,10 @@ class ClosedLoop:
             "peak_force_n": executed["peak_force_n"], "path_error_m": executed["path_error_m"],
             "limit_broken": bool(executed["peak_force_n"]
                                  > read_cell(self.cell_file).limits.soft_force_n),
-            "flower_goal_m": goal, "flower_planned_m": plan.get("target_end_m"),
+            "pull_count": told.pull_count, "open_factor": told.open_factor,
+            "no_further_pull": told.reason, "holding_force_n": told.wish.holding_force,
+            "max_force_n": told.wish.max_force,
+            "flower_goal_m": goal, "flower_planned_m": told.plan.get("target_end_m"),
             "flower_m": flower, "flower_off_m": None if flower is None else off,
             "flower_in_goal": off <= GOAL_TOLERANCE_M,
             "overload_reason": reason,
@@ -271,14 +331,16 @@ class ClosedLoop:
     @contextmanager
     def _timed(self, name: str, title: str) -> Iterator[Progress]:
         began = time.perf_counter()
-        progress = self.progress.part(self._done, _DONE[name])
+        ends = max(self._done, _DONE[name])
+        progress = self.progress.part(self._done, ends)
         progress(0.0, title)
         try:
             yield progress
         finally:
-            self._done = _DONE[name]
-            self.seconds[name] = round(time.perf_counter() - began, 1)
-            self.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
+            self._done = ends
+            took = round(time.perf_counter() - began, 1)
+            self.seconds[name] = round(self.seconds.get(name, 0.0) + took, 1)
+            self.say(f"  {title:<42} {took:6.1f} s")
 
 
 def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
@@ -300,17 +362,23 @@ def comparison(result: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
         if result[key] is not None:
             places.append([title, *(f"{1000 * value:.1f}" for value in result[key])])
     way, still = result["overload_way_m"], result["overload_standstill_s"]
+    pulls = [["pulls", str(result["pull_count"])],
+             ["widest interval, its end over its beginning", f"{result['open_factor']:.1f}"],
+             ["no further pull", result["no_further_pull"]],
+             ["holds the flower in its goal", f"{result['holding_force_n']:.2f} N"],
+             ["allowed on the way", f"{result['max_force_n']:.2f} N"]]
     stop = [["a provoked overload", ""], ["stopped by", result["overload_reason"]],
             ["way after it", "-" if way is None else f"{1000 * way:.1f} mm"],
             ["until standstill", "-" if still is None else f"{1000 * still:.0f} ms"]]
-    return [("Young's modulus", modulus_rows(result, result)),
+    return [("Young's modulus", modulus_rows(result, result)), ("Whether that is enough", pulls),
             ("Predicted against measured", force), ("The flower", places), ("Safety", stop)]
 
 
-def _grasp_of(skeleton: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The grasp's point [m] and the branch's axis there, shape [3] each."""
-    point = skeleton.point_at(GRASP_FRACTION)
-    axis = point - skeleton.point_at(GRASP_FRACTION - 0.05)
+def _grasp_of(skeleton: Any, fraction: float = GRASP_FRACTION,
+              ) -> tuple[np.ndarray, np.ndarray]:
+    """A place on the main path [m] and the branch's axis there, shape [3] each."""
+    point = skeleton.point_at(fraction)
+    axis = point - skeleton.point_at(fraction - 0.05)
     return point, axis / np.linalg.norm(axis)
 
 

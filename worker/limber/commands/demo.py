@@ -100,6 +100,7 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
                          "The virtual robot scans a branch that it holds: a generated one.",
                          "Leave one of them out.")
     require_extra("robot", ("rtde_control", "rtde_io"), "The virtual robot's client")
+    require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     from limber.closed_loop.loop import ClosedLoop, comparison
 
     started = time.perf_counter()
@@ -107,7 +108,18 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
     result = ClosedLoop(folder, seed, say=run.say, progress=run.progress).run()
     for title, rows in comparison(result):
         run.show(title, rows)
-    return result | {"demo_seconds": round(time.perf_counter() - started, 1)}
+    scene, picture = folder / "scene.blend", folder / "scene.png"
+    try:
+        run_stage(["scene", result["branch"], "-o", str(scene), "--render", str(picture)])
+    except Cancelled:
+        raise
+    except LimberError as error:
+        run.progress.warn(f"There is no picture of it: {error}")
+    with_picture = ["--picture", str(picture)] if picture.exists() else []
+    report = run_stage(["report", result["branch"], *with_picture])["report"]
+    seconds = round(time.perf_counter() - started, 1)
+    run.say(f"\nreport  {report}\nscene   {scene}\npicture {picture}\n{seconds:.0f} s in all")
+    return result | {"report": report, "demo_seconds": seconds}
 
 
 def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None, young: str,
