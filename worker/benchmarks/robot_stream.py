@@ -18,7 +18,7 @@ from limber.recordings.streams import read_stream
 from limber.stages.record import RecordOptions, RecordSettings, record
 from limber.store import Branch
 
-_DISTANCE_M = 0.01
+_DISTANCE_M = 0.012  # 20 times there and back with pauses take 630 s
 _BEGUN_M_S, _APART = 5e-4, 20  # samples over which a speed is taken
 _LONGEST_S = 120.0  # for connecting, the arc and the tare
 
@@ -38,11 +38,17 @@ def recorded_stream(seed: int, seconds: float, address: str) -> list[Row]:
                 process.kill()
                 process.wait()
             lost_by_robot = robot.state["lost_seconds"]
-        record(branch.folder, path, "stream", RecordSettings(), RecordOptions(recover=True))
+        if killed is not None:
+            record(branch.folder, path, "stream", RecordSettings(), RecordOptions(recover=True))
         rows = read_stream(Branch.open(branch.folder).path("pulls/stream/robot.csv"))
     times, places = rows.times, rows.values[:, :3]
     steps = np.diff(times)
     lost = int(np.round(steps / 0.002).sum() - len(steps))
+    if killed is None:
+        ended = Branch.open(branch.folder).manifest.stages["record:stream"].result["ended"]
+        return [Row(f"500 Hz recorded for {seconds:.0f} s: samples lost", "0", f"{lost} of "
+                    f"{len(times)}, but stopped after {times[-1]:.0f} s: {ended} (load of the "
+                    f"machine {os.getloadavg()[1]:.1f})", False)]
     # Both clocks from when it began to move.
     way = np.linalg.norm(places[_APART:] - places[:-_APART], axis=1)
     first = int(np.argmax(way > _BEGUN_M_S * (times[_APART:] - times[:-_APART])))
@@ -67,19 +73,24 @@ def _started(branch: Branch, path: Path) -> subprocess.Popen:
 
 
 def _watched(robot, process: subprocess.Popen, seconds: float,
-             ) -> tuple[float, int, int, float]:
+             ) -> tuple[float, int, int, float | None]:
     """Return the clock when it began to move, memory after a tenth of the time and how it has grown
-    since, and the clock of the kill."""
+    since, and the clock of the kill; None where the recording ended before."""
     end = time.monotonic() + _LONGEST_S
     while np.linalg.norm(robot.state["tool_speed"][:3]) < _BEGUN_M_S:
         if process.poll() is not None or time.monotonic() > end:
             raise RuntimeError("the recording did not begin")
         time.sleep(0.01)
     begin = robot.state["clock"]
-    time.sleep(0.1 * seconds)
-    before = _memory(process.pid)
-    time.sleep(0.9 * seconds)
-    grown = _memory(process.pid) - before
+    before = grown = 0
+    for share in (0.1, 0.9):
+        end = time.monotonic() + share * seconds
+        while time.monotonic() < end:
+            if process.poll() is not None:
+                return begin, before, grown, None
+            time.sleep(0.5)
+        now = _memory(process.pid)
+        before, grown = (now, 0) if share == 0.1 else (before, now - before)
     killed = robot.state["clock"]
     os.kill(process.pid, signal.SIGKILL)
     return begin, before, grown, killed
