@@ -17,6 +17,7 @@ from limber.batch.course import run_jobs
 from limber.batch.job_file import read_jobs
 from limber.batch.records import Records, numbers_of
 from limber.errors import BranchFolderError
+from limber.stages.target import TargetSettings, set_target
 from limber.store import Branch
 
 JOBS = """
@@ -110,6 +111,29 @@ def test_a_killed_batch_goes_on(orchard, monkeypatch):
     assert {status for row in found for status in row} <= {"done", "up to date"}
     one, two = (Branch.open(orchard / f"{name}.branch", verify=True) for name in ("one", "two"))
     assert one.digest("pulls/pull-2/robot.csv") == two.digest("pulls/pull-2/robot.csv")
+
+
+def test_what_is_written_beside_the_branch_is_not_written_again(orchard, here, capsys):
+    """An export, as a scene, is made once, and again when the branch or the file has changed."""
+    jobs = orchard / "jobs.toml"
+    jobs.write_text(JOBS.replace("{reach}", "0.2").split("[[job.stage]]\nrun = \"virtual")[0] +
+                    '[[job.stage]]\nrun = "export"\noutput = "{scan}.swc"\n')
+    ran: list[str] = []
+    here.before = staticmethod(lambda task, folder: ran.append(f"{folder.stem} {task.label}"))
+    try:
+        for change, exported in ((None, ["one", "two"]), (None, []), ("file", ["one"]),
+                                 ("branch", ["two"])):
+            if change == "file":
+                next(orchard.rglob("one.swc")).unlink()
+            elif change == "branch":
+                set_target(orchard / "two.branch", "leaf", TargetSettings(at=(0.0, 0.0, 0.1)))
+            ran.clear()
+            assert call(capsys, "batch", jobs)[0] == 0
+            assert [one.split()[0] for one in ran if "export" in one] == exported, change
+            assert [row[-1] for row in states(jobs)] == [
+                "done" if name in exported else "up to date" for name in ("one", "two")]
+    finally:
+        here.before = staticmethod(lambda task, folder: None)
 
 
 def test_two_batches_exclude_each_other(orchard):

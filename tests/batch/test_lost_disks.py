@@ -4,16 +4,12 @@ import errno
 import json
 import os
 import shutil
-from concurrent.futures import Future
 
 import pytest
 
 from limber import cli
-from limber.batch import course
 from limber.batch.job_file import read_jobs
 from limber.batch.records import Records
-from limber.batch.task import run_task
-from limber.progress import SILENT
 from limber.store import Branch, journal
 
 JOBS = """
@@ -29,40 +25,11 @@ farthest = "50 cm"
 """ for name in ("flower", "fruit"))
 
 
-class Here:
-    """Runs tasks in this process, so that its disk can be made to fail."""
-
-    count = 1
-    before = staticmethod(lambda task, folder: None)
-
-    def __init__(self, *_given):
-        pass
-
-    def submit(self, task, folder):
-        future = Future()
-        Here.before(task, folder)
-        try:
-            future.set_result(run_task(task, folder, SILENT))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-    def cancel(self):
-        pass
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_error):
-        pass
-
-
 @pytest.fixture
-def orchard(tmp_path, branch_template, monkeypatch):
+def orchard(tmp_path, branch_template, here):
     for name in ("one", "two"):
         shutil.copytree(branch_template, tmp_path / f"{name}.branch")
     (tmp_path / "jobs.toml").write_text(JOBS)
-    monkeypatch.setattr(course, "_ThisProcess", Here)
     return tmp_path
 
 
@@ -86,7 +53,7 @@ def targets(orchard, name) -> list[str]:
     return [one["name"] for one in json.loads(branch.path("targets.json").read_text())["targets"]]
 
 
-def test_a_full_disk_ends_its_own_branch(orchard, batch, monkeypatch):
+def test_a_full_disk_ends_its_own_branch(orchard, batch, here, monkeypatch):
     flush = journal.flush_tree
     calls = []
 
@@ -108,13 +75,13 @@ def test_a_full_disk_ends_its_own_branch(orchard, batch, monkeypatch):
     assert Branch.open(orchard / "two.branch").manifest.stages == kept
 
 
-def test_a_lost_branch_ends_alone(orchard, batch, monkeypatch):
+def test_a_lost_branch_ends_alone(orchard, batch, here, monkeypatch):
     """It is not made anew, and when it is there again the batch goes on with it."""
     def lose(task, folder):
         if folder.name == "one.branch" and task.label.endswith("fruit"):
             folder.rename(orchard / "away")
     with monkeypatch.context() as patch:
-        patch.setattr(Here, "before", staticmethod(lose))
+        patch.setattr(here, "before", staticmethod(lose))
         code, told, _ = batch()
     assert code == 3 and "There is no folder" in told["error"]
     assert not (orchard / "one.branch").exists()
@@ -126,7 +93,7 @@ def test_a_lost_branch_ends_alone(orchard, batch, monkeypatch):
 
 
 @pytest.mark.parametrize("trouble", ["gone", "full"])
-def test_lost_results_stop_the_batch(orchard, batch, monkeypatch, trouble):
+def test_lost_results_stop_the_batch(orchard, batch, here, monkeypatch, trouble):
     """Nothing is written where they were; back again, what is stored is not done again."""
     out = orchard / "results"
 
@@ -141,7 +108,7 @@ def test_lost_results_stop_the_batch(orchard, batch, monkeypatch, trouble):
     def no_room(_handle):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     with monkeypatch.context() as patch:
-        patch.setattr(Here, "before", staticmethod(lose))
+        patch.setattr(here, "before", staticmethod(lose))
         code, told, _ = batch()
     assert code == 3, told
     if trouble == "gone":

@@ -3,6 +3,7 @@
 import time
 from collections import deque
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,7 +12,7 @@ from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.batch.log import BatchLog
 from limber.batch.records import DONE, FAILED, KEPT, RUNNING, Record, Records, numbers_of
 from limber.batch.staging import AT_ONCE, Staging
-from limber.batch.task import run_task
+from limber.batch.task import is_shown, run_task
 from limber.errors import Cancelled, LimberError, WorkError
 from limber.jobs import Pool, worker_count
 from limber.progress import SILENT, Progress
@@ -152,6 +153,11 @@ class _Course:
             return
         self.require_place()
         task = branch.tasks[number]
+        record = self.records.of(branch, task)
+        if record.has_succeeded and is_shown(task, branch.folder, record.content):
+            self.records.end(branch, task, replace(record, status=KEPT))
+            self.submit(branch, number + 1)
+            return
         self.records.begin(branch, task)
         future = self.machines.submit(task, branch.folder)
         self.running[future] = branch, number, time.monotonic()
@@ -233,7 +239,7 @@ class _Course:
                           f"bug-report {branch.folder}`). {notes}", round(seconds, 3))
         status = FAILED if told["error"] else KEPT if told["is_kept"] else DONE
         return Record(status, told["error"], told["seconds"], told["memory_mb"],
-                      tuple(told["warnings"]), numbers_of(told["result"]))
+                      tuple(told["warnings"]), numbers_of(told["result"]), told.get("content", ""))
 
 
 def _identity(folder: Path) -> tuple[int, int]:

@@ -19,7 +19,10 @@ WAITING, RUNNING, DONE, KEPT, FAILED = "waiting", "running", "done", "up to date
 
 @dataclass(frozen=True)
 class Record:
-    """How a task stands: ``numbers`` are those of its result, ``memory_mb`` its largest."""
+    """How a task stands: ``numbers`` are those of its result, ``memory_mb`` its largest.
+
+    ``content`` is the digest of the branch that a stage has shown which stores nothing in it.
+    """
 
     status: str = WAITING
     error: str = ""
@@ -27,6 +30,7 @@ class Record:
     memory_mb: float | None = None
     warnings: tuple[str, ...] = ()
     numbers: dict[str, float] = field(default_factory=dict)
+    content: str = ""
 
     @property
     def has_succeeded(self) -> bool:
@@ -79,7 +83,8 @@ class Records:
                 record = Record(RUNNING) if is_alive(int(process), int(since)) else Record()
             else:
                 record = Record(status, str(told["error"]), told["seconds"], told["memory_mb"],
-                                tuple(told["warnings"]), dict(told["numbers"]))
+                                tuple(told["warnings"]), dict(told["numbers"]),
+                                str(told.get("content", "")))
         except (ValueError, KeyError, TypeError, RecursionError):
             # A line that was damaged tells nothing: its task is run again, and kept if it is done.
             return

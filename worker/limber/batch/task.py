@@ -14,6 +14,7 @@ from limber.plain import plain
 from limber.progress import Progress
 from limber.stages.registry import stage_description
 from limber.store.manifest import read_manifest
+from limber.version import VERSION
 
 _SAMPLE_SECONDS = 0.2
 
@@ -23,7 +24,8 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
 
     Returns:
         ``error`` (empty where it succeeded), ``result``, ``warnings``, ``seconds``, ``memory_mb``
-        at its largest, and ``is_kept``: the branch had it already, from this input with these
+        at its largest, ``content``, the digest of the branch that a stage has shown which stores
+        nothing in it, and ``is_kept``: the branch had it already, from this input with these
         settings.
 
     Raises:
@@ -49,8 +51,39 @@ def run_task(task: StageTask, folder: Path, progress: Progress) -> dict[str, Any
             outcome["error"] = str(told)
     after = _finished(task, folder)
     return outcome | {
-        "warnings": warnings, "seconds": round(time.perf_counter() - started, 3),
+        "content": _content(task, folder), "warnings": warnings,
+        "seconds": round(time.perf_counter() - started, 3),
         "memory_mb": round(memory.most_mb, 1), "is_kept": before is not None and before == after}
+
+
+def is_shown(task: StageTask, folder: Path, content: str) -> bool:
+    """Whether a stage that stores nothing in the branch, as a scene, has nothing new to show.
+
+    Args:
+        content: Digest of the branch that it has shown; empty where it has shown none.
+    """
+    outputs = _outputs(task)
+    return bool(content and outputs) and content == _content(task, folder) and all(
+        path.exists() for path in outputs)
+
+
+def _content(task: StageTask, folder: Path) -> str:
+    """Digest of the branch, and of our version, for a stage that stores nothing; else empty."""
+    if stage_description(task.stage).key or not _outputs(task):
+        return ""
+    try:
+        return f"{VERSION} {read_manifest(folder).content_digest()}"
+    except (LimberError, OSError):
+        return ""
+
+
+def _outputs(task: StageTask) -> list[Path]:
+    """The files that a stage writes beside the branch; none if it reads any beside it."""
+    kind = type(task.inputs)
+    paths = {name: value for name, value in task.inputs if isinstance(value, Path)
+             and name != "branch_folder"}
+    outputs = [value for name, value in paths.items() if kind.group_of(name) == "output"]
+    return outputs if len(outputs) == len(paths) else []
 
 
 def _finished(task: StageTask, folder: Path) -> str | None:

@@ -1,7 +1,5 @@
 """One self-contained HTML page with figures and tables of all results."""
 
-import hashlib
-import json
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -68,14 +66,8 @@ def write_report(folder: Path, *, picture: Path | None = None, caliper_path: Pat
 
 def _shown(branch: Branch, picture: Path | None, caliper_path: Path | None) -> dict[str, str]:
     """Digests of all that the page is drawn from."""
-    manifest = branch.manifest
-    held = {"files": {name: entry.sha256 for name, entry in manifest.files.items()
-                      if entry.stage != "report"},
-            "stages": {key: entry.model_dump(mode="json") for key, entry in manifest.stages.items()
-                       if key != "report"}}
-    text = json.dumps(held, sort_keys=True).encode()
     outside = {"picture": picture, "caliper": caliper_path}
-    return {"folder": hashlib.sha256(text).hexdigest(), "limber": VERSION} | {
+    return {"folder": branch.manifest.content_digest(), "limber": VERSION} | {
         name: file_digest(require_file(path, f"A {name} file"))
         for name, path in outside.items() if path is not None}
 

@@ -1,6 +1,7 @@
 """The manifest ``branch.json``: what a branch folder holds, and what it was made from."""
 
 import functools
+import hashlib
 import json
 import platform
 import uuid
@@ -19,6 +20,8 @@ from limber.version import VERSION
 FORMAT_VERSION = 2
 """1: until 0.1; 2: with the branch's UUID. Older ones are read, and written as this one."""
 MANIFEST = "branch.json"
+REPORT = "report"
+"""The stage that shows all of the others."""
 _PROGRAMS = ("numpy", "scipy", "numba", "cvxopt", "pytetwild", "robust_laplacian", "ompl")
 
 
@@ -70,6 +73,14 @@ class Manifest(BaseModel):
         self.format_version = FORMAT_VERSION
         self.uuid = self.uuid or str(uuid.uuid4())
         return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+    def content_digest(self) -> str:
+        """Return a sha256 of all that the branch has, its report aside."""
+        held = {"files": {name: entry.sha256 for name, entry in self.files.items()
+                          if entry.stage != REPORT},
+                "stages": {key: entry.model_dump(mode="json") for key, entry in self.stages.items()
+                           if key != REPORT}}
+        return hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -1,0 +1,44 @@
+"""A batch whose stages run in the test's own process: quick, and its disk can be made to fail."""
+
+from concurrent.futures import Future
+
+import pytest
+
+from limber.batch import course
+from limber.batch.task import run_task
+from limber.progress import SILENT
+
+
+class Here:
+    """Runs tasks in this process; ``before`` is called before each."""
+
+    count = 1
+    before = staticmethod(lambda task, folder: None)
+
+    def __init__(self, *_given):
+        pass
+
+    def submit(self, task, folder):
+        future = Future()
+        Here.before(task, folder)
+        try:
+            future.set_result(run_task(task, folder, SILENT))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    def cancel(self):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_error):
+        pass
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Batches run in this process; returns what runs their tasks."""
+    monkeypatch.setattr(course, "_ThisProcess", Here)
+    return Here
