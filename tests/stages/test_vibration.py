@@ -1,11 +1,13 @@
 """`limber vibration` on the example branch: the modulus comes back from what it would ring like."""
 
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from limber.cli import call
 from limber.errors import InputError
 from limber.mechanics.vibration import lowest_modes
 from limber.report.ringing import vibration_rows
@@ -54,6 +56,22 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
         vibration_rows(now.path("vibration.json"))
 
 
+def test_import_pull_takes_a_record_of_a_swing(branch, tmp_path, capsys):
+    """Other names and units of time, a counter and a gap beside the readings: the same modulus."""
+    record = written(tmp_path / "ring.csv", 2.5)
+    plain = vibration(branch.folder, record, VibrationSettings())
+    rows = [line.split(",") for line in record.read_text().splitlines()[1:]]
+    (tmp_path / "strain.csv").write_text("Frame;Time (ms);strain (um/m);tip_x_m\n" + "".join(
+        f"{number};{1e3 * float(time):.3f};{reading};{'' if number == 7 else reading}\n"
+        for number, (time, reading) in enumerate(rows)))
+    assert call(["import-pull", str(branch.folder), str(tmp_path / "strain.csv"), "--name", "s",
+                 "--swing", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["kind"] == "ringing"
+    assert told["frequencies_hz"][0] == pytest.approx(2.5, rel=1e-3)
+    assert told["young_pa"] == pytest.approx(plain["young_pa"], rel=1e-3)
+
+
 def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
     """The same record with a mass at the tip means stiffer wood."""
     tip = load_mesh(branch).nodes[load_mesh(branch).nodes[:, 2].argmax()]
@@ -65,8 +83,11 @@ def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
 
 @pytest.mark.parametrize(("content", "told"), [
     ("time_s\n0\n1\n", "no column of readings"),
-    ("time_s,a\n1,1\n0,2\n", "ascend"),
-    ("t,a\n1,1\n", "no column time_s"),
+    ("time_s,a\n1,1\n0,2\n", "backwards"),
+    ("time_s,a\n0,nan\n1,2\n", "no column of readings"),
+    ("t,a\n1,1\n", "two samples"),
+    ("b,a\n1,1\n", "None is called time"),
+    ("time_s,a\n" + "".join(f"{k},1\n" for k in range(40)) + "1e12,1\n", "gaps"),
     ("time_s,a\n" + "".join(f"{k},{k % 2}\n" for k in range(9)), "At least 32"),
 ])
 def test_a_record_that_cannot_be_used(branch, tmp_path, content, told):

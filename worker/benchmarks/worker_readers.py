@@ -251,7 +251,8 @@ def _decay(name: str, column: str, _template: Path, folder: Path) -> list[Path]:
 def _ring(_template: Path, path: Path) -> Any:
     from limber.estimation.ringing import identify, read_record
 
-    return identify(*read_record(path))
+    record = read_record(path)
+    return identify(record.times, record.values)
 
 
 def _wind(_template: Path, path: Path) -> Any:

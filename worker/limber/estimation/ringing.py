@@ -7,15 +7,20 @@ Bayesian information criterion falls. What the vibrations leave over is correlat
 counts as so many fewer readings.
 """
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from limber.errors import InputError
-from limber.reading import read_columns
+from limber.recordings.importing import markers_from_c3d
+from limber.recordings.streams import Stream
+from limber.recordings.tables import read_table, split_title, time_stream
 
+_COUNTS = r"frames?|samples?|index|framenumber|subframes?"
+"""Columns that count the rows."""
 _MOST_MODES = 4
 _LEAST_READINGS = 32
 _MOST_STEPS = 2e6
@@ -52,21 +57,31 @@ class Ringing:
     duration: float
 
 
-def read_record(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a record: times [s], shape [n], and its columns of readings, shape [n, c].
+def read_record(path: Path) -> Stream:
+    """Read a record: a table of times and readings in any unit, or the marker tracks of a C3D file.
+
+    Columns with gaps, as of a marker that was out of sight, are left out.
 
     Raises:
-        InputError: it cannot be read, has no readings, or its times do not ascend in even steps.
+        InputError: it cannot be read, has no times or no readings, or its times do not ascend in
+            even steps.
     """
-    columns = read_columns(path, ("time_s",), "a record of vibrations")
-    times = columns.pop("time_s")
-    if not columns or len(times) < 2 or not (np.diff(times) > 0).all():
-        raise InputError(f"{path} has no column of readings beside time_s, or its times do not "
-                         "ascend.", "A record has both.", "Correct the file.")
+    if path.suffix.lower() == ".c3d":
+        stream = markers_from_c3d(path)[0]
+    else:
+        stream = time_stream(read_table(path))
+    used = [number for number, title in enumerate(stream.columns)
+            if np.isfinite(stream.values[:, number]).all()
+            and not re.fullmatch(_COUNTS, split_title(title).plain)]
+    times = stream.times
+    if not used:
+        raise InputError(f"{path} has no column of readings beside its times that is whole.",
+                         "A record has one.", "Correct the file.")
     if not (times[-1] - times[0]) / np.median(np.diff(times)) < _MOST_STEPS:
         raise InputError(f"{path} has gaps that are far longer than its steps.",
                          "It is taken in even steps.", "Give a part of it without gaps.")
-    return times, np.stack(list(columns.values()), axis=1)
+    return replace(stream, values=stream.values[:, used],
+                   columns=tuple(stream.columns[number] for number in used))
 
 
 def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None) -> Ringing:
@@ -88,7 +103,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     if len(times) < _LEAST_READINGS:
         raise InputError(f"The record has {len(times)} readings of a free decay.",
                          f"At least {_LEAST_READINGS} are needed.",
-                         "Record longer, or say when it begins with --from.")
+                         "Record longer, or say when it begins with --start.")
     guess = _peak(times, channels, step)
     used = times <= times[0] + _PERIODS / guess
     times, channels = times[used], channels[used] - channels[used].mean(axis=0)
@@ -100,7 +115,7 @@ def identify(times: np.ndarray, channels: np.ndarray, start: float | None = None
     if found.left_over > 0.9:
         raise InputError("Nothing rings in the record.",
                          f"Vibrations that die away explain {100 * (1 - found.left_over**2):.0f} "
-                         "% of it.", "Let the branch go at once; say when with --from.")
+                         "% of it.", "Let the branch go at once; say when with --start.")
     return Ringing(**{**vars(found), "start": float(times[0]),
                       "duration": float(times[-1] - times[0])})
 

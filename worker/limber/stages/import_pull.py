@@ -27,11 +27,17 @@ _JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wris
 class ImportInputs(BranchInputs):
     """A branch folder, a recording, and the name it gets."""
 
-    groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",)}
+    groups: ClassVar[Groups] = {"input": ("source",), "output": ("name",),
+                               "simulation": ("swing",)}
 
     source: Path = argument("Marker CSV, C3D, PLY or RGB-D folder, force table, MCAP, rosbag2, "
                             "RTDE log.")
     name: str = Field(description="Name of the pull.")
+    swing: bool = Field(
+        False, description="The branch is let go, without a robot. Markers with --weight or --load "
+        "become a pull for `limber swing`; other records (accelerometer, strain gauge, a video's "
+        "track, markers of a plucked branch) go through `limber vibration` at once.",
+        json_schema_extra={"switch": True})
 
 
 def import_pull(branch_folder: Path, source: Path, name: str, settings: ImportSettings, *,
@@ -122,6 +128,15 @@ def _digest(path: Path) -> str:
 def run(inputs: ImportInputs, settings: ImportSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
+    if inputs.swing and settings.weight is None and settings.load is None:
+        # Nothing is known of what bent it: its frequencies tell the modulus, no positions do.
+        from limber.stages.vibration import VibrationSettings, vibration
+
+        told = vibration(inputs.branch_folder, inputs.source, VibrationSettings(),
+                         force=options.force, progress=progress)
+        return told | {"kind": "ringing"}
+    if inputs.swing:
+        settings = settings.model_copy(update={"motion": "swing"})
     return import_pull(inputs.branch_folder, inputs.source, inputs.name, settings,
                        force=options.force, progress=progress)
 

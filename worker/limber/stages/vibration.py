@@ -1,8 +1,8 @@
 """Young's modulus and damping from how a branch rings: accelerometer, strain gauge or video track.
 
-RECORD is a CSV file with time_s and one column or more of accelerations, strains or displacements,
-in any unit. The branch is plucked and left to itself. Its frequencies tell one level of Young's
-modulus, as sure as its density and radii are; the pattern along the branch stays.
+RECORD is a table of times and one column or more of accelerations, strains or displacements in any
+unit, or a C3D file of markers. The branch is plucked and left to itself. Its frequencies tell one
+level of Young's modulus, as sure as its density and radii are; the pattern along the branch stays.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class VibrationInputs(BranchInputs):
 
     groups: ClassVar[Groups] = {"input": ("record",)}
 
-    record: Path = argument("CSV file with time_s and columns of readings.")
+    record: Path = argument("Table of times and readings (CSV), or C3D.")
 
 
 class VibrationSettings(Settings):
@@ -78,14 +78,19 @@ def vibration(branch_folder: Path, record: Path, settings: VibrationSettings, *,
     from limber.estimation.ringing import identify, read_record
     from limber.stages.loading import load_branch, load_mesh
 
-    times, channels = read_record(record)
+    if not Path(record).is_file():
+        raise InputError(f"There is no file {record}.", "A record of how the branch rings was "
+                         "expected.", "Check the path.")
+    rung = read_record(Path(record))
+    for text in rung.warnings:
+        progress.warn(text)
     branch = Branch.open(branch_folder)
     with branch.writing("limber vibration"):
         mesh = load_mesh(branch)
         digests = {"record": file_digest(record), "mesh geometry": mesh.geometry_digest()}
         if not force and branch.is_current("vibration", settings, digests=digests):
             return branch.manifest.stages["vibration"].result
-        seen = identify(times, channels, settings.start)
+        seen = identify(rung.times, rung.values, settings.start)
         progress(0.3, "modulus of that frequency")
         model = load_branch(branch, progress=progress).model
         told = young_of(_with_sensor(model, settings), seen, settings)
