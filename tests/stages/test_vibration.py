@@ -82,9 +82,9 @@ def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
 
 
 @pytest.mark.parametrize(("content", "told"), [
-    ("time_s\n0\n1\n", "no column of readings"),
+    ("time_s\n0\n1\n", "no row of numbers"),
     ("time_s,a\n1,1\n0,2\n", "backwards"),
-    ("time_s,a\n0,nan\n1,2\n", "no column of readings"),
+    ("time_s,a\n0,nan\n1,2\n", "two samples"),
     ("t,a\n1,1\n", "two samples"),
     ("b,a\n1,1\n", "None is called time"),
     ("time_s,a\n" + "".join(f"{k},1\n" for k in range(40)) + "1e12,1\n", "gaps"),

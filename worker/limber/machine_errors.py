@@ -1,6 +1,7 @@
 """What the machine does to a program, in words: a full disk, a lost folder, no memory."""
 
 import errno
+import re
 from pathlib import Path
 
 from limber.errors import InputError, LimberError, WorkError
@@ -18,6 +19,8 @@ _UNREACHABLE = _codes("ENOTCONN", "ESHUTDOWN", "EHOSTDOWN", "EHOSTUNREACH", "ENE
 """Of a file; without a name they may be of a robot's connection."""
 _LOST_ON_WINDOWS = frozenset((53, 55, 59, 64, 67, 121, 1231))
 """ERROR_BAD_NETPATH and its kin, which Python takes for a file that is not there."""
+_FULL_IN_WORDS = re.compile(r"no space left|not enough free space|requested and \d+ written", re.I)
+"""As numpy and HDF5 say it, without a number."""
 _FORBIDDEN = _codes("EROFS", "EACCES", "EPERM")
 
 
@@ -34,7 +37,7 @@ def machine_error(error: BaseException, place: Path | None = None) -> LimberErro
         return None
     name = error.filename2 or error.filename or place or "A file"
     told = error.strerror or str(error) or type(error).__name__
-    if error.errno in _FULL:
+    if error.errno in _FULL or (error.errno is None and _FULL_IN_WORDS.search(told)):
         return WorkError(f"{name} cannot be written ({told}).",
                          "The disk is full, or your share of it.",
                          "Make room (`limber cache --clear` frees some), and run this again: what "

@@ -13,11 +13,11 @@ writes (:mod:`limber.store.lock`), any number read. What killed programs left be
 the next one that writes.
 """
 
-import errno
-import math
+import gc
 import os
 import shutil
 import time
+import traceback
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -49,7 +49,6 @@ from limber.store.verify import Checker, Damage, damage_error
 _STREAMS = ".streams"
 RESULTS = "results"
 """Among a stage's programs: the version of its settings' results; see limber.settings."""
-_NOTHING_FREE_BYTES = 1e6
 LEAST_FREE_BYTES = 200e6
 """A stage does not begin with less room on the disk: it would lose its work at the end."""
 
@@ -404,11 +403,12 @@ def _in_words(folder: Path) -> Iterator[None]:
         if _is_gone(folder):
             raise _gone(folder) from error
         told = machine_error(error, folder)
-        if told is None and _free_bytes(folder) < _NOTHING_FREE_BYTES:
-            # Native writers tell that something was not written, not why.
-            told = machine_error(OSError(errno.ENOSPC, str(error)), folder)
         if told is None:
             raise
+        # A file that the failed writer still has open keeps its room, removed or not; the next
+        # stage of this process would find the disk as full.
+        traceback.clear_frames(error.__traceback__)
+        gc.collect()
         raise told from error
 
 
@@ -430,13 +430,6 @@ def _gone(folder: Path) -> WorkError:
     return WorkError(f"{folder} is not there any more.",
                      "It was moved or removed, or the disk or network folder that it is on was "
                      "lost.", "Bring it back, and run this again: what was stored before is kept.")
-
-
-def _free_bytes(folder: Path) -> float:
-    try:
-        return shutil.disk_usage(folder).free
-    except OSError:
-        return math.inf
 
 
 def _require_room(folder: Path, purpose: str) -> None:
