@@ -15,7 +15,8 @@ import pytest
 from limber import cli
 from limber.batch.course import run_jobs
 from limber.batch.job_file import read_jobs
-from limber.batch.records import Records, numbers_of
+from limber.batch.records import Records, numbers_of, path_of_page
+from limber.batch.summary import write_page
 from limber.errors import BranchFolderError
 from limber.stages.target import TargetSettings, set_target
 from limber.store import Branch
@@ -69,6 +70,7 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     code, told = call(capsys, "batch", jobs, "--workers", "1")
     assert code == 3 and "1 of 2 branches failed; two: target:flower" in told["error"]
     assert states(jobs) == [["done", "done"], ["failed", "waiting"]]
+    rows = list(csv.DictReader((orchard / "results/jobs.csv").open()))
     assert Branch.open(orchard / "one.branch").has("pulls/pull-2/pull.toml")
     code, told = call(capsys, "status", jobs)
     assert (told["done"], told["failed"], told["failures"][0][0]) == (1, 1, "two")
@@ -79,6 +81,8 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     code, told = call(capsys, "batch", jobs, "--workers", "1", "--retry-failed")
     assert code == 0 and told["done"] == 2, told
     assert states(jobs)[0][1] == "up to date" and states(jobs)[1] == ["done", "done"]
+    rows_before, rows = rows, list(csv.DictReader((orchard / "results/jobs.csv").open()))
+    assert rows[0]["virtual-pull:pull-2.seconds"] == rows_before[0]["virtual-pull:pull-2.seconds"]
     assert Branch.open(orchard / "one.branch").digest("pulls/pull-2/robot.csv") == json.loads(
         before)["files"]["pulls/pull-2/robot.csv"]["sha256"]
     rows = list(csv.DictReader((orchard / "results/jobs.csv").open()))
@@ -134,6 +138,19 @@ def test_what_is_written_beside_the_branch_is_not_written_again(orchard, here, c
                 "done" if name in exported else "up to date" for name in ("one", "two")]
     finally:
         here.before = staticmethod(lambda task, folder: None)
+
+
+def test_the_page_shows_what_was_rendered(orchard):
+    """Pictures that `limber scene` has made of a branch, by ways that hold when all is moved."""
+    jobs = orchard / "jobs.toml"
+    jobs.write_text(JOBS.replace("{reach}", "0.2") + '[[job.stage]]\nrun = "scene"\n'
+                    'output = "{scan}.blend"\nrender = "views/{scan} & co.png"\n')
+    checked = read_jobs(jobs)
+    (checked.out / "views").mkdir(parents=True)
+    (checked.out / "views" / "one & co.png").write_bytes(b"")
+    write_page(checked, Records(checked))
+    page = path_of_page(checked).read_text()
+    assert page.count("<img") == 1 and "<img src='views/one%20%26%20co.png'" in page
 
 
 def test_two_batches_exclude_each_other(orchard):

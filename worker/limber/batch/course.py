@@ -100,6 +100,7 @@ class _Course:
         self.staging, self.log, self.retry_failed = staging, log, retry_failed
         self.waiting = deque(jobs.branches)
         self.running: dict[Future, tuple[BranchJob, int, float]] = {}
+        self.earlier: dict[Future, Record] = {}
         self.ended = 0
         self.place = _identity(jobs.out)
         # While some are moved others are computed.
@@ -160,6 +161,7 @@ class _Course:
             return
         self.records.begin(branch, task)
         future = self.machines.submit(task, branch.folder)
+        self.earlier[future] = record
         self.running[future] = branch, number, time.monotonic()
 
     def require_place(self) -> None:
@@ -188,8 +190,12 @@ class _Course:
             self.moved(future, branch, number, time.monotonic() - since)
             return
         task = branch.tasks[number]
-        record = self.outcome(future, branch, time.monotonic() - since)
-        self.records.end(branch, task, record)
+        record, earlier = (self.outcome(future, branch, time.monotonic() - since),
+                           self.earlier.pop(future))
+        is_kept = record.status == KEPT and earlier.has_succeeded
+        # What was told of it, and what it took, is of its making, not of finding it made.
+        self.records.end(branch, task, replace(earlier, status=KEPT, numbers=record.numbers)
+                         if is_kept else record)
         self.log.tell(branch.name, task.label, f"{record.status} after {record.seconds or 0:.1f} s",
                       f"with {record.memory_mb:.0f} MB" if record.memory_mb else "")
         for warning in record.warnings:

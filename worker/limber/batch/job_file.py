@@ -145,6 +145,8 @@ class _Reader:
     def __init__(self, path: Path, content: dict[str, Any], lines: dict[Place, int]):
         self.path, self.content, self.lines = path, content, lines
         self.problems: list[tuple[int, str]] = []
+        self.misfits: set[Place] = set()
+        """Places whose value was refused before it came to the stage's settings."""
         self.out = path.parent / path.stem
         self.home = ""
         self.addresses = JobAddresses(self.problem)
@@ -388,6 +390,7 @@ class _TaskReader:
             if about.get("unit") or "string" not in _types(about):
                 return in_unit(value, about.get("unit", ""))
         except ValueError as error:
+            self.reader.misfits.add(place)
             self.reader.problem(place, f"{place[-1]}: {error}")
         return self.filled(value, place) if isinstance(value, str) else value
 
@@ -452,8 +455,11 @@ class _TaskReader:
                 for one in error.errors():
                     key = str(one["loc"][0]) if one["loc"] else ""
                     unit = fields.get(key, ("", {}))[1].get("unit")
+                    at = self.place_of(place, name, key)
+                    if at in self.reader.misfits:
+                        continue
                     self.reader.problem(
-                        self.place_of(place, name, key), f"{name} {key}: {one['msg']}"
+                        at, f"{name} {key}: {one['msg']}"
                         + ("" if one["type"] == "missing" else f", not {one['input']!r}")
                         + (f" [{unit}]." if unit else "."))
         return StageTask(name, *made) if len(made) == len(models) else None

@@ -113,7 +113,8 @@ def _page(jobs: JobFile, records: Records) -> Iterator[str]:
 
 def _branch(branch: BranchJob, records: Records, page: Path) -> Iterator[str]:
     swept = ", ".join(f"{key} = {value}" for key, value in branch.sweep.items())
-    yield f"<section>{pictures(branch.folder)}<div><h3>{_title(branch, page)}</h3>"
+    yield (f"<section>{pictures(branch.folder)}<div><h3>{_title(branch, page)}</h3>"
+           f"{_rendered(branch, page)}")
     if swept:
         yield f"<p>{html.escape(swept)}</p>"
     yield "<table><tr><th>stage<th>status<th>time [s]<th>memory [MB]<th></tr>"
@@ -128,15 +129,29 @@ def _branch(branch: BranchJob, records: Records, page: Path) -> Iterator[str]:
 
 def _title(branch: BranchJob, page: Path) -> str:
     """The branch's name, leading to its own report where it has one."""
-    name, report = html.escape(branch.name), branch.folder / "report.html"
-    if not report.is_file():
-        return name
+    name, way = html.escape(branch.name), _way(branch.folder / "report.html", page)
+    return f"<a href='{way}'>{name}</a>" if way else name
+
+
+def _rendered(branch: BranchJob, page: Path) -> str:
+    """What `limber scene` has rendered of the branch."""
+    shown = (getattr(task.inputs, kind, None) for task in branch.tasks
+             for kind in ("render", "turntable"))
+    ways = [way for path in shown if path and (way := _way(path, page))]
+    return "".join(f"<a href='{way}'><img src='{way}' alt='rendered' loading=lazy></a>"
+                   for way in ways)
+
+
+def _way(path: Path, page: Path) -> str:
+    """The way from the page to a file beside it, as a link has it; none leads to no file."""
+    if not path.is_file():
+        return ""
     try:
-        way = Path(os.path.relpath(report.resolve(), page.resolve().parent)).as_posix()
+        way = Path(os.path.relpath(path.resolve(), page.resolve().parent)).as_posix()
     except ValueError:
         # On another drive (Windows): no way leads there from here.
-        return name
-    return f"<a href='{html.escape(quote(way))}'>{name}</a>"
+        return ""
+    return html.escape(quote(way))
 
 
 def _told(record: Record) -> str:
@@ -151,5 +166,5 @@ _STYLE = ("body{font:15px/1.45 system-ui,sans-serif;max-width:60em;margin:2em au
           "table{border-collapse:collapse}td,th{padding:.15em .7em .15em 0;text-align:left;"
           "vertical-align:top}section{display:flex;gap:1.5em;border-top:1px solid #ddd;"
           "padding:.8em 0}h3{margin:.1em 0 .4em}.pictures{width:310px;flex:none}"
-          ".sketch{max-width:150px;margin-right:6px}.range{color:#666;margin:.1em 0;"
-          "font-size:.85em}")
+          "img{max-width:230px;margin:0 6px 6px 0}.sketch{max-width:150px;margin-right:6px}"
+          ".range{color:#666;margin:.1em 0;font-size:.85em}")
