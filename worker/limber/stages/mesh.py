@@ -1,4 +1,4 @@
-"""Closed surface (STL, PLY, OBJ), or a table of sections, to tetrahedra."""
+"""Closed surface (STL, PLY, OBJ), a table of sections or a cylinder model to tetrahedra."""
 
 import json
 from pathlib import Path
@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 
 class MeshInputs(Settings):
-    """A closed surface or a table of sections, and the branch folder to make."""
+    """A closed surface, a table of sections or a cylinder model, and the branch folder to make."""
 
     groups: ClassVar[Groups] = {"input": ("surface",), "output": ("output",)}
 
     surface: Path = argument(
-        "STL, PLY, OBJ or OFF; or a CSV of sections along an axis from the end that is held: x, y, "
-        "z, width, height, and perhaps mass_kg, what hangs there.")
+        "STL, PLY, OBJ or OFF; a CSV of sections along an axis from the end that is held: x, y, "
+        "z, width, height, and perhaps mass_kg, what hangs there; or a cylinder model: .mat of "
+        "TreeQSM or SmartQSM, CSV of rTwig or SimpleForest, MTG, SWC.")
     output: Path = Field(description="The branch folder to make.",
                          json_schema_extra={"short": "-o"})
 
@@ -35,7 +36,7 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     """Fill a closed surface with tetrahedra and mark base, control points and grasp.
 
     Args:
-        path: STL, PLY, OBJ or OFF, or a CSV of sections.
+        path: STL, PLY, OBJ or OFF, a CSV of sections, or a cylinder model.
         folder: The branch folder to make or renew.
         settings: How.
         force: Run even if nothing has changed.
@@ -44,15 +45,21 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     Raises:
         InputError: the surface cannot be read or is not that of one solid
             (:func:`limber.geometry.surface.input.usable_surface`), or the table is none of
-            sections (:func:`limber.geometry.sections.read_sections`).
+            sections (:func:`limber.geometry.sections.read_sections`), or the cylinder model
+            cannot be used (:func:`limber.geometry.mesh_model.mesh_model`).
         MeshingError: fTetWild failed.
     """
+    from limber.geometry.mesh_model import is_model, mesh_model
     from limber.geometry.mesh_surface import mesh_body
     from limber.geometry.sections import mesh_sections, read_sections
+    from limber.geometry.skeleton.files import write_cylinders
 
     settings = settings or MeshSurfaceSettings()
     path, warnings, drawn = require_file(path, "A surface"), [], None
-    if path.suffix.lower() == ".csv":
+    has_cylinders = is_model(path)
+    if has_cylinders:
+        progress = progress.keeping(warnings)
+    elif path.suffix.lower() == ".csv":
         drawn = read_sections(path, settings.unit)
     else:
         surface, warnings = _usable(path, settings)
@@ -60,11 +67,15 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     digests = {"surface": file_digest(path)}
     if not force and branch.is_current("mesh", settings, digests=digests):
         return branch.manifest.stages["mesh"].result
-    for text in warnings:
+    for text in list(warnings):
         progress.warn(text)
     with branch.stage("mesh", settings, digests=digests) as stage:
-        made, masses = (mesh_sections(drawn, settings) if drawn is not None
-                        else (mesh_body(surface, settings, progress), []))
+        if has_cylinders:
+            made, masses = mesh_model(path, settings, progress)
+        elif drawn is not None:
+            made, masses = mesh_sections(drawn, settings)
+        else:
+            made, masses = mesh_body(surface, settings, progress), []
         stage.manifest.alignment = made.alignment
         stage.manifest.source = {"file": path.name, "unit": settings.unit,
                                  "sha256": digests["surface"]}
@@ -73,6 +84,8 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
         made.mesh.write(stage.path("mesh.vtu"))
         for name in ("point_masses.json", "skeleton.csv"):
             stage.remove(name)  # of an earlier scan in this folder
+        if has_cylinders:
+            write_cylinders(made.skeleton, stage.path("skeleton.csv"))
         if masses:
             stage.path("point_masses.json").write_text(json.dumps(masses, indent=1) + "\n",
                                                        encoding="utf-8")
@@ -98,4 +111,4 @@ def run(inputs: MeshInputs, settings: MeshSurfaceSettings, options: RunOptions,
 
 STAGE = StageDescription(
     "mesh", 30, run, MeshInputs, MeshSurfaceSettings, RunOptions, key="mesh",
-    writes=("skeleton.swc", "surface.ply", "mesh.vtu"))
+    writes=("skeleton.swc", "skeleton.csv", "surface.ply", "mesh.vtu", "point_masses.json"))
