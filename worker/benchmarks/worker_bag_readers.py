@@ -39,9 +39,11 @@ def _recorded_bag(template: Path, kind: str) -> Path:
     atexit.register(shutil.rmtree, place, ignore_errors=True)
     if kind == "ros1":
         from rosbags.rosbag1 import Writer
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         types = get_typestore(Stores.ROS1_NOETIC)
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms",
+                                          "tf2_msgs/msg/TFMessage"))
         writer = Writer(place / "pull.bag")
     else:
         from rosbags.rosbag2 import Writer
