@@ -26,7 +26,8 @@ from limber.errors import LimberError
 from limber.jobs import Pool
 from limber.plain import plain
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.field.sampling import sample_branch, sample_field, sample_positions
+from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.sampling import Sampled, sample_field, sample_positions
 from limber.planning.goals import GraspGoal, default_goal
 from limber.planning.settings import EnergySettings
 from limber.progress import Progress
@@ -34,7 +35,11 @@ from limber.progress import Progress
 
 @dataclass(frozen=True)
 class _Fresh:
-    """Relative errors at fresh poses of energy and force, of the tip [m], each shape [n]."""
+    """Relative errors at fresh trusted poses of energy and force, of the tip [m], each shape [n].
+
+    There the branch is as the motion brings it: coming from the nearest sample; nan where it does
+    not come.
+    """
 
     energy: np.ndarray
     force: np.ndarray
@@ -43,13 +48,14 @@ class _Fresh:
 
 @dataclass(frozen=True)
 class _Fielded:
-    """A branch with its field."""
+    """A branch with its field; ``lost`` is the share of its samples' hull that is not trusted."""
 
     subject: Subject
     known: EnergyField
     goal: GraspGoal
     seconds: float
     fresh: _Fresh
+    lost: float
 
 
 def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
@@ -99,11 +105,11 @@ def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, out: 
         known = EnergyField.read(kept)
         with np.load(kept) as file:
             fresh = _Fresh(*file["fresh"])
-            seconds = float(file["seconds"])
-        return _Fielded(subject, known, default_goal(known, 0.01), seconds, fresh)
+            seconds, lost = float(file["seconds"]), float(file["lost"])
+        return _Fielded(subject, known, default_goal(known, 0.01), seconds, fresh, lost)
     found = _sampled(subject, settings, fresh_count, progress)
     if kept is not None:
-        found.known.write(kept, {"seconds": np.array(found.seconds),
+        found.known.write(kept, {"seconds": np.array(found.seconds), "lost": np.array(found.lost),
                                  "fresh": np.array(list(asdict(found.fresh).values()))})
     return found
 
@@ -114,17 +120,30 @@ def _sampled(subject: Subject, settings: EnergySettings, fresh_count: int, progr
     sampled = sample_field(model, settings, progress=progress.part(0.0, 0.7))
     known = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius)
     seconds = time.perf_counter() - began
-    targets = sample_positions(model.reach, model.rest_position, 3 * fresh_count, sampled.valley,
+    targets = sample_positions(model.reach, model.rest_position, 4 * fresh_count, sampled.valley,
                                deflection=settings.deflection, seed=settings.seed + 1)
-    targets = targets[known.region.contains(targets)][:fresh_count]
-    fresh, _ = sample_branch(model, targets, progress=progress.part(0.7, 1.0))
-    fresh = fresh.take(np.arange(1, len(fresh.poses)))
-    places = fresh.positions
-    return _Fielded(subject, known, default_goal(known, 0.01), seconds, _Fresh(
-        np.abs(known.energy(places) - fresh.energies) / np.maximum(fresh.energies, 1e-12),
-        np.linalg.norm(known.force(places) - fresh.forces, axis=1)
-        / np.linalg.norm(fresh.forces, axis=1),
-        np.linalg.norm(known.tip(places) - fresh.tips, axis=1)))
+    targets = targets[known.region.height(targets) <= 0.0]
+    trusted = known.region.contains(targets)
+    return _Fielded(subject, known, default_goal(known, 0.01), seconds,
+                    _fresh(model, known, sampled, targets[trusted][:fresh_count],
+                           progress.part(0.7, 1.0)), float((~trusted).mean()))
+
+
+def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, targets: np.ndarray,
+           progress: Progress) -> _Fresh:
+    errors = np.full((3, len(targets)), np.nan)
+    for number, place in enumerate(targets):
+        progress(number / len(targets), "fresh poses")
+        gaps = np.linalg.norm(sampled.samples.positions - place, axis=1)
+        there = model.follow(place[None], sampled.displacements[int(gaps.argmin())])[0]
+        if refusal(there):
+            continue
+        energy, force = model.energy(there), there.reaction_force
+        errors[:, number] = (
+            abs(known.energy(place)[0] - energy) / max(energy, 1e-12),
+            np.linalg.norm(known.force(place)[0] - force) / np.linalg.norm(force),
+            np.linalg.norm(known.tip(place)[0] - model.tip(there.displacement)))
+    return _Fresh(*errors)
 
 
 def _trials(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
@@ -242,20 +261,28 @@ def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
 def _field_rows(fielded: list[_Fielded], failed: list[str]) -> list[Row]:
     def spread(name: str, scale: float) -> tuple[float, float]:
         values = scale * np.concatenate([getattr(one.fresh, name) for one in fielded])
-        return float(np.median(values)), float(np.quantile(values, 0.95))
+        # A pose where the motion does not come is as wrong as can be.
+        return tuple(map(float, np.quantile(np.nan_to_num(values, nan=np.inf), (0.5, 0.95),
+                                            method="higher")))
 
     table = []
     for name, what, scale, asked, unit in (("energy", "energy", 100, (1, 5), "%"),
                                            ("force", "force", 100, (2, 8), "%"),
                                            ("tip", "target position", 1e3, (1, 4), "mm")):
         median, most = spread(name, scale)
-        worst = max(fielded, key=lambda one: np.quantile(getattr(one.fresh, name), 0.95))
-        there = scale * np.quantile(getattr(worst.fresh, name), 0.95)
+        worst = max(fielded, key=lambda one: np.nanquantile(getattr(one.fresh, name), 0.95))
+        there = scale * np.nanquantile(getattr(worst.fresh, name), 0.95)
         table.append(Row(
             f"field error on fresh poses: {what}, median / 95 %",
             f"{asked[0]} / {asked[1]} {unit}", f"{median:.2g} / {most:.2g} {unit} "
             f"(worst {worst.subject.name}: {there:.2g})",
             bool(median <= asked[0] and most <= asked[1])))
+    missed = sum(int(np.isnan(one.fresh.tip).sum()) for one in fielded)
+    table.append(Row(
+        "of the samples' hull not trusted, mean / most; fresh trusted poses where the motion does "
+        "not come", "-", f"{100 * np.mean([one.lost for one in fielded]):.0f} / "
+        f"{100 * max(one.lost for one in fielded):.0f} %; {missed} of "
+        f"{sum(len(one.fresh.tip) for one in fielded)}", None))
     slowest = max(fielded, key=lambda one: one.seconds)
     samples = len(slowest.known.samples.poses)
     tets = slowest.subject.model.mesh.tet_count

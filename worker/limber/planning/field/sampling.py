@@ -16,9 +16,11 @@ import numpy as np
 from limber.errors import WorkError
 from limber.jobs import run_tasks
 from limber.mechanics import StaticResult
-from limber.mechanics.status import Status
+from limber.planning.field.between import ask_between
+from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import GraspSamples
-from limber.planning.field.grasp_model import GraspModel, Reach, refusal
+from limber.planning.field.grasp_model import GraspModel, Reach
+from limber.planning.field.solved import Solved, samples_of, taken
 from limber.planning.field.valley import Valley, walk_valley
 from limber.planning.settings import EnergySettings
 from limber.progress import SILENT, Progress
@@ -31,38 +33,9 @@ _SHARE_POSES = 40
 """Poses of one tree. How many trees there are must not depend on how many processes work on
 them, nor what they find."""
 _SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """What is kept of a solution."""
-
-    target: int
-    pose: np.ndarray
-    energy: float
-    force: np.ndarray
-    tip: np.ndarray
-    min_det_f: float
-    trouble: Status | None
-    targets: np.ndarray
-    torque: np.ndarray
-    strain: float
-    strain_place: np.ndarray
-    stress: float
-    shape_slopes: np.ndarray
-    axial_force: float
-
-
-def _taken(grasp_model: GraspModel, result: StaticResult, target: int) -> _Solved:
-    moved, at_rest = result.displacement, result is grasp_model.rest
-    strain, place, stress = grasp_model.peak_load(moved)
-    force = np.zeros(3) if at_rest else result.reaction_force
-    return _Solved(
-        target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
-        force, grasp_model.tip(moved),
-        float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
-        np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
-        grasp_model.shape_slopes(moved), grasp_model.axial_force(moved, force))
+_BETWEEN = 0.75  # places asked between neighbours that do not agree, for each sample, at most
+TWO_SHAPES = "two shapes"
+"""Among the reasons for which poses are refused: which of two shapes it is depends on the way."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +44,14 @@ class Sampled:
 
     Attributes:
         samples: Those to fit to, the rest pose first.
+        displacements: Of all nodes at those [m], shape [node_count, 3] each.
         valley: The shell that they follow.
         reasons: How many poses were rejected for which reason.
         taut_count: How many were left out as taut.
     """
 
     samples: GraspSamples
+    displacements: list[np.ndarray]
     valley: Valley
     reasons: dict[str, int]
     taut_count: int
@@ -84,7 +59,8 @@ class Sampled:
 
 def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: int | None = None,
                  progress: Progress = SILENT) -> Sampled:
-    """Solve the branch at ``settings.samples`` poses spread over where its grasp may be taken.
+    """Solve the branch at ``settings.samples`` poses spread over where its grasp may be taken, and
+    between neighbours that do not agree (:mod:`limber.planning.field.between`).
 
     Raises:
         WorkError: the grasp has hardly any room. ConvergenceError: the branch has no rest state.
@@ -95,11 +71,19 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
     targets = sample_positions(
         grasp_model.reach, grasp_model.rest_position, max(settings.samples - len(walked), 1),
         valley, deflection=settings.deflection, seed=settings.seed)
-    samples, reasons = sample_branch(grasp_model, targets, walked, workers=workers,
-                                     progress=progress.part(0.1, 1.0))
+    good, bad = solve_branch(grasp_model, targets, walked, workers=workers,
+                             progress=progress.part(0.1, 0.7))
     drawn = max((float(np.linalg.norm(state.reaction_force)) for state in walked), default=0.0)
-    samples, taut_count = without_taut(samples, drawn)
-    return Sampled(samples, valley, reasons, taut_count)
+    slack = _slack(np.array([np.linalg.norm(one.force) for one in good]), drawn)
+    good = [one for one, kept in zip(good, slack, strict=True) if kept]
+    chart = Chart.about(valley.pivot, valley.radius, grasp_model.rest_position)
+    added, torn = ask_between(grasp_model, good, chart, round(_BETWEEN * settings.samples),
+                              workers=workers, progress=progress.part(0.7, 1.0))
+    good += added
+    reasons = _counted(bad) | ({TWO_SHAPES: len(torn)} if len(torn) else {})
+    samples = samples_of(good, np.concatenate([_asked(bad, targets), torn]))
+    return Sampled(samples, [one.displacement for one in good], valley, reasons,
+                   int((~slack).sum()))
 
 
 def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley, *,
@@ -155,46 +139,47 @@ def sample_branch(grasp_model: GraspModel, targets: np.ndarray,
     Returns:
         The accepted samples, the rest pose first; and how many were rejected for which reason.
     """
+    good, bad = solve_branch(grasp_model, targets, known, workers=workers, progress=progress)
+    return samples_of(good, _asked(bad, targets)), _counted(bad)
+
+
+def solve_branch(grasp_model: GraspModel, targets: np.ndarray,
+                 known: Sequence[StaticResult] = (), *, workers: int | None = None,
+                 progress: Progress = SILENT) -> tuple[list[Solved], list[Solved]]:
+    """Return accepted solutions, the rest state first, then ``known`` ones, and refused ones."""
     # Slabs of space: in each a tree of its own out of the rest state.
     share_count = max(2, -(-len(targets) // _SHARE_POSES))
     shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), share_count)
     found = run_tasks(_solve_share, [(grasp_model, targets[share], share) for share in shares],
                       workers=workers, progress=progress, message="solving grasp poses")
-    solved = [one for share in found for one in share]
-    at_rest = _taken(grasp_model, grasp_model.rest, -1)
-    good = [at_rest, *(_taken(grasp_model, state, -1) for state in known),
-            *sorted((s for s in solved if not s.trouble), key=lambda s: s.target)]
-    bad = sorted((s for s in solved if s.trouble), key=lambda s: s.target)
-    reasons = [s.trouble for s in bad]
-    rejected = np.zeros((len(bad), 6))
-    rejected[:, :3] = targets[[s.target for s in bad]] if bad else 0.0
-    samples = GraspSamples(
-        poses=np.array([s.pose for s in good]), energies=np.array([s.energy for s in good]),
-        forces=np.array([s.force for s in good]),
-        tips=np.array([s.tip for s in good]), min_det_f=np.array([s.min_det_f for s in good]),
-        rejected_poses=rejected, strains=np.array([s.strain for s in good]),
-        targets=np.array([s.targets for s in good]),
-        torques=np.array([s.torque for s in good]),
-        strain_places=np.array([s.strain_place for s in good]),
-        stresses=np.array([s.stress for s in good]),
-        shape_slopes=np.array([s.shape_slopes for s in good]),
-        axial_forces=np.array([s.axial_force for s in good]))
-    return samples, {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
+    solved = sorted((one for share in found for one in share), key=lambda s: s.target)
+    good = [taken(grasp_model, grasp_model.rest), *(taken(grasp_model, state) for state in known),
+            *(one for one in solved if not one.trouble)]
+    return good, [one for one in solved if one.trouble]
+
+
+def _asked(bad: list[Solved], targets: np.ndarray) -> np.ndarray:
+    return targets[[one.target for one in bad]] if bad else np.empty((0, 3))
+
+
+def _counted(bad: list[Solved]) -> dict[str, int]:
+    reasons = [one.trouble for one in bad]
+    return {str(reason): reasons.count(reason) for reason in sorted(set(reasons))}
 
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
-                report: Callable[[int], None]) -> list[_Solved]:
+                report: Callable[[int], None]) -> list[Solved]:
     """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their names.
 
     A pose that cannot be reached from there is tried again at the end, from other sides.
     """
     positions = [grasp_model.rest_position]
     states = [grasp_model.rest.displacement]
-    solved: list[_Solved] = []
+    solved: list[Solved] = []
 
-    def attempt(target: int, source: int) -> _Solved:
+    def attempt(target: int, source: int) -> Solved:
         result = grasp_model.follow(targets[target][None], states[source])[0]
-        found = _taken(grasp_model, result, int(numbers[target]))
+        found = taken(grasp_model, result, int(numbers[target]))
         if not found.trouble:
             positions.append(targets[target])
             states.append(result.displacement)
@@ -246,7 +231,7 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray,
 
 
 def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
-                 progress: Progress = SILENT) -> list[_Solved]:
+                 progress: Progress = SILENT) -> list[Solved]:
     def report(done: int) -> None:
         progress(done / len(targets), "solving grasp poses", solved=done)
     return _solve_tree(grasp_model, targets, numbers, report)
@@ -260,10 +245,14 @@ def without_taut(samples: GraspSamples, drawn: float = 0.0) -> tuple[GraspSample
     goes there: poses over twice the median force stay out, and so out of the trusted region; but
     none that takes no more than ``drawn`` [N], the force that the branch was drawn outward with.
     """
-    size = np.linalg.norm(samples.forces, axis=1)
-    slack = size <= max(_TAUT * np.median(size), drawn * (1.0 + 1e-9))
-    slack[0] = True
+    slack = _slack(np.linalg.norm(samples.forces, axis=1), drawn)
     return samples.take(np.flatnonzero(slack)), int((~slack).sum())
+
+
+def _slack(forces: np.ndarray, drawn: float) -> np.ndarray:
+    slack = forces <= max(_TAUT * np.median(forces), drawn * (1.0 + 1e-9))
+    slack[0] = True
+    return slack
 
 
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:

@@ -1,0 +1,68 @@
+"""What is kept of the branch's state at one grasp position, and samples made of such states."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from limber.mechanics import StaticResult
+from limber.mechanics.status import Status
+from limber.planning.field.energy_field import GraspSamples
+from limber.planning.field.grasp_model import GraspModel, refusal
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A solution; ``target`` is the number of the position that was asked, -1: none was.
+
+    The others as in :class:`~.energy_field.GraspSamples`, of one sample; ``trouble`` is why it
+    cannot be believed, ``displacement`` [node_count, 3] that of all nodes [m].
+    """
+
+    target: int
+    pose: np.ndarray
+    energy: float
+    force: np.ndarray
+    tip: np.ndarray
+    min_det_f: float
+    trouble: Status | None
+    targets: np.ndarray
+    torque: np.ndarray
+    strain: float
+    strain_place: np.ndarray
+    stress: float
+    shape_slopes: np.ndarray
+    axial_force: float
+    displacement: np.ndarray
+
+    @property
+    def shape(self) -> np.ndarray:
+        """Natural rotation [rad], tip and targets [m] in one row, [6 + 3 targets]."""
+        return np.concatenate([self.pose[3:], self.tip, self.targets.ravel()])
+
+
+def taken(grasp_model: GraspModel, result: StaticResult, target: int = -1) -> Solved:
+    """Return what a solution says."""
+    moved, at_rest = result.displacement, result is grasp_model.rest
+    strain, place, stress = grasp_model.peak_load(moved)
+    force = np.zeros(3) if at_rest else result.reaction_force
+    return Solved(
+        target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
+        force, grasp_model.tip(moved),
+        float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
+        np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
+        grasp_model.shape_slopes(moved), grasp_model.axial_force(moved, force), moved)
+
+
+def samples_of(good: Sequence[Solved], rejected: np.ndarray) -> GraspSamples:
+    """Return samples of solutions, the rest state first; ``rejected`` positions [m], [q, 3]."""
+    def column(name: str) -> np.ndarray:
+        return np.array([getattr(one, name) for one in good])
+
+    return GraspSamples(
+        poses=column("pose"), energies=column("energy"), forces=column("force"),
+        tips=column("tip"), min_det_f=column("min_det_f"),
+        rejected_poses=np.hstack([rejected, np.zeros_like(rejected)]), strains=column("strain"),
+        targets=column("targets"), torques=column("torque"),
+        strain_places=column("strain_place"), stresses=column("stress"),
+        shape_slopes=column("shape_slopes"), axial_forces=column("axial_force"))
