@@ -188,12 +188,12 @@ def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
 
 def _about_goal(problem: GentleProblem, grid: _Grid, ground: Terrain,
                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]:
-    """Return cells on and about the goal, a signed length there, cells inside it, its error [m].
+    """Return cells on and about the goal, a signed cost there, cells inside it, its error.
 
-    Every point of the goal lies in a cell that has all its coefficients among the known ones;
-    there the spline of the length is at most the error (a spline whose coefficients are a
-    function's values differs from it by ``h^2 / 8 sum_i max |second derivative|``). Last: whether
-    any open cell may have a point of the goal.
+    The cost is that of the way left, below 0 inside. Every point of the goal lies in a cell that
+    has all its coefficients among the known ones; there the spline of the cost is at most the error
+    (a spline whose coefficients are a function's values differs from it by ``h^2 / 8 sum_i
+    max |second derivative|``). Last: whether any open cell may have a point of the goal.
     """
     h = ground.spacing
     cells = np.argwhere(ground.active)
@@ -203,17 +203,33 @@ def _about_goal(problem: GentleProblem, grid: _Grid, ground: Terrain,
                        - problem.goal.tolerance)
     filled = np.nan_to_num(distance, nan=np.inf)
     growth = _growth(distance, np.abs(filled) <= 4.0 * h, h)
-    length = distance / growth
+    cost = _way_left(distance / growth, problem.goal.tolerance / growth, ground)
     curved = CURVATURE_FACTOR / 8.0 * sum(
-        maximum_filter(second, 3) for second in second_differences(length))
+        maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * h * np.sqrt(3.0)
     touching = ground.open_cells & (filled <= growth * half)
     known = filled <= growth * 3.0 * half
     inside = filled < -growth * half
     border = touching & ~inside
     slack = float(curved[border].max()) if border.any() else 0.0
-    return (known, np.nan_to_num(np.maximum(length, -2.0 * h)), inside, slack,
-            bool(touching.any()))
+    return known, np.nan_to_num(cost), inside, slack, bool(touching.any())
+
+
+def _way_left(length: np.ndarray, depth: float, ground: Terrain) -> np.ndarray:
+    """Return what a ``length`` [m] to the goal costs, at the rate half-way; nan where not known.
+
+    One rate for all sides of the goal would be the least of them. Inside, where nothing is asked,
+    the length flattens out to a goal's middle ``depth`` [m] below its outside: it has no tip there.
+    """
+    h = ground.spacing
+    flat = np.maximum(length, -depth)
+    flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
+    rate = np.sqrt(corner_values(ground.rate_squared).mean(axis=0))
+    rate = np.where(ground.level, np.sqrt(ground.floor_squared), rate)
+    growing = sum(np.gradient(rate, h, axis=axis) * np.gradient(length, h, axis=axis)
+                  for axis in range(3))
+    half_way = rate - 0.5 * length * np.nan_to_num(growing)
+    return flat * np.where(length > 0.0, np.clip(half_way, 0.5 * rate, 1.5 * rate), rate)
 
 
 def _growth(distance: np.ndarray, near: np.ndarray, h: float) -> float:

@@ -33,8 +33,8 @@ from limber.planning.bound.marching import march
 CURVATURE_FACTOR = 2.0
 """What second differences at a cell's corners are multiplied by to bound derivatives inside."""
 
-_ROUNDS = 4  # of local reweighting; stops before when nothing is over by more than _CLOSE
-_CLOSE = 1.002
+_ROUNDS = 8  # of local reweighting; stops before when nothing is over by more than _CLOSE
+_CLOSE = 1.0005
 _NEAR = np.ones((3, 3, 3))
 
 

@@ -27,7 +27,7 @@ from limber.progress import SILENT, Progress
 _RANGE = (1e-2, 1e3)  # of the weight of a metre, times that which was given
 _STEPS = 8  # of the search for the weight
 _CLOSE = 2e-3  # of the length limit: near enough below it
-_ENOUGH = 0.002  # gap of the weighed cost: of the energy, which is a part of it, it is more
+_ENOUGH = 0.001  # gap of the weighed cost: of the energy, a part of it, it is five to ten times
 _MOST_BOUNDS = 3
 _NEAR = 0.01  # of the energy: a bound so near needs no other
 _ROUGH = 0.03  # gap of the weighed cost above which a dearer metre tells more
