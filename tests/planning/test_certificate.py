@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from limber.errors import NoPathError
+from limber.errors import Cancelled, NoPathError
 from limber.planning.bound import certificate
 from limber.planning.bound.certificate import certify
 from limber.planning.compare import plan_pair
@@ -20,6 +20,7 @@ from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
 from limber.planning.regions import Ball
 from limber.planning.settings import PlanSettings
+from limber.progress import Progress
 
 START = np.array([-0.06, -0.03, 0.02])
 GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)
@@ -90,6 +91,22 @@ def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across,
         assert (slope > 0.9 * rate).mean() > 0.3  # and not for being far below
         checked += len(cells)
     assert checked >= 6000
+
+
+def test_cancelled_once_a_path_is_known_what_there_is_counts(across):
+    """The bound of the grids so far, below the path; before any path a cancel ends it."""
+    problem, found = across
+
+    def cut(_fraction, _message, numbers):
+        if numbers["upper"] < np.inf:
+            progress.cancel()
+
+    progress = Progress(cut)
+    early = certify(problem, lambda _path: found.cost, enough=0.0, progress=progress)
+    assert early.stopped and len(early.levels) < len(found.certificate.levels) + 1
+    assert 0.0 < early.lower <= found.certificate.lower < early.upper == found.cost
+    with pytest.raises(Cancelled):
+        certify(problem, lambda _path: found.cost, progress=progress)
 
 
 def _spline_slope(u, cells, place):

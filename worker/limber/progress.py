@@ -71,6 +71,10 @@ class Progress:
     def _with_warnings(self, on_warning: Callable[[str], None]) -> "Progress":
         return Progress(self._sink, on_warning, _span=self._span, _stop=self._stop)
 
+    def to_the_end(self) -> "Progress":
+        """Return the same progress of work that is finished though it was cancelled."""
+        return Progress(self._sink, self._on_warning, _span=self._span)
+
     def cancel(self) -> None:
         """Make the next report, from any thread, raise ``Cancelled``."""
         self._stop.set()

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from limber.errors import InputError, NoPathError
+from limber.errors import Cancelled, InputError, NoPathError
 from limber.planning.chance import YoungDoubt
 from limber.planning.compare import (
     PathPair,
@@ -78,7 +78,11 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     gentlest; the last of those is passed on with a warning. And so is a motion that breaks a limit
     by the branch's inertia, however slow it was tried.
 
+    Cancelled (or by Ctrl-C) while the bound closes, it takes the best path so far, which is checked
+    as any other; ``stopped`` in the summary says so.
+
     Raises:
+        Cancelled: before there was a path, or the best so far breaks a limit.
         InputError: the start is not allowed, or two goals are given.
         NoPathError: no path, or none that keeps the limits on the full model; says why and where.
         ConvergenceError: the branch cannot be solved along the shortest path.
@@ -100,6 +104,9 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         before, pair = pair, plan_within(field, start, goal, settings, planned_limits,
                                          before=pair, progress=ahead.part(0.0, 0.3))
         planned = perf_counter()
+        stopped = pair.certificate.stopped
+        if stopped:  # the best so far is checked all the same: else it could not be kept
+            ahead, progress = ahead.to_the_end(), progress.to_the_end()
         ahead(0.3, "both paths on the full model")
         # The shortest path rarely changes with what was learnt: it is solved once.
         same = before is not None and np.array_equal(before.baseline.points, pair.baseline.points)
@@ -114,7 +121,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             planned_limits = planned_limits.tightened(
                 {name: _RESERVE * share for name, share in risks[-1].excess.items() if share > 1.0})
         off = field_error(field, plan.solved)
-        is_last = number == settings.replans
+        is_last = stopped or number == settings.replans
         is_near = is_last or off <= settings.field_error / 100.0
         if settings.inertia and not broken and is_near and limits.asked():
             moving = check_motion(
@@ -128,12 +135,16 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
                        "plan_seconds": planned - began, "check_seconds": perf_counter() - planned})
         if not broken and is_near:
             break
+        if stopped:
+            raise Cancelled("The search was stopped.", f"The best path so far is none: "
+                            f"{'; '.join(broken)}.", "Run it again when there is time for it.")
         if is_last:
             raise _refused(broken, settings)
         field = refit(field, learnt(field, grasp_model, plan, limits))
     _require_sight(goal, grasp_model, plan)
     summary = _summary(field, goal, start, pair, baseline.require(), plan, settings)
     summary["rounds"] = rounds
+    summary["stopped"] = stopped
     if isinstance(goal, TargetGoal):
         summary["target_end_m"] = goal.place(plan.solved)
     if risks:

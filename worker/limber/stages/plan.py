@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.errors import BranchFolderError, InputError, NoPathError
+from limber.errors import BranchFolderError, Cancelled, InputError, NoPathError
 from limber.files import file_digest
 from limber.plain import plain
 from limber.planning.settings import PlanSettings
@@ -69,6 +69,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         BranchFolderError: no energy field, or one of another geometry or material.
         InputError: a name that is none, a start that is not allowed, or two goals.
         NoPathError: no path; the message says why.
+        Cancelled: the best so far was kept, where there was one and no finished plan of the name.
     """
     from limber.planning.field.energy_field import EnergyField
     from limber.planning.field.sampling import energy_inputs
@@ -109,8 +110,10 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
     inputs = {"reads": ["energy.npz"], "digests": digests}
-    if not force and branch.is_current(key, settings, **inputs):
-        return branch.manifest.stages[key].result
+    earlier = branch.manifest.stages.get(key)
+    finished = earlier is not None and not earlier.result.get("stopped")
+    if not force and finished and branch.is_current(key, settings, **inputs):
+        return earlier.result
     if in_cell is not None:
         in_cell.check_goal(settings)
     with branch.stage(key, settings, **inputs) as stage:
@@ -122,6 +125,11 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         found = plan_motion(field, grasp_model, settings, limits=limits,
                             region=in_cell and in_cell.region, doubt=doubt, pace=pace,
                             workers=workers, progress=progress)
+        if found.summary["stopped"]:
+            progress = progress.to_the_end()
+        if found.summary["stopped"] and finished:
+            raise Cancelled("The search was stopped.", f"The finished plan {name} is kept.",
+                            "Run it again when there is time for it.")
         pace = found.pace
         motion = whole_motion(found.plan, tuple(t.name for t in grasp_model.branch.targets), pace)
         if in_cell is not None:
@@ -137,8 +145,16 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
                                                              encoding="utf-8")
         _write(stage, name, limits, pace, motion, grasp_model, found)
         stage.result.update(found.summary)
+    result = branch.manifest.stages[key].result
+    if result["stopped"]:
+        gap = result["certificate"]["gap_percent"]
+        near = "how far above the best possible is not known" if gap is None else (
+            f"at most {gap:.2g} % above the best possible")
+        raise Cancelled("The search was stopped.",
+                        f"Its best path so far ({near}), checked on the full model, is plan "
+                        f"{name}.", "Run it again to have the bound closed.")
     progress(1.0, "planned")
-    return branch.manifest.stages[key].result
+    return result
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from time import perf_counter
 import numpy as np
 from scipy.ndimage import binary_dilation, label, maximum_filter
 
-from limber.errors import NoPathError
+from limber.errors import Cancelled, NoPathError
 from limber.planning.bound.subsolution import (
     CURVATURE_FACTOR,
     Terrain,
@@ -56,6 +56,7 @@ class Certificate:
         levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
         field_error_j: What was subtracted from the energy before bounding [J].
         to_go: The bound from anywhere, on the first grid.
+        stopped: It was cancelled before it was close enough.
     """
 
     lower: float
@@ -63,6 +64,7 @@ class Certificate:
     levels: list[dict[str, float]] = field(default_factory=list)
     field_error_j: float = 0.0
     to_go: CostToGo | None = None
+    stopped: bool = False
 
     @property
     def gap(self) -> float:
@@ -110,29 +112,36 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
             progress: Progress = SILENT) -> Certificate:
     """Return a lower bound on the cost of every path, refined until it is close to the known one.
 
+    Cancelled (or by Ctrl-C) once a path is known, it returns what there is.
+
     Raises:
         NoPathError: closed cells separate start and goal; it is proven that no path exists.
     """
     grid, cell = _first_grid(problem)
-    lower, upper, levels, to_go = 0.0, np.inf, [], None
+    lower, upper, levels, to_go, stopped = 0.0, np.inf, [], None, False
     began = perf_counter()
-    for level in range(_LEVELS):
-        progress(level / _LEVELS, "bounding the best path", lower=lower, upper=upper)
-        found = _bound(problem, grid, cell)
-        if level == 0:
-            to_go = found.to_go(grid)
-            upper = improve(None)  # after the first bound, which may prove that there is no path
-        upper = min(upper, improve(found.rough_path))
-        lower = max(lower, min(found.lower, upper))
-        levels.append({"spacing_m": grid.spacing, "open_cells": int(found.open_cells.sum()),
-                       "lower": lower, "upper": upper, "seconds": perf_counter() - began})
-        if upper <= (1.0 + enough) * lower:
-            break
-        keep = found.keep(upper)
-        if _CHILDREN * keep.sum() > _MOST_CELLS:
-            break
-        grid, cell = _refined(grid, keep, cell)
-    return Certificate(lower, upper, levels, problem.field_error, to_go)
+    try:
+        for level in range(_LEVELS):
+            progress(level / _LEVELS, "bounding the best path", lower=lower, upper=upper)
+            found = _bound(problem, grid, cell)
+            if level == 0:
+                to_go = found.to_go(grid)
+                upper = improve(None)  # after the first bound, which may prove that there is none
+            upper = min(upper, improve(found.rough_path))
+            lower = max(lower, min(found.lower, upper))
+            levels.append({"spacing_m": grid.spacing, "open_cells": int(found.open_cells.sum()),
+                           "lower": lower, "upper": upper, "seconds": perf_counter() - began})
+            if upper <= (1.0 + enough) * lower:
+                break
+            keep = found.keep(upper)
+            if _CHILDREN * keep.sum() > _MOST_CELLS:
+                break
+            grid, cell = _refined(grid, keep, cell)
+    except (Cancelled, KeyboardInterrupt) as stop:
+        if not (levels and upper < np.inf):
+            raise Cancelled from stop
+        stopped = True
+    return Certificate(lower, upper, levels, problem.field_error, to_go, stopped)
 
 
 @dataclass(frozen=True)

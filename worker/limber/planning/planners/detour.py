@@ -98,8 +98,9 @@ def plan_detour(problem: GentleProblem, shortest: np.ndarray, max_detour: float,
         weight = bounds.ask(weight, part)
         if weight is None:
             break
-    progress(0.95, "just short enough")
-    return search.result(bounds.best, bounds.best_weight, float(least))
+    if not bounds.stopped:
+        progress(0.95, "just short enough")
+    return search.result(bounds.best, bounds.best_weight, float(least), bounds.stopped)
 
 
 class _Bounds:
@@ -110,11 +111,13 @@ class _Bounds:
         self.best: GentlePath | None = None
         self.best_weight, self.value = np.nan, -np.inf
         self.low, self.high = 0.0, np.inf
+        self.stopped = False
 
     def ask(self, weight: float, progress: Progress) -> float | None:
         """Bound at a weight; returns the next one, None where none is worth its time."""
         search, weighed = self.search, _weighed(self.problem, weight)
         found = plan_gentle(weighed, [search.short_path], enough=_ENOUGH, progress=progress)
+        self.stopped = found.certificate.stopped
         search.add(weight, found.points, found.certificate.lower)
         last = search.curve[-1]
         value = last.lower_bound_jm - last.metre_jm * search.longest
@@ -122,7 +125,7 @@ class _Bounds:
             self.best, self.best_weight, self.value = found, weight, value
         if last.length_m > search.longest:
             search.long_path = found.points
-        if value >= (1.0 - _NEAR) * search.gentlest_short(found.points):
+        if self.stopped or value >= (1.0 - _NEAR) * search.gentlest_short(found.points):
             return None
         spare = last.metre_jm * (search.longest - last.length_m)
         unsure = found.cost / self.problem.weights.energy - last.lower_bound_jm
@@ -200,13 +203,15 @@ class _Search:
         self.short_path = known[number]
         return integral
 
-    def result(self, found: GentlePath, weight: float, shortest: float) -> DetourPath:
+    def result(self, found: GentlePath, weight: float, shortest: float, stopped: bool,
+               ) -> DetourPath:
         """Return the gentlest of the short enough paths that are known, and the best bound."""
         bounds = [p.lower_bound_jm - p.metre_jm * self.longest for p in self.curve
                   if p.lower_bound_jm is not None]
         integral = self.gentlest_short()
         cost = _weighed(self.problem, weight).cost(self.short_path)
-        found = GentlePath(self.short_path, cost, replace(found.certificate, upper=cost))
+        found = GentlePath(self.short_path, cost, replace(found.certificate, upper=cost,
+                                                                    stopped=stopped))
         return DetourPath(found, weight, shortest, self.longest, integral, max(bounds),
                           tuple(sorted(self.curve, key=lambda point: point.weight)))
 
