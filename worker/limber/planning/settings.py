@@ -11,10 +11,14 @@ class EnergySettings(Settings):
     """How the energy field is sampled."""
 
     groups: ClassVar[Groups] = {
-        "samples": ("samples", "deflection", "seed"),
+        "samples": ("samples", "field_error", "deflection", "seed"),
         "material": ("gravity",),
     }
-    samples: int = Field(150, ge=30, description="Grasp positions to solve.")
+    samples: int = Field(150, ge=30, description=(
+        "Grasp positions to solve; some more are, where neighbours do not agree."))
+    field_error: float | None = Field(None, gt=0, description=(
+        "Percent that the energy may be off at samples left out of the fit (root mean square over "
+        "theirs): more poses are solved where it is off most, up to four times --samples."))
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
         "Largest distance from rest, as a share of the branch's length up to the grasp."))
     gravity: bool = Field(True, description=(

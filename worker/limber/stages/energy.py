@@ -11,6 +11,8 @@ from limber.stages.inputs import BranchInputs, ParallelOptions
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
+_MOST_TIMES = 4  # the samples asked for, that --field-error may take
+
 
 def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int | None = None,
                         force: bool = False, progress: Progress = SILENT) -> dict[str, Any]:
@@ -21,6 +23,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         WorkError: too few poses could be solved.
     """
     from limber.planning.field.energy_field import fit_field
+    from limber.planning.field.refining import refined
     from limber.planning.field.sampling import energy_inputs, sample_field
     from limber.stages.loading import load_grasp_model
 
@@ -32,10 +35,20 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
     with branch.stage("energy", settings, digests=digests) as stage:
         progress(0.0, "rest state")
         sampled = sample_field(grasp_model, settings, workers=workers,
-                               progress=progress.part(0.02, 0.9))
+                               progress=progress.part(0.02, 0.7))
+        field = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius,
+                          progress=progress.part(0.7, 0.8))
+        if settings.field_error is not None:
+            sampled, field = refined(grasp_model, sampled, field, settings.field_error / 100.0,
+                                     _MOST_TIMES * settings.samples, workers=workers,
+                                     progress=progress.part(0.8, 1.0))
+            off = 100.0 * field.errors["energy_error"]
+            if off > settings.field_error:
+                progress.warn(
+                    f"The energy field is off by {off:.2g} %, over the {settings.field_error:g} % "
+                    f"of --field-error, with {len(field.samples.poses)} poses: ask for more "
+                    "--samples, or a smaller --deflection.")
         samples, reasons = sampled.samples, sampled.reasons
-        field = fit_field(samples, sampled.valley.pivot, sampled.valley.radius,
-                          progress=progress.part(0.9, 1.0))
         rejected = len(samples.rejected_poses)
         if rejected > 0.2 * settings.samples:
             progress.warn(f"{rejected} of {settings.samples} poses were rejected ({reasons}); "
