@@ -185,6 +185,27 @@ def default_goal(field: EnergyField, tolerance: float) -> GraspGoal:
                       "Sample more poses with `limber energy --samples`, or name a --goal.")
 
 
+def hemisphere_goal(field: EnergyField, base: np.ndarray, length: float, limits: FieldArrays,
+                    tolerance: float, seed: int) -> GraspGoal:
+    """Return a goal as the paper draws its candidates: evenly from the half ball above the branch's
+    ``base`` [m] with its ``length`` [m] as radius; of those, one that the field knows, that keeps
+    the limits and lies at least half the largest deflection away from rest.
+
+    Raises:
+        NoPathError: no such pose was found.
+    """
+    points = field.region.draw(4000, np.random.default_rng([seed, 13]))
+    half = 0.5 * float(np.linalg.norm(field.samples.positions - field.rest, axis=1).max())
+    fit = (np.linalg.norm(points - base, axis=1) <= length) & (points[:, 2] >= base[2])
+    fit &= np.linalg.norm(points - field.rest, axis=1) >= half
+    fit &= allowed_points(points, limits)
+    if not fit.any():
+        raise NoPathError("No pose of the hemisphere lies far from rest and keeps the limits.",
+                          f"Far is {half:.3f} m; the hemisphere's radius is {length:.3f} m.",
+                          "Give a --goal, or relax the limits.")
+    return GraspGoal(tuple(map(float, points[np.flatnonzero(fit)[0]])), tolerance)
+
+
 def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     points = field.region.draw(2000, np.random.default_rng(seed))
     distance = goal.distance(field, points)

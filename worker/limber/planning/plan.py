@@ -16,6 +16,7 @@ from limber.planning.compare import (
     PathPair,
     PlanSettings,
     chosen_engine,
+    limits_of,
     plan_within,
     random_start,
 )
@@ -24,7 +25,7 @@ from limber.planning.field.energy_field import EnergyField, among_obstacles, ref
 from limber.planning.field.grasp_model import GraspModel
 from limber.planning.field.sampling import displacements_at
 from limber.planning.full_check import broken_on_full_model, field_error, learnt
-from limber.planning.goals import Goal, GraspGoal, TargetGoal, default_goal
+from limber.planning.goals import Goal, GraspGoal, TargetGoal, default_goal, hemisphere_goal
 from limber.planning.limits import Limits
 from limber.planning.motion_check import check_motion
 from limber.planning.planners.tree_search import SearchTree
@@ -193,17 +194,21 @@ def _goal(field: EnergyField, grasp_model: GraspModel, settings: PlanSettings,
           cells: Region | None) -> Goal:
     given = {"--goal": settings.goal, "--tip-goal": settings.tip_goal,
              "--target-box": settings.target_box, "--in-view": settings.in_view or None,
-             "--second-arm": settings.second_arm or None}
+             "--second-arm": settings.second_arm or None, "--goal-seed": settings.goal_seed}
     asked = [name for name, value in given.items() if value is not None]
     if len(asked) > 1:
         raise InputError(f"{' and '.join(asked)} are given.", "A path ends in one goal.",
                          "Give one of them.")
-    if settings.target is not None and asked in ([], ["--goal"]):
+    if settings.target is not None and asked in ([], ["--goal"], ["--goal-seed"]):
         raise InputError(f"--target {settings.target} is given without a place for it.",
                          "A target alone says not where it shall be.",
                          "Give --tip-goal, --target-box, --in-view or --second-arm as well.")
     if settings.goal is not None:
         return GraspGoal(settings.goal, settings.goal_tolerance)
+    if settings.goal_seed is not None:
+        reach = grasp_model.reach
+        return hemisphere_goal(field, reach.base, reach.arc_length, limits_of(field, settings),
+                               settings.goal_tolerance, settings.goal_seed)
     if not asked:
         return default_goal(field, settings.goal_tolerance)
     if settings.tip_goal is not None:
@@ -308,7 +313,7 @@ def _on_full_model(field: EnergyField, pair: PathPair, found: PathMeasures) -> d
 
 def _is_chosen(settings: PlanSettings) -> bool:
     return not (settings.goal or settings.tip_goal or settings.target_box or settings.in_view
-                or settings.second_arm)
+                or settings.second_arm or settings.goal_seed is not None)
 
 
 def _checked(field: EnergyField, path: ResolvedPath) -> dict[str, Any]:

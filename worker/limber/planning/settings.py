@@ -31,7 +31,7 @@ class PlanSettings(Settings):
 
     groups: ClassVar[Groups] = {
         "start and goal": ("goal", "tip_goal", "target", "target_box", "in_view", "second_arm",
-                           "goal_tolerance", "start", "start_seed"),
+                           "goal_seed", "goal_tolerance", "start", "start_seed"),
         "weights and limits": ("deformation_weight", "distance_weight", "max_detour", "max_energy",
                                "max_force", "max_axial_force", "max_torque", "max_strain",
                                "wood", "max_stress", "workspace_low", "workspace_high",
@@ -39,7 +39,8 @@ class PlanSettings(Settings):
         "timing": ("speed", "acceleration", "inertia", "slowings"),
         "solver": ("planner", "iterations", "engine", "field_error", "replans", "seed"),
     }
-    experts = ("start_seed", "iterations", "engine", "replans", "field_error", "slowings")
+    experts = ("goal_seed", "start_seed", "iterations", "engine", "replans", "field_error",
+               "slowings")
 
     goal: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp shall be, in the branch's frame [m]; without any goal a far pose is "
@@ -56,6 +57,9 @@ class PlanSettings(Settings):
         "not hidden by the branch."))
     second_arm: bool = Field(False, description=(
         "The target shall be where the cell's second arm can take it."))
+    goal_seed: int | None = Field(None, ge=0, description=(
+        "A grasp pose drawn at random from the paper's hemisphere, above the base and as far as "
+        "the branch is long, among those known, allowed and far from rest."))
     goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp starts [m]; default the rest pose."))
