@@ -6,18 +6,23 @@ import numpy as np
 
 from benchmarks.planning_branches import Subject
 from benchmarks.table import Row
-from limber.errors import LimberError
+from limber.errors import LimberError, NoPathError
 from limber.planning.chance import YoungDoubt
-from limber.planning.cost import resample
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.goals import GraspGoal
-from limber.planning.plan import plan_motion
+from limber.planning.limits import Limits
+from limber.planning.plan import PlannedMotion, plan_motion
+from limber.planning.resolve import ResolvedPath, SolvedPoses
 from limber.planning.settings import PlanSettings
 
 CONFIDENCE = 0.95
 _DEVIATION = 0.12  # of log E at each control point: an interval of about -21 to +27 %
 _NEIGHBOUR = -0.4  # correlation of neighbours, as fits have it
 _EVERY = 4  # pose of the motion is asked under each draw, and the one with most force
+_LOW = 0.6  # of the limit: a pose of less force breaks it under no likely draw
+_TIGHT = (0.5, 0.75, 0.9, 1.0)
+"""Where the limit lies between what the goal itself needs and what the motion without limit takes,
+each with the confidence: the first at which there is a plan."""
 
 
 @dataclass
@@ -27,6 +32,7 @@ class Sure:
     Attributes:
         kept: Share of draws, each solved on the full model, that keep the limit.
         before: The same by the risk that the plan for the estimate alone would have run.
+        tight: Of ``_TIGHT``, the limit's.
     """
 
     branch: str
@@ -34,6 +40,7 @@ class Sure:
     source: str = ""
     kept: float | None = None
     before: float | None = None
+    tight: float | None = None
     trouble: str = ""
 
 
@@ -45,17 +52,11 @@ def run_sure(subject: Subject, known: EnergyField, goal: GraspGoal, draws: int, 
     settings = PlanSettings(seed=seed, iterations=500, goal=goal.position,
                             goal_tolerance=goal.tolerance)
     try:
-        free = plan_motion(known, model, settings, workers=1)
-        path = free.plan.solved.poses[:, :3]
-        force = np.linalg.norm(free.field.force(resample(path, 0.002)), axis=1)
-        cap = float(max(1.1 * force.max(), 1.3 * force[-1]))
-        motion = plan_motion(free.field, model, settings.model_copy(update={
-            "max_force": cap, "confidence": CONFIDENCE, "goal": tuple(map(float, path[-1]))}),
-            doubt=doubt, workers=1)
+        motion, cap = _planned(sure, subject, known, doubt, settings)
         sure.before = motion.summary["confidence"]["of_a_plan_for_the_estimate"]
         states = motion.plan.approach.joined(motion.plan.solved)
-        chosen = np.unique([*range(0, len(states.poses), _EVERY), len(states.poses) - 1,
-                            int(states.force_sizes.argmax())])
+        high = np.flatnonzero(states.force_sizes > _LOW * cap)
+        chosen = np.unique([*high[::_EVERY], *high[-1:], int(states.force_sizes.argmax())])
         generator = np.random.default_rng([seed, 5])
         kept = [doubt.solved(model, doubt.draw(generator), states.take(chosen)).force_sizes.max()
                 <= cap for _ in range(draws)]
@@ -63,6 +64,39 @@ def run_sure(subject: Subject, known: EnergyField, goal: GraspGoal, draws: int, 
     except LimberError as error:
         sure.trouble = f"{type(error).__name__}: {error}"
     return sure
+
+
+def _planned(sure: Sure, subject: Subject, known: EnergyField, doubt: YoungDoubt,
+             settings: PlanSettings) -> tuple[PlannedMotion, float]:
+    """Return a plan with confidence under a force limit that binds, and the limit [N].
+
+    Raises:
+        NoPathError: there is none under any of the limits that were tried.
+    """
+    model = subject.model
+    free = plan_motion(known, model, settings, workers=1)
+    states = free.plan.approach.joined(free.plan.solved)
+    likely = _likely_forces(doubt, subject, states)
+    end = tuple(map(float, free.plan.solved.poses[-1, :3]))
+    for tight in _TIGHT:
+        cap = float(max(likely[-1] + tight * (likely.max() - likely[-1]), 1.02 * likely[-1]))
+        sure.tight = tight
+        try:
+            return plan_motion(free.field, model, settings.model_copy(update={
+                "max_force": cap, "confidence": CONFIDENCE, "goal": end}), doubt=doubt,
+                workers=1), cap
+        except NoPathError:
+            if tight == _TIGHT[-1]:
+                raise
+    raise AssertionError("the last limit either has a plan or raises")
+
+
+def _likely_forces(doubt: YoungDoubt, subject: Subject, states: SolvedPoses) -> np.ndarray:
+    """Return the force [N] that each state takes at most with the confidence, shape [n]."""
+    peak = states.force_sizes.max()
+    found = doubt.exposure(subject.model, ResolvedPath(
+        states, states.take(np.arange(1)), np.empty((0, 3)), (), True), Limits(force=2.0 * peak))
+    return states.force_sizes * found.risk(doubt.covariance, CONFIDENCE).factors["force"]
 
 
 def doubt_of(subject: Subject) -> YoungDoubt:
@@ -81,9 +115,12 @@ def sure_rows(found: list[Sure], draws: int) -> list[Row]:
         return [Row(f"limits kept at --confidence {CONFIDENCE}", "90 to 100 %", troubles, False)]
     kept = 100.0 * np.array([one.kept for one in good])
     before = 100.0 * np.array([one.before for one in good])
+    tight = [one.tight for one in good]
     return [Row(
         f"force limit kept at --confidence {CONFIDENCE}, {draws} draws each on the full model, "
-        f"{len(good)} of {len(found)} branches", "90 to 100 %",
+        f"{len(good)} of {len(found)} branches; limit at {100 * min(tight):.0f} to "
+        f"{100 * max(tight):.0f} % of the way from what the goal needs to what the free motion "
+        "takes", "90 to 100 %",
         f"{kept.min():.0f} to {kept.max():.0f} %, mean {kept.mean():.1f}; planned for the estimate "
         f"alone {before.min():.0f} to {before.max():.0f}" + (f"; {troubles}" if troubles else ""),
         bool(kept.min() >= 90.0 and len(good) == len(found)))]
