@@ -12,6 +12,7 @@ from limber.mechanics import simulate_dynamics
 from limber.mechanics.dynamics.motion import EnergyMomentumSettings
 from limber.planning.limits import Limits
 from limber.planning.motion_check import MotionCheck, check_motion
+from limber.planning.obstacles import Box
 from limber.planning.plan_file import read_plan
 from limber.planning.resolve import resolve_path
 from limber.planning.settings import PlanSettings
@@ -80,6 +81,16 @@ def test_what_no_pace_keeps_is_broken_with_its_place(small_model, bent):
     found = check_motion(small_model, bent, limits, Pace(0.1, 1.0), slowings=4, workers=1)
     assert found.slowings == 0 and found.excess["force"] > 1.0
     assert "force in motion" in found.broken[0] and "at (" in found.broken[0]
+
+
+def test_an_obstacle_is_met_in_motion(small_model, bent):
+    """A post where the tip comes to: named with its depth; one that is farther off is not met."""
+    tip = bent.solved.tips[-1]
+    for place, met in ((tip, True), (tip + [0.0, 0.1, 0.0], False)):
+        post = Box("the post", np.full(3, 0.01), place, np.eye(3))
+        found = check_motion(small_model, bent, Limits(obstacles=(post,)), Pace(0.1, 1.0),
+                             slowings=0, workers=1)
+        assert any("inside the post" in words for words in found.broken) == met
 
 
 def test_a_plan_that_inertia_breaks_is_refused(planned_branch, tmp_path, monkeypatch):

@@ -9,12 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import limber.planning.plan as plan_module
 from limber.cli import call
 from limber.errors import BranchFolderError, Cancelled, ConvergenceError, InputError, NoPathError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.planning.compare import PlanSettings
 from limber.planning.field.energy_field import EnergyField, fit_field
-from limber.planning.goals import default_goal
+from limber.planning.goals import default_goal, hemisphere_goal
 from limber.planning.plan import _doubts
 from limber.planning.resolve import resolve_path
 from limber.progress import Progress
@@ -149,9 +150,56 @@ def test_refusals_leave_the_folder_as_it_was(copied):
     assert sorted(p.name for p in copied.rglob("*") if p.name != ".lock") == before
 
 
+def test_stopped_while_the_bound_closes_the_best_so_far_is_kept(copied, monkeypatch):
+    """Checked on the full model as any other; the next run is made, not taken for done. A finished
+    plan of the name stays."""
+    def interrupt(_fraction, message, numbers):
+        if message == "bounding the best path" and numbers["upper"] < np.inf:
+            raise KeyboardInterrupt
+
+    settings = PlanSettings(iterations=100)
+    with pytest.raises(Cancelled, match=r"above the best possible.* is plan early"):
+        plan_paths(copied, settings, name="early", workers=1, progress=Progress(interrupt))
+    early = read_plan(copied, "early")
+    assert early["stopped"] and early["plan"]["unsolved_count"] == 0
+
+    asked = []
+
+    def stopped(*_arguments, **_options):
+        asked.append(True)
+        return SimpleNamespace(summary={"stopped": True})
+
+    monkeypatch.setattr(plan_module, "plan_motion", stopped)
+    before = (copied / "plans/there.json").read_text()
+    with pytest.raises(Cancelled, match="finished plan there is kept"):
+        plan_paths(copied, settings, name="there", workers=1)
+    assert (copied / "plans/there.json").read_text() == before
+    with pytest.raises(AttributeError):  # the stand-in has no paths: it was asked again
+        plan_paths(copied, settings, name="early", workers=1)
+    assert len(asked) == 2
+
+
+def test_a_goal_drawn_from_the_papers_hemisphere(copied):
+    """Above the base, no farther than the branch is long, far from rest, the same for a seed."""
+    field = EnergyField.read(copied / "energy.npz")
+    base, length = np.zeros(3), 0.4
+
+    def drawn(seed, **limits):
+        goal = hemisphere_goal(field, base, length, field.limited(**limits), 0.01, seed)
+        return np.array(goal.position)
+
+    first = drawn(1)
+    assert np.array_equal(first, drawn(1)) and not np.allclose(first, drawn(2))
+    assert np.linalg.norm(first) <= length and first[2] >= 0.0
+    away = np.linalg.norm(field.samples.positions - field.rest, axis=1).max()
+    assert np.linalg.norm(first - field.rest) >= 0.5 * away and field.region.contains(first)[0]
+    with pytest.raises(NoPathError, match="hemisphere"):
+        drawn(1, max_energy=1e-6)
+
+
 def test_limits_hold_on_the_full_model(copied):
     """Caps between those that the ends need and those that the free plan takes hold at every pose
-    of the motion, approach and return included."""
+    of the motion, approach and return included. In time: test_motion_check and test_plan_cell."""
     plan = read_plan(copied)
     caps = {}
     for name, column in (("max_force", "forces_n"), ("max_strain", "strains")):
@@ -161,7 +209,8 @@ def test_limits_hold_on_the_full_model(copied):
         caps[name] = float(max(0.5 * (ends + free.max()), 1.05 * ends))
     for name, column in (("max_stress", "stresses_pa"), ("max_axial_force", "axial_forces_n")):
         caps[name] = 1.02 * float(np.abs(plan["motion"][column]).max())
-    done = plan_paths(copied, PlanSettings(**caps, **QUICK), name="capped", workers=1)
+    done = plan_paths(copied, PlanSettings(**caps, **QUICK, inertia=False), name="capped",
+                      workers=1)
     motion = read_plan(copied, "capped")["motion"]
     assert np.linalg.norm(motion["forces_n"], axis=1).max() <= caps["max_force"]
     assert max(motion["strains"]) <= caps["max_strain"]
