@@ -139,6 +139,13 @@ def test_refusals_leave_the_folder_as_it_was(copied):
         plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
     with pytest.raises(NoPathError, match=r"force is at least .* where 0.01 N is allowed"):
         plan_paths(copied, PlanSettings(max_force=0.01), name="bad")
+    with pytest.raises(NoPathError, match=r"in millimetres\?"):
+        plan_paths(copied, PlanSettings(goal=(20.0, 0.0, 400.0)), name="bad")
+    with pytest.raises(InputError, match=r"in millimetres\?"):
+        plan_paths(copied, PlanSettings(start=(20.0, 0.0, 400.0)), name="bad")
+    with pytest.raises(InputError, match=r"workspace .*in millimetres\?"):
+        plan_paths(copied, PlanSettings(workspace_low=(50.0, -100.0, 0.0),
+                                        workspace_high=(100.0, 100.0, 500.0)), name="bad")
     with pytest.raises(InputError, match="tip-goal"):
         plan_paths(copied, PlanSettings(goal=(0, 0, 1), tip_goal=(0, 0, 1)), name="bad")
     with pytest.raises(InputError, match="outside the sampled region"):

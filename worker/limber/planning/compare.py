@@ -8,7 +8,14 @@ from limber.errors import InputError, NoPathError
 from limber.planning.bound.certificate import Certificate
 from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
-from limber.planning.goals import Goal, GraspGoal, allowed_points, goal_points, over_limits
+from limber.planning.goals import (
+    Goal,
+    GraspGoal,
+    allowed_points,
+    goal_points,
+    over_limits,
+    unit_doubt,
+)
 from limber.planning.limits import UNITS, Limits
 from limber.planning.planners.detour import DetourPath, plan_detour
 from limber.planning.planners.gentle import plan_gentle
@@ -262,7 +269,9 @@ def _check_start(field: EnergyField, start: np.ndarray, limits: FieldArrays) -> 
         return
     place = ", ".join(f"{value:.3f}" for value in start)
     if not field.region.contains(start)[0]:
-        raise InputError(f"The start ({place}) m lies outside the sampled region.",
+        away = float(np.linalg.norm(start - field.rest))
+        raise InputError(f"The start ({place}) m lies outside the sampled region"
+                         f"{unit_doubt(away, field)}.",
                          "The branch's energy is not known there.",
                          "Choose a start nearer to rest, or sample farther (`limber energy "
                          "--deflection`).")

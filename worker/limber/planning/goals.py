@@ -17,6 +17,8 @@ from limber.planning.field.energy_field import (
 from limber.planning.regions import Region, ball
 from limber.planning.resolve import SolvedPoses
 
+_MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
+
 
 class Goal(Protocol):
     """A region of grasp positions."""
@@ -144,7 +146,8 @@ def over_limits(field: EnergyField, points: np.ndarray, limits: FieldArrays) -> 
     told = [f"the {name} is at least {values.min():.3g}{unit} where {limit:.3g}{unit} is allowed"
             for name, values, limit, unit in found if values.min() > limit]
     if outside.min() > 0.0:
-        told.append(f"the workspace is {outside.min():.3f} m away")
+        told.append(f"the workspace is {outside.min():.3f} m away"
+                    + unit_doubt(outside.min(), field))
     return " and ".join(told) or "each pose breaks one or the other"
 
 
@@ -214,11 +217,19 @@ def _out_of_reach(goal: Goal, field: EnergyField, seed: int) -> NoPathError:
     what = f"the {goal.name}" if isinstance(goal, TargetGoal) else "the grasp"
     return NoPathError(
         f"No sampled pose brings {what} to the goal; the nearest misses it by "
-        f"{distance.min():.3f} m, with the grasp at ({place}).",
+        f"{distance.min():.3f} m, with the grasp at ({place})"
+        f"{unit_doubt(float(distance.min()), field)}.",
         f"The tolerance is {goal.tolerance:.3f} m and the branch was sampled from "
         f"{_place(field.region.low)} to {_place(field.region.high)}.",
         "Choose a goal nearer to that, widen --goal-tolerance, or sample farther (`limber "
         "energy --deflection`).")
+
+
+def unit_doubt(off: float, field: EnergyField) -> str:
+    """Return words of doubt about the unit where something is so far ``off`` [m] that it can hardly
+    be in metres; nothing else."""
+    size = float(np.linalg.norm(field.region.high - field.region.low))
+    return " (in millimetres? Lengths are in metres)" if off > _MILLIMETRES * size else ""
 
 
 def _place(point: np.ndarray) -> str:

@@ -60,7 +60,7 @@ class PlanSettings(Settings):
     goal_seed: int | None = Field(None, ge=0, description=(
         "A grasp pose drawn at random from the paper's hemisphere, above the base and as far as "
         "the branch is long, among those known, allowed and far from rest."))
-    goal_tolerance: float = Field(0.01, gt=0, description="Radius of the goal region [m].")
+    goal_tolerance: float = Field(0.01, gt=0, le=1, description="Radius of the goal region [m].")
     start: tuple[float, float, float] | None = Field(None, description=(
         "Where the grasp starts [m]; default the rest pose."))
     start_seed: int | None = Field(None, ge=0, description=(
