@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from limber.errors import InputError
-from limber.planning.chance import YoungDoubt
+from limber.planning.chance import Exposure, YoungDoubt
 from limber.planning.limits import Limits
 from limber.planning.resolve import resolve_path
 from limber.planning.settings import PlanSettings
@@ -76,3 +76,21 @@ def test_the_log_of_a_force_is_linear_in_the_logs_of_the_moduli(small_model, ben
 def test_a_confidence_needs_a_limit_and_an_estimate(planned_branch, settings, words):
     with pytest.raises(InputError, match=words):
         plan_paths(planned_branch, PlanSettings(**settings), name="sure")
+
+
+def test_poses_that_break_under_other_moduli_share_the_chance():
+    """Two poses, each below its limit with 0.95 under a modulus of its own: both with 0.95 squared;
+    a force that bends upwards with its modulus is kept less often, in closed form."""
+    z = norm.ppf(0.95)
+    both = Exposure({"force": 1.0}, {"force": np.exp([-0.1 * z, -0.1 * z])}, {"force": np.eye(2)})
+    found = both.risk(0.01 * np.eye(2), 0.95)
+    assert found.kept == pytest.approx(0.95**2, abs=2e-3)
+    assert found.excess["force"] == pytest.approx(
+        np.exp(0.1 * (norm.ppf(np.sqrt(0.95)) - z)), rel=2e-3)
+    straight = Exposure({"force": 1.0}, {"force": np.exp([-0.2])}, {"force": np.ones((1, 1))})
+    bent = replace(straight, bends={"force": np.array([0.8])}, farthest={"force": np.array([9.0])})
+    most = (np.sqrt(1.0 + 4 * 0.8 * 0.2) - 1.0) / (2 * 0.8)  # p + 0.8 p^2 = 0.2
+    least = (-np.sqrt(1.0 + 4 * 0.8 * 0.2) - 1.0) / (2 * 0.8)
+    kept = norm.cdf(most / 0.15) - norm.cdf(least / 0.15)
+    assert bent.risk(np.full((1, 1), 0.15**2), 0.95).kept == pytest.approx(kept, abs=2e-3)
+    assert straight.risk(np.full((1, 1), 0.15**2), 0.95).kept > kept + 0.02
