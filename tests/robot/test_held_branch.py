@@ -2,6 +2,7 @@
 
 import json
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -227,6 +228,24 @@ def test_what_gives_way_is_in_series_with_the_branch(held):
     back[:3, 3] -= 1e-4 * felt[:3]
     assert felt == pytest.approx(extrapolated(solution, back, 0.0), rel=1e-4, abs=1e-6)
     assert np.linalg.norm(felt) < np.linalg.norm(extrapolated(solution, patch, 0.0))
+
+
+def test_what_is_seen_stays_behind_by_what_gives_way(held):
+    """Solved with the piece C F behind the gripper, the points are seen where they were solved."""
+    flange = Controller("ur5e").flange
+    held.setting = replace(held.setting, compliance=1e-2)
+    held.wrench(flange, 0.002)
+    assert closed(held, flange) == "held"
+    moved = flange.copy()
+    moved[1, 3] += 0.01
+    for _ in range(200):
+        held.wrench(moved, 0.002)
+        held._pipe.poll(0.05)
+    solution = held._solution
+    behind = (held._gripper @ held._offset)[:3, 3] - solution.frame[:3, 3]
+    assert behind == pytest.approx(1e-2 * solution.wrench[:3], abs=5e-5)
+    assert np.linalg.norm(behind) > 5e-4
+    assert held.points == pytest.approx(solution.points, abs=1e-4)
 
 
 def test_closing_on_nothing_is_told(held):

@@ -166,7 +166,11 @@ class HeldBranch:
         solution = self._solution
         if solution is None:
             return self.rest_points
-        moved = solution.point_slopes @ solution.change_to(self._gripper @ self._offset)
+        patch = self._gripper @ self._offset
+        # The held piece stays behind the gripper by what gives way.
+        felt = self._extrapolated(solution, patch)
+        patch[:3, 3] -= self.setting.compliance * felt[:3]
+        moved = solution.point_slopes @ solution.change_to(patch)
         return solution.points + moved.reshape(-1, 3)
 
     def wrench(self, flange: np.ndarray, seconds: float) -> np.ndarray:
