@@ -1,5 +1,6 @@
 """Faults while the robot moves, with the real client and processes: standstill and a report."""
 
+import threading
 import time
 
 import numpy as np
@@ -128,6 +129,26 @@ def test_a_path_that_starts_elsewhere_is_refused(moving_robot):
     with RobotLink(cell_for(moving_robot.address)) as link:
         with pytest.raises(SafetyStop, match=r"starts 20\.0 mm"):
             link.start(moved)
+
+
+def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
+    """Samples of 1.5 s would fill its pipe four times over: the motion goes on to its end."""
+    stalled, taken = threading.Event(), []
+
+    def take(rows: np.ndarray) -> None:
+        if stalled.is_set():
+            stalled.clear()
+            time.sleep(1.5)
+        taken.append(rows)
+    with RobotLink(cell_for(moving_robot.address), take) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(moving_robot, (0.0, 0.12, 0.0)))
+        stalled.set()
+        assert link.wait("reached", "stopped", seconds=30)["event"] == "reached"
+        time.sleep(0.1)
+    clock = np.concatenate(taken)[:, 0]
+    assert np.diff(clock) == pytest.approx(np.full(len(clock) - 1, 0.002), abs=1e-5)
 
 
 @pytest.mark.parametrize("action, values, error, told", [

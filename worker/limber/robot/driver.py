@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from limber.robot.real_time import claim_real_time
 from limber.robot.samples import Dashboard, Sample, SampleStream
 from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
 from limber.robot.trajectory import Trajectory
+from limber.robot.words import Words
 
 WATCHDOG_HZ = 10.0
 """The controller ends the program when it hears nothing for a tenth of a second."""
@@ -64,14 +65,14 @@ class Driver:
 
     Args:
         cell: Robot, tool, sensor and limits.
-        out: Where events go, a JSON object a line.
+        words: What it says goes through them.
 
     Raises:
         LimberError: the robot does not answer, or is not in a state to be moved.
     """
 
-    def __init__(self, cell: Cell, out: TextIO):
-        self.cell, self._out = cell, out
+    def __init__(self, cell: Cell, words: Words):
+        self.cell, self.tell = cell, words.tell
         self._base = frame_of(np.array(cell.base.pose))
         address = cell.robot.address
         self._stream = SampleStream(address)
@@ -477,11 +478,6 @@ class Driver:
 
     # Words
 
-    def tell(self, **content: Any) -> None:
-        """Send an event."""
-        self._out.write(json.dumps(content) + "\n")
-        self._out.flush()
-
     def _send_batch(self) -> None:
         now = time.monotonic()
         if self._batch and now - self._batch_since >= _BATCH_SECONDS:
@@ -520,25 +516,23 @@ def _read_orders(orders: "queue.Queue[dict[str, Any] | None]") -> None:
 def main() -> int:
     """Read the cell from the first line of standard input, then serve; returns an exit code."""
     # ur-rtde prints on standard output; what is ours goes through a copy of it.
-    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    words = Words(os.fdopen(os.dup(1), "w", encoding="utf-8"))
     os.dup2(2, 1)
     driver: Driver | None = None
     try:
-        driver = Driver(Cell.model_validate_json(sys.stdin.readline()), out)
+        driver = Driver(Cell.model_validate_json(sys.stdin.readline()), words)
         driver.tell(event="connected", **driver.facts)
         orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
         driver.run(orders)
     except (LimberError, RuntimeError, ConnectionError, ImportError) as error:
-        out.write(json.dumps({"event": "failed", "reason": str(error),
-                              "code": getattr(error, "exit_code", 3)}) + "\n")
-        out.flush()
+        words.tell(event="failed", reason=str(error), code=getattr(error, "exit_code", 3))
         return 3
     finally:
         if driver is not None and not driver.ended:
             driver.close()
+        words.close()
     # What ur-rtde's threads still wait for is not waited for.
-    out.flush()
     os._exit(0)
 
 
