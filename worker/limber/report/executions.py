@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MOST_POINTS = 1500
+_GAP_SECONDS = 0.5
 _NAMES = [*(f"{kind}_f{axis}_n" for kind in ("smooth", "expected") for axis in "xyz"),
           *(f"expected_{entry}_n2" for entry in ("xx", "yy", "zz"))]
 
@@ -58,6 +59,9 @@ def force_along_the_way(path: Path) -> "Figure":
     known = np.flatnonzero(known)
     known = known[::max(1, len(known) // _MOST_POINTS)]
     times, table = log.times[known] - log.times[known[0]], table[known]
+    # Nothing is drawn across a time in which nothing was expected.
+    after = np.flatnonzero(np.diff(times) > _GAP_SECONDS) + 1
+    times, table = np.insert(times, after, np.nan), np.insert(table, after, np.nan, axis=0)
     felt, expected, variances = table[:, :3], table[:, 3:6], table[:, 6:]
     figure = Figure(figsize=(9.0, 5.2), layout="constrained")
     for axes, column, name in zip(figure.subplots(3, 1, sharex=True), range(3), "xyz",
@@ -72,5 +76,5 @@ def force_along_the_way(path: Path) -> "Figure":
         axes.grid(alpha=0.25)
         if name == "x":
             axes.legend(frameon=False, ncols=2)
-    axes.set_xlabel("time since the branch was led [s]")
+    axes.set_xlabel("time since the robot set out [s]")
     return figure
