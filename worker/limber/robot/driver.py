@@ -411,7 +411,9 @@ class Driver:
         done = self._control.servoL(list(self._command), 0.1, 0.1, 1.0 / self._stream.rate,
                                     _LOOKAHEAD, _GAIN)
         if not done:
-            self._judge(self.guard.event("the control program took no target"))
+            self._judge(self.guard.event(
+                "the control program took no target: it ends when it hears nothing for "
+                f"{1 / WATCHDOG_HZ:.2g} s, as where this computer is too busy"))
             return
         over = following.time >= following.trajectory.duration + 0.5 * _LOOKAHEAD
         still = float(np.abs(self._last.joint_speeds).max()) < 1e-3
