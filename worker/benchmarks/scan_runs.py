@@ -1,8 +1,13 @@
-"""Cases of the bench `scans` run as a user runs them, two at a time, and their scores by kind."""
+"""Cases of the bench `scans` run as a user runs them, side by side, and their scores by kind.
+
+Each case is kept as it is done: a run that was stopped goes on with the same seed and folder.
+"""
 
 import json
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks import scan_cases, scan_plants, scan_scores
+from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.scan_cases import (
     ScanCase,
     gap_case,
@@ -25,15 +32,36 @@ from limber.geometry.reconstruct import ReconstructSettings
 from limber.geometry.skeleton.files import read_fitted
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.jobs.budget import core_budget
 from limber.jobs.pool import Pool
 from limber.progress import Progress
 from limber.stages.reconstruct import reconstruct
 
 KINDS: dict[str, Callable[[int], ScanCase]] = {
-    "one-sided": one_sided_case, "2 mm": lambda seed: one_sided_case(seed, 0.002),
-    "3 mm": lambda seed: one_sided_case(seed, 0.003), "round": round_case, "gaps": gap_case,
+    "one-sided": one_sided_case, "2-mm": lambda seed: one_sided_case(seed, 0.002),
+    "3-mm": lambda seed: one_sided_case(seed, 0.003), "round": round_case, "gaps": gap_case,
     "single-view": single_view_case, "crowns": crown_case, "leafy": leafy_case}
 _FAR = 4.0  # radii from an axis to the nearest node of the mesh, from which that leaves it out
+
+
+@dataclass
+class CaseRun:
+    """What one case gave: its scores, or why it was not reconstructed.
+
+    ``source`` (digest of the sources) says what code it was.
+    """
+
+    kind: str
+    seed: int
+    source: str
+    scores: dict[str, Any] = field(default_factory=dict)
+    failure: str = ""
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in self.scores.items():
+            if value is None:  # as JSON has what is not finite
+                self.scores[name] = np.inf
 
 
 @dataclass
@@ -73,33 +101,62 @@ def measure(wanted: dict[str, range], progress: Progress, out: Path | None,
     Args:
         wanted: Seeds of each kind.
         progress: Called as it goes.
-        out: Where pictures of every case go, or None.
+        out: Where pictures of every case and ``cases.jsonl`` go, or None. What that file has from
+            the same sources is not done again.
     """
-    tasks = [(kind, seed, out) for kind, seeds in wanted.items() for seed in seeds]
-    with Pool(name="scans") as pool:
-        results = pool.map(measured, tasks, progress=progress, message="scans")
+    kept, source = None if out is None else out / "cases.jsonl", case_source()
+    known = {(run.kind, run.seed): run for run in read_trials(CaseRun, kept)
+             if run.source == source}
+    tasks = [(kind, seed) for kind, seeds in wanted.items() for seed in seeds]
+    missing = [task for task in tasks if task not in known]
+    progress.part(0.0, 0.01)(1.0, f"{len(tasks) - len(missing)} of {len(tasks)} cases were kept")
+    for number, run in enumerate(_computed([(*task, out) for task in missing])):
+        known[run.kind, run.seed] = run
+        keep(run, kept)
+        progress((number + 1) / len(missing), "scans", case=f"{run.kind} {run.seed}",
+                 seconds=run.seconds)
     done = {kind: Outcomes() for kind in wanted}
-    for (kind, _, _), result in zip(tasks, results, strict=True):
-        if isinstance(result, str):
-            done[kind].failed.append(result)
+    for kind, seed in tasks:
+        run = known[kind, seed]
+        if run.failure:
+            done[kind].failed.append(run.failure)
         else:
-            done[kind].scores.append(result)
+            done[kind].scores.append(run.scores)
     return done
 
 
-def measured(kind: str, seed: int, out: Path | None) -> dict[str, Any] | str:
-    """Scores of one case, or why it was not reconstructed; its picture goes to ``out``."""
-    case = KINDS[kind](seed)
+def case_source() -> str:
+    """Digest of all that a case's scores depend on."""
+    return source_digest(("geometry",), __file__, scan_cases.__file__, scan_plants.__file__,
+                         scan_scores.__file__)
+
+
+def _computed(tasks: list[tuple[str, int, Path | None]]) -> Iterator[CaseRun]:
+    if core_budget() < 2:
+        for task in tasks:
+            yield measured(*task)
+        return
+    with Pool(name="scans") as pool:
+        for future in as_completed([pool.submit(measured, *task) for task in tasks]):
+            yield future.result()
+
+
+def measured(kind: str, seed: int, out: Path | None) -> CaseRun:
+    """One case; its picture goes to ``out``."""
+    case, began, source = KINDS[kind](seed), time.perf_counter(), case_source()
     with tempfile.TemporaryDirectory() as folder:
         try:
             scored, found = run_case(case, Path(folder))
-        except LimberError as error:
-            return f"{case.name}: {error}"
+        except Exception as error:  # a crash is a failure too
+            known = isinstance(error, LimberError)
+            return CaseRun(kind, seed, source, seconds=time.perf_counter() - began, failure=(
+                f"{case.name}: {'' if known else f'{type(error).__name__}: '}{error}"))
+    seconds = time.perf_counter() - began
     if out is not None:
         from benchmarks.scan_pictures import draw_case
 
         draw_case(out / f"{case.name}.png", case, found, scored)
-    return scored
+    return CaseRun(kind, seed, source, scored, seconds=seconds)
 
 
 def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:

@@ -1,47 +1,45 @@
-"""What the issue on real scans asked: `reconstruct` as a user calls it, on fresh seeds each run."""
+"""What the issue on real scans asked: `reconstruct` as a user calls it, on fresh seeds each run.
 
-import json
+With ``--out`` every case is kept as it is done, and drawn: the same ``--seed`` goes on with them,
+and ``--only`` takes the table's parts one after another.
+"""
+
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.scan_files import metamorphic_rows, real_rows
+from benchmarks.scan_files import SCANS, metamorphic_rows, real_rows
 from benchmarks.scan_runs import Outcomes, measure
 from benchmarks.table import Row
 from limber.progress import Progress
 
-_COUNTS = {"one-sided": 60, "2 mm": 60, "3 mm": 60, "round": 60, "gaps": 60, "single-view": 20,
+_COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60,
            "crowns": 12, "leafy": 8}
 _QUICK = 15  # times as few
 _BINOMIAL = 1.96  # standard deviations of a share of few, that its row tells beside it
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    """Measure; pictures of every case and raw numbers go to ``out``."""
-    first = 1000 * seed
-    done = measure({kind: range(first, first + (max(count // _QUICK, 2) if quick else count))
-                    for kind, count in _COUNTS.items()}, progress.part(0.0, 0.8), out)
-    if out is not None:
-        raw = {kind: {"scores": outcomes.scores, "failed": outcomes.failed}
-               for kind, outcomes in done.items()}
-        (out / "scans.json").write_text(json.dumps({"seed": seed} | raw, indent=1) + "\n")
-    table = _table(done)
-    table += metamorphic_rows(quick, first, progress.part(0.8, 0.9))
-    return table + real_rows(quick, progress.part(0.9, 1.0), out)
-
-
-def _table(done: dict[str, Outcomes]) -> list[Row]:
-    table = _view_rows("one-sided, noise 1 mm", done["one-sided"], 0.90, 0.08, 2, 0.12, 0.08)
-    for kind in ("2 mm", "3 mm"):
-        table += _noise_rows(kind, done[kind])
-    table += _view_rows("round", done["round"], 0.97, 0.02, 0, 0.08, 0.05)
-    table += _view_rows("single-view", done["single-view"], None, None, None, None, None)
-    table.append(_root_row([done["one-sided"], done["round"]]))
-    table.append(_gap_row(done["gaps"]))
-    table += probability_rows("", [one for kind, one in done.items() if kind != "leafy"])
-    table += probability_rows(" of leafy plants", [done["leafy"]])
-    table.append(_crown_row(done["crowns"]))
-    table.append(_leafy_row(done["leafy"]))
+def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
+         only: tuple[str, ...] = ()) -> list[Row]:
+    """Measure the parts named in ``only``, or all; pictures and what is kept go to ``out``."""
+    first, chosen = 1000 * seed, only or WHOLE
+    # What several parts tell of is measured once.
+    needed = [kind for kind in _COUNTS if any(kind in NEEDED.get(name, ()) for name in chosen)]
+    done = measure({kind: range(first, first + (
+        max(_COUNTS[kind] // _QUICK, 2) if quick else _COUNTS[kind])) for kind in needed},
+        progress.part(0.0, 0.7), out)
+    table = []
+    for number, name in enumerate(chosen):
+        if name in TOLD:
+            table += TOLD[name](done)
+            continue
+        part = progress.part(*(0.7 + 0.3 * k / len(chosen) for k in (number, number + 1)))
+        if name == "real":
+            table += real_rows(quick, first, part, out)
+        else:
+            table += metamorphic_rows(quick, first, part, out, PARTS[name])
     return table
 
 
@@ -175,3 +173,38 @@ def _leafy_row(leafy: Outcomes) -> Row:
 def _nothing(name: str, one: Outcomes) -> Row:
     return Row(f"{one.count} {name}", "-", f"none reconstructed: {'; '.join(one.failed[:3])}",
                False)
+
+
+def _kind_rows(done: dict[str, Outcomes], kind: str,
+               told: Callable[[Outcomes], list[Row]]) -> list[Row]:
+    return told(done[kind])
+
+
+def _of(kind: str, told: Callable[[Outcomes], list[Row]]) -> Callable[[dict], list[Row]]:
+    return partial(_kind_rows, kind=kind, told=told)
+
+
+TOLD: dict[str, Callable[[dict[str, Outcomes]], list[Row]]] = {
+    "one-sided": _of("one-sided", lambda one: _view_rows(
+        "one-sided, noise 1 mm", one, 0.90, 0.08, 2, 0.12, 0.08)),
+    "2-mm": _of("2-mm", lambda one: _noise_rows("2 mm", one)),
+    "3-mm": _of("3-mm", lambda one: _noise_rows("3 mm", one)),
+    "round": _of("round", lambda one: _view_rows("round", one, 0.97, 0.02, 0, 0.08, 0.05)),
+    "single-view": _of("single-view", lambda one: _view_rows(
+        "single-view", one, None, None, None, None, None)),
+    "root": lambda done: [_root_row([done["one-sided"], done["round"]])],
+    "gaps": _of("gaps", lambda one: [_gap_row(one)]),
+    "crowns": _of("crowns", lambda one: [_crown_row(one)]),
+    "leafy": _of("leafy", lambda one: [_leafy_row(one)]),
+    "probabilities": lambda done: [
+        *probability_rows("", [one for kind, one in done.items() if kind != "leafy"]),
+        *probability_rows(" of leafy plants", [done["leafy"]])]}
+"""Rows of generated cases, by part."""
+NEEDED = {kind: (kind,) for kind in _COUNTS} | {
+    "root": ("one-sided", "round"), "probabilities": tuple(_COUNTS)}
+"""Kinds of cases that each part tells of."""
+WHOLE = (*TOLD, "same-tree", "real")
+"""The table's parts, in its order."""
+PARTS: dict[str, str | None] = dict.fromkeys(WHOLE) | {
+    f"same-tree:{Path(name).stem}": Path(name).stem for name in SCANS}
+"""What ``--only`` knows: those, and one scan of the same tree's row."""
