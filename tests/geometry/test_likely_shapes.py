@@ -40,6 +40,32 @@ def test_drawn_shapes_scatter_as_the_fit_says():
     assert np.abs(moved[..., 2]).max() < 0.1 * np.abs(moved[..., 0]).max()  # across only
 
 
+def test_twigs_are_missing_as_often_as_they_are_doubted():
+    """Of 600 shapes a twig of probability 0.8 is thin in a fifth; one on it, of 0.4, in 0.6, and
+    wherever its carrier is."""
+    tube, steps = _tube(), 0.01 * np.arange(1, 11)[:, None]
+    twig = tube.nodes[25] + steps * [1.0, 0, 0]
+    upper = twig[5] + steps * [0, 1.0, 0]
+    tree = Skeleton.from_edges(
+        np.vstack([tube.nodes, twig, upper]),
+        np.concatenate([tube.parent, [25], 51 + np.arange(9), [56], 61 + np.arange(9)]),
+        np.concatenate([tube.radius, np.full(20, 0.004)]))
+    rng = np.random.default_rng(4)
+    points = _scan(rng)
+    rings = [axis + side * np.eye(3)[way] for axis, ways in ((twig, (1, 2)), (upper, (0, 2)))
+             for way in ways for side in (0.004, -0.004)]
+    points = np.vstack([points, *rings])
+    told = replace(tree, probability=np.array([1.0, 0.8, 0.4])[tree.branch])
+    drawn = likely_skeletons(told, points, 600, rng)
+    ends = [members[-1] for members in told.runs()]
+    thin = np.array([[np.isclose(shape.radius[end], 0.5 * told.radius[end]) for end in ends]
+                     for shape in drawn])
+    assert thin.mean(axis=0) == pytest.approx([0.0, 0.2, 0.6], abs=0.06)
+    assert thin[thin[:, 1], 2].all()
+    sure = likely_skeletons(tree, points, 20, rng)
+    assert min((shape.radius / tree.radius)[:51].min() for shape in sure) > 0.6
+
+
 def test_new_scans_scatter_as_the_drawn_shapes_foretell():
     """20 scans with fresh noise, fitted: mean radius and axis scatter as the shapes of one do."""
     def means(shape: Skeleton) -> list[float]:

@@ -2,7 +2,8 @@
 
 Where a scan's axis runs and how thick the branch is are known to the points' noise, averaged over
 a length of the branch. Errors of neighbouring places go together, and where only one side was
-seen, an axis too near goes with a radius too small: drawn together, all that is kept.
+seen, an axis too near goes with a radius too small: drawn together, all that is kept. Twigs that
+may not be there at all are missing in as many of the shapes as their probability says.
 """
 
 from dataclasses import replace
@@ -19,13 +20,18 @@ from limber.geometry.tets.tet_mesh import EDGES, TetMesh
 POINT_LIMIT = 60_000
 """As many points as the fit itself looks at: more share their errors."""
 _LEAST, _MOST = 0.5, 2.0
+# Radius of a twig that is not there, over the fitted one: a shape has the same tetrahedra. What
+# follows shapes to first order, as estimates do, loses 2 (1 - 0.5), all, of the twig's mass.
+_MISSING = 0.5
 _LEAST_VOLUME = 0.1  # of a tetrahedron's own, below which its corners go half as far
 _HALVINGS = 30
 
 
 def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
                      rng: np.random.Generator) -> list[Skeleton]:
-    """Draw ``count`` skeletons from the fit's covariance; nodes move across their axis only.
+    """Draw ``count`` skeletons from the fit's covariance and the twigs' probabilities.
+
+    Nodes move across their axis only; a twig that is not there, and what it carries, is thin.
 
     Args:
         skeleton: Fitted to the points.
@@ -50,8 +56,25 @@ def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
     across = moves[..., :3] - np.einsum("snj,nj->sn", moves[..., :3], along)[..., None] * along
     radius = np.clip(skeleton.radius + moves[..., 3], _LEAST * skeleton.radius,
                      _MOST * skeleton.radius)
+    # Drawn last: where all twigs are sure, shapes are as without them.
+    radius = np.where(_there(skeleton, count, rng), radius, _MISSING * skeleton.radius)
     return [replace(skeleton, nodes=skeleton.nodes + move, radius=thick)
             for move, thick in zip(across, radius, strict=True)]
+
+
+def _there(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Whether each node's run is there in each draw, shape [count, n].
+
+    The probability of a run holds its carriers': given these it is as much more likely.
+    """
+    runs = skeleton.runs()
+    stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
+    there = np.ones((count, len(runs)), bool)
+    for run, members in enumerate(runs[1:], start=1):
+        carrier = int(skeleton.branch[members[0]])
+        share = stated[run] / (max(float(stated[carrier]), 1e-12) if carrier else 1.0)
+        there[:, run] = there[:, carrier] & (rng.uniform(size=count) < share)
+    return there[:, skeleton.branch]
 
 
 def reshaped(mesh: TetMesh, skeleton: Skeleton, other: Skeleton) -> TetMesh:
