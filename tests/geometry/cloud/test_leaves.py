@@ -57,6 +57,18 @@ def test_leaves_are_told_from_stems(seedling) -> None:
     assert sum(leaf.area for leaf in leaves) == pytest.approx(area, rel=0.3)
 
 
+def test_leaves_are_the_same_however_the_file_is_sorted_and_turned(seedling) -> None:
+    """Shuffled, turned and moved: the same points lie on leaves."""
+    _, points, _, _ = seedling
+    rng = np.random.default_rng(8)
+    order = rng.permutation(len(points))
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    first, again = (np.isin(np.arange(len(points)), np.concatenate(
+        [leaf.points for leaf in find_leaves(some)]))
+        for some in (points, (points @ turn.T + [3.0, -2.0, 7.0])[order]))
+    assert np.mean(again != first[order]) < 1e-3
+
+
 def test_rims_of_leaves_go_with_them_and_stems_stay() -> None:
     """A strip along a sheet's side is its rim; a stem that touches it with its end is none."""
     rng = np.random.default_rng(5)

@@ -42,6 +42,8 @@ from limber.progress import SILENT, Progress
 Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Takes in a skeleton as it was found, and all that the search for it came to."""
 
+_LEAVES_ASKED = 0.2  # share of points on no round axis, from which leaves are looked for
+
 
 @dataclass(frozen=True)
 class MeshedBranch:
@@ -177,11 +179,11 @@ def _may_be_leafy(found: SkeletonResult, prepared: Prepared, settings: Reconstru
     """Whether so much lies on no round axis that leaves are looked for.
 
     Leaves can swell the axes until half of what is on them counts as wood: a scan that would be
-    taken is asked too. A depth camera's scatter alone does that without a leaf; 3 mm of noise on
-    branches of 3 mm radius leaves 15 % off the axes.
+    taken is asked too, whatever share its user allows. A depth camera's scatter alone does that
+    without a leaf; 3 mm of noise on branches of 3 mm radius leaves 15 % off the axes.
     """
-    if found.leafy or (prepared.view is None
-                       and unexplained_share(found) > settings.unexplained):
+    if found.leafy or (prepared.view is None and unexplained_share(found) > min(
+            settings.unexplained, _LEAVES_ASKED)):
         return True
     try:
         check_explained(found, settings.unexplained)

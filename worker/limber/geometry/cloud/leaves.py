@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from limber.geometry.cloud.own_frame import own_axes, own_order
 from limber.geometry.cloud.preparation import voxel_thinned
 
 _CELL = 0.25  # of a scale: as finely is the cloud looked at there
@@ -26,6 +27,9 @@ _AFTER = 3  # scales that are looked at after it
 _LEAST = 8  # points of a neighbourhood that tell anything
 _SMALLEST = 40  # points of a leaf
 _PATCH = 0.1  # of the largest leaf's area, up to which a piece is a patch of a stem
+# Up to half of it, a piece is one if it is so thick for its width: blades come to 0.14, stretches
+# of stem and fork to 0.34 and more.
+_STRETCH, _THICK = 0.5, 0.25
 _NEAR = 3.0  # spacings, up to which points hang together
 _AGREE = 0.5  # of the neighbours, that make a point one of a leaf
 
@@ -49,6 +53,12 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
     Args:
         points: [m], shape [n, 3].
     """
+    order = own_order(points)
+    return [Leaf(order[leaf.points], leaf.area)
+            for leaf in _found(points[order] @ own_axes(points))]
+
+
+def _found(points: np.ndarray) -> list[Leaf]:
     spacing = float(np.median(cKDTree(points).query(points[::max(1, len(points) // 5000)], k=2)[0][
         :, 1]))
     on_leaf = _on_sheets(points, spacing)
@@ -147,4 +157,11 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
         # The median: at a leaf's edge neighbours are missing on one side.
         leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
     largest = max((leaf.area for leaf in leaves), default=0.0)
-    return [leaf for leaf in leaves if leaf.area > _PATCH * largest]
+    return [leaf for leaf in leaves if leaf.area > _PATCH * largest and (
+        leaf.area > _STRETCH * largest or _thickness(points[leaf.points]) < _THICK)]
+
+
+def _thickness(points: np.ndarray) -> float:
+    """Least extent of points [n, 3] over the next one, as standard deviations."""
+    across, wide, _ = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
+    return float(across / max(wide, 1e-300))

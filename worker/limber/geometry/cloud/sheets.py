@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.geometry.cloud.own_frame import own_order
+
 _SAMPLE = 400
 _ENOUGH = 150  # points that tell a plane
 _REACH = 0.05  # of the cloud's diagonal: what is looked at around a point
@@ -24,10 +26,10 @@ def find_sheet(points: np.ndarray, least: float) -> np.ndarray | None:
     """
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     reach = _REACH * diagonal
-    rng = np.random.default_rng(0)
-    sample = rng.permutation(len(points))[:_SAMPLE]
+    order, rng = own_order(points), np.random.default_rng(0)
+    sample = order[:_SAMPLE]
     # Among as many points as the sample needs; a sheet is no less flat for fewer.
-    dense = points[rng.permutation(len(points))[:20 * _SAMPLE]]
+    dense = points[order[-20 * _SAMPLE:]]
     tree = cKDTree(dense)
     centres, normals, spreads = [], [], []
     for point, near in zip(points[sample], tree.query_ball_point(points[sample], reach),

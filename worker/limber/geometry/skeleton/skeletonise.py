@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.geometry.cloud.own_frame import own_axes, own_order
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
 from limber.geometry.skeleton.contraction.curve_graph import (
@@ -134,10 +135,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     Raises:
         InputError: the cloud is not branch-like.
     """
-    # What is chosen point by point must not depend on the file's order: the same tree, shuffled or
-    # turned, is to give the same skeleton. By distance alone, covers would grow from the middle.
-    order = np.argsort(np.linalg.norm(points - points.mean(axis=0), axis=1), kind="stable")
-    order = order[np.random.default_rng(0).permutation(len(points))]
+    order = own_order(points)
     found = _of_ordered(points[order], settings or SkeletonSettings(), root, up, camera, progress)
     place = np.argsort(order)
     return replace(found, node_of_point=found.node_of_point[place], residual=found.residual[place])
@@ -233,16 +231,6 @@ def thinned(points: np.ndarray, limit: int) -> np.ndarray:
             return np.sort(first)
         size *= max(1.03, np.sqrt(len(first) / limit))
     return np.sort(first)
-
-
-def own_axes(points: np.ndarray) -> np.ndarray:
-    """The directions in which a cloud extends, farthest first, as columns, shape [3, 3].
-
-    Each points to where the cloud has its longer tail.
-    """
-    offset = points - points.mean(axis=0)
-    axes = np.linalg.eigh(offset.T @ offset)[1][:, ::-1]
-    return axes * np.where(((offset @ axes)**3).sum(axis=0) < 0, -1.0, 1.0)
 
 
 def _first_skeleton(graph: CurveGraph, settings: SkeletonSettings, start: int,
