@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from limber.geometry.skeleton.radii import noisy_rings
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -70,6 +71,18 @@ def test_half_a_noisy_ring_is_not_taken_for_a_thinner_whole_one() -> None:
     # Where the seen side ends is open: its doubt is in the interval, of half a ring alone.
     assert fit.skeleton.radius_sigma[20] > 0.03 * fit.skeleton.radius[20]
     assert whole.skeleton.radius_sigma[20] < fit.skeleton.radius_sigma[20]
+
+
+def test_a_flat_stem_is_not_taken_for_half_a_ring(monkeypatch) -> None:
+    """An elliptic section, 1.7 times as wide as thick, with noise of 0.4 of its radius: as flat as
+    an arc, but not bent. Taken for one, it would come out thicker."""
+    points = _points(0.005, 0.0, False) * [1.3, 1 / 1.3, 1.0]
+    points += np.random.default_rng(6).normal(0, 0.002, points.shape)
+    whole = np.median(fit_axes(_axis(0.004), points, rounds=30).skeleton.radius[5:-5])
+    assert whole == pytest.approx(0.005, rel=0.1)
+    monkeypatch.setattr(noisy_rings, "_BENT_LEAST", 0.0)
+    half = np.median(fit_axes(_axis(0.004), points, rounds=30).skeleton.radius[5:-5])
+    assert half > 1.1 * whole
 
 
 def test_scatter_that_is_known_to_be_along_the_sight_moves_no_radius() -> None:

@@ -36,6 +36,7 @@ _HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and th
 _KINK = np.deg2rad(50.0)
 # A twig's start may be as long as so many radii of its carrier, and end in such a kink.
 _HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
+_RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
 _ENOUGH = 200  # points that tell the noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
@@ -258,16 +259,20 @@ def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
 
     A run is no thicker than its carrier where it starts, nor ``growth`` times the median of what
     was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
-    not resolve would otherwise become a fat cylinder.
+    not resolve would otherwise become a fat cylinder. What is far thinner than most of the run
+    speaks for nothing: a rag at a stem's foot does not make a hair of the stem.
     """
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
-    measured = state == MEASURED
+    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[np.maximum(skeleton.parent, 0)], axis=1)
     for run, members in enumerate(skeleton.runs()):
         own = members if run == 0 else members[1:]
         carrier = members[0]
         cap = np.inf if run == 0 else max(radius[carrier], radius[skeleton.parent[carrier]])
+        speaks = state[own] == MEASURED
+        if speaks.any():
+            speaks &= radius[own] > _RAG * _middle(radius[own[speaks]], step[own[speaks]])
         for place, node in enumerate(own):
-            before = own[:place][measured[own[:place]]]
+            before = own[:place][speaks[:place]]
             # The first few are too few to speak for the run: a cut stem starts with a ragged end.
             if len(before) >= max(6, len(own) // 8):
                 allowed = growth + (1 - growth) * place / len(own)
@@ -275,6 +280,13 @@ def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
             if radius[node] > cap:
                 radius[node], state[node] = cap, LIMITED
     return replace(skeleton, radius=radius, radius_state=state)
+
+
+def _middle(values: np.ndarray, weight: np.ndarray) -> float:
+    """Median of values that count by their weight."""
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order[int(np.searchsorted(total, total[-1] / 2))]])
 
 
 def median_radii(skeleton: Skeleton, points: np.ndarray, neighbours: int = 24) -> np.ndarray:

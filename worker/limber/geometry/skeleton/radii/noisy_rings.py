@@ -32,6 +32,9 @@ _LEAST_SEEN = 0.01
 _RING_LOST = 12.0  # square of radius over noise, under which a ring's middle is not seen empty
 _FLAT = 0.10  # relative difference of scatter across and along the sight that is one side's
 _FLAT_SURE = 4.0  # standard deviations
+# Third moment of an arc, of cos over its half-angle with sin squared, in cubes of the radius; half
+# of it tells an arc from what is flat but not bent, as an elliptic stem is.
+_BENT, _BENT_LEAST, _BENT_SURE = 0.0913, 0.5, 2.0
 _DIRECTIONS, _SAMPLE = 120, 2000
 _ANGLE = 2 * np.pi * (np.arange(_PLACES) + 0.5) / _PLACES
 
@@ -104,7 +107,8 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
     """One side, if noise fills the rings and points scatter less along one sight than across it.
 
     Of an arc of half-angle g, the variance along the sight is that of cos over (-g, g), 0.08 of
-    the radius's square at 84 degrees, and across it that of sin, 0.46. Noise adds to both alike.
+    the radius's square at 84 degrees, and across it that of sin, 0.46. Noise adds to both alike,
+    and nothing to the third moment, which a flat stem seen from all around does not have.
     """
     near = np.flatnonzero(weight > 0)
     if len(near) == 0:
@@ -128,7 +132,11 @@ def _flat_side(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: 
         return None
     view, along, across = best
     # An arc's ends lie back from the viewer.
-    return _one_side(view if np.mean(along * (across**2 - np.mean(across**2))) < 0 else -view)
+    bent = (along - along.mean()) * (across**2 - np.mean(across**2))
+    wanted = _BENT_LEAST * _BENT * float(np.mean(stout[thick]**1.5))
+    if abs(bent.mean()) + _BENT_SURE * bent.std() / np.sqrt(len(bent)) < wanted:
+        return None
+    return _one_side(view if bent.mean() < 0 else -view)
 
 
 def _half_sphere() -> np.ndarray:
