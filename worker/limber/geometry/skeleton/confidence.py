@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.geometry.skeleton.doubts import start_angle
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import (
     BRIDGED,
@@ -35,14 +36,15 @@ _UNRESOLVED_SIGMA = 0.5  # at least, of a radius
 # Standard deviation of the logarithm of an unresolved radius that came out under what is expected:
 # such fits collapse. On generated scans they were 0.3 to 0.7 too thin.
 _COLLAPSED = 1.2
-# Logistic: a constant, then a slope for each column of the evidence. Fitted by likelihood, slopes
-# held to their sign and weakly to 0, to 1,056 side branches of 203 generated scans (seeds 7000 to
-# 7215: round, one-sided with 1 to 3 mm noise, gaps, single views, crowns, stray points, and points
-# up to 6 mm apart): a twig is there where its fork is a true one, a node where it lies in the true
-# wood. Fitted to even seeds and held against odd ones, and the other way round, bins of 20 and
-# more came out within 9 points.
-_TWIG_ODDS = (-2.2, 0.97, 0.88, -1.3, -1.35)
+# Logistic: a constant, then a slope for each column of the evidence; fitted by
+# `python -m benchmarks.scan_probabilities`. A twig is there where its fork is a true one: 666 side
+# branches of 112 generated scans (16 each, seeds from 910000: round, one-sided with 1 to 3 mm
+# noise, gaps, single views, crowns), 97 % of them there. Fitted to even seeds and held against odd
+# ones, and the other way round, tenths of 8 and more came out within 13 points. A node is there
+# where it lies in the true wood: fitted likewise to 203 scans (seeds 7000 to 7215).
+_TWIG_ODDS = (0.75, 0.60, 0.65, -2.48, -1.99, -3.07)
 _NODE_ODDS = (6.6, -0.8, -1.3, -3.4)
+_BACK = np.deg2rad(75.0), np.deg2rad(30.0)  # angle from which a twig starts backwards, and wholly
 _NOISE_MOST = 2.0  # radii of noise from which more tells nothing more
 
 
@@ -71,8 +73,22 @@ def assessed(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     state[gap > 0] = BRIDGED
     sigma = np.where(gap > 0, np.maximum(sigma, _BRIDGED_SIGMA * radius), sigma)
     told = replace(skeleton, radius=radius, radius_sigma=sigma, radius_state=state)
-    return replace(told, probability=_probability(told, twig_evidence(told, count, noise),
+    return replace(told, probability=_probability(told, twig_evidence(told, count, gap, noise),
                                                   node_evidence(told, gap, noise)))
+
+
+def evidence(skeleton: Skeleton, points: np.ndarray, noise: float,
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Return what probabilities are told by: that of runs [runs, 5] and that of nodes [n, 3].
+
+    Args:
+        skeleton: As :func:`assessed` returned it.
+        points: The scan [m], shape [m, 3].
+        noise: Standard deviation of the points [m].
+    """
+    segment, count = _counted(skeleton, points, noise)
+    gap = _gaps(skeleton, skeleton.radius, count, _spacing(skeleton, points, segment, noise))
+    return twig_evidence(skeleton, count, gap, noise), node_evidence(skeleton, gap, noise)
 
 
 def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
@@ -87,7 +103,7 @@ def doubted(skeleton: Skeleton, points: np.ndarray, noise: float) -> Skeleton:
     gap = _gaps(skeleton, skeleton.radius, count, _spacing(skeleton, points, segment, noise))
     state = np.where(gap > 0, BRIDGED, skeleton.radius_state).astype(np.int8)
     told = replace(skeleton, radius_state=state)
-    return replace(told, probability=_probability(told, twig_evidence(told, count, noise),
+    return replace(told, probability=_probability(told, twig_evidence(told, count, gap, noise),
                                                   node_evidence(told, gap, noise)))
 
 
@@ -118,13 +134,15 @@ def shares(skeleton: Skeleton) -> dict[str, float]:
             for name, value in STATES.items()}
 
 
-def twig_evidence(skeleton: Skeleton, count: np.ndarray, noise: float) -> np.ndarray:
-    """What speaks for each side run, shape [runs, 4]; zeros for the main run.
+def twig_evidence(skeleton: Skeleton, count: np.ndarray, gap: np.ndarray, noise: float,
+                  ) -> np.ndarray:
+    """What speaks for each side run, shape [runs, 5]; zeros for the main run.
 
     ln(1 + points / 10), ln(1 + how far it reaches / its carrier's radius), the share that is
-    bridged, and the noise over its radius.
+    bridged, the noise over its radius, and whether it starts backwards, 0 to 1: where a fork is
+    misplaced, a twig comes back to it.
     """
-    told = np.zeros((skeleton.branch_count, 4))
+    told = np.zeros((skeleton.branch_count, 5))
     runs = skeleton.runs()
     for run, members in enumerate(runs[1:], start=1):
         own, carrier = members[1:], runs[int(skeleton.branch[members[0]])]
@@ -132,7 +150,8 @@ def twig_evidence(skeleton: Skeleton, count: np.ndarray, noise: float) -> np.nda
         told[run] = (np.log1p(count[own].sum() / 10),
                      np.log1p(away.max() / max(float(skeleton.radius[members[0]]), 1e-12)),
                      float(np.mean(skeleton.radius_state[own] == BRIDGED)),
-                     min(noise / max(float(np.median(skeleton.radius[own])), 1e-12), _NOISE_MOST))
+                     min(noise / max(float(np.median(skeleton.radius[own])), 1e-12), _NOISE_MOST),
+                     np.clip((start_angle(skeleton, members) - _BACK[0]) / _BACK[1], 0.0, 1.0))
     return told
 
 

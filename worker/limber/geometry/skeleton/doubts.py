@@ -63,7 +63,7 @@ def doubtful_parts(skeleton: Skeleton) -> list[Doubt]:
             worst = part[np.argmax(turn[part])]
             found.append(_part(skeleton, DoubtKind.kink, run, members[worst:worst + 1],
                                float(turn[worst])))
-        back = _against_carrier(skeleton, members) if run else 0.0
+        back = start_angle(skeleton, members) if run else 0.0
         if back > _BACKWARDS:
             found.append(_part(skeleton, DoubtKind.backwards, run, own[:1], back))
     order = list(DoubtKind)
@@ -101,7 +101,7 @@ def turns(skeleton: Skeleton, members: np.ndarray) -> np.ndarray:
     return angle
 
 
-def _against_carrier(skeleton: Skeleton, members: np.ndarray) -> float:
+def start_angle(skeleton: Skeleton, members: np.ndarray) -> float:
     """Angle [rad] between a side run's start and its carrier, which runs outwards."""
     fork = int(members[0])
     before = int(skeleton.parent[fork])

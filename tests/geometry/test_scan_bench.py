@@ -1,0 +1,58 @@
+"""The bench of scans: parts of its table, cases that are kept, and the fit of probabilities."""
+
+import numpy as np
+import pytest
+
+from benchmarks import scan_runs, scans
+from benchmarks.scan_probabilities import TWIG_SIGNS, fitted
+from benchmarks.scan_runs import CaseRun
+from limber.progress import SILENT
+
+_SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, "centre_m": 1e-4,
+           "radius_error": 0.01, "radius_bias": 0.01, "covered": 0.95, "volume": 0.01, "shown": 1.0,
+           "root_diameters": 0.1, "main_axis_radii": 0.3}
+
+
+def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
+    """The root's row counts cases that two parts made before; other sources' are not taken."""
+    made = []
+
+    def measured(kind: str, seed: int, out: object) -> CaseRun:
+        made.append((kind, seed))
+        far = {"main_axis_radii": np.inf} if seed % 2 else {}
+        return CaseRun(kind, seed, "now", _SCORES | far)
+    monkeypatch.setattr(scan_runs, "case_source", lambda: "now")
+    monkeypatch.setattr(scan_runs, "measured", measured)
+    monkeypatch.setattr(scan_runs, "core_budget", lambda: 1)
+    for part in ("one-sided", "round"):
+        table = scans.rows(True, SILENT, tmp_path, 3, only=(part,))
+        assert all(row.met for row in table)
+    count = len(made)
+    root, = scans.rows(True, SILENT, tmp_path, 3, only=("root",))
+    assert len(made) == count == 8 and root.measured.startswith("8 of 8")
+    gaps, = scans.rows(True, SILENT, tmp_path, 3, only=("gaps",))
+    again, = scans.rows(True, SILENT, tmp_path, 3, only=("gaps",))
+    assert gaps == again and gaps.measured.startswith("2 of 4 (worst inf")
+    monkeypatch.setattr(scan_runs, "case_source", lambda: "later")
+    scans.rows(True, SILENT, tmp_path, 3, only=("gaps",))
+    assert len(made) == count + 8
+
+
+def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
+    """Neither a refusal nor a crash ends the bench: the row is not met, and says so."""
+    monkeypatch.setattr(scan_runs, "run_case", lambda case, folder: 1 / 0)
+    run = scan_runs.measured("round", 5, None)
+    assert "ZeroDivisionError" in run.failure and not run.scores
+    row, = scans.TOLD["gaps"]({"gaps": scan_runs.Outcomes([dict(_SCORES)], [run.failure])})
+    assert row.met is False and "1 not reconstructed" in row.measured
+
+
+def test_the_fit_of_probabilities_finds_the_odds_that_made_them() -> None:
+    """20,000 outcomes of known odds, one slope of the wrong sign: that is held at 0."""
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(20_000, 5))
+    true = np.array([0.5, 1.2, -0.6, -0.8, -0.3, -1.0])
+    there = rng.uniform(size=len(rows)) < 1 / (1 + np.exp(-(true[0] + rows @ true[1:])))
+    found = fitted(rows, there, TWIG_SIGNS)
+    assert found[[0, 1, 3, 4, 5]] == pytest.approx(true[[0, 1, 3, 4, 5]], abs=0.2)
+    assert found[2] == 0
