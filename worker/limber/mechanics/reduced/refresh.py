@@ -31,9 +31,10 @@ _CORRECTIONS = 4
 changed by up to 3, 11 of them more than 0.5 % of the length or 1 % of the energy off: 1, 2, 3, 4
 steps flag 74, 43, 4, 0 of those that are good, and 11, 9, 10, 11 of those that are not."""
 _POSITION, _ENERGY = 0.0045, 0.009
-"""Errors, of the extent and of the energy, beyond which a state is doubted: a tenth below those that
-no state may have unsaid (0.5 %, 1 %). What is measured falls a little short of what is there: of
-300 grasps 3 were off by 0.50 to 0.52 % and said to be less, and none of 245 good ones was doubted.
+"""Errors, of the extent and of the energy, beyond which a state is doubted: a tenth below those
+that no state may have unsaid (0.5 %, 1 %). What is measured falls a little short of what is there:
+of 300 grasps 3 were off by 0.50 to 0.52 % and said to be less, and none of 245 good ones was
+doubted.
 """
 
 
