@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from limber.geometry.skeleton.doubts import KINK, DoubtKind, doubtful_parts, turns
-from limber.geometry.skeleton.kinks import without_kinks
+from limber.geometry.skeleton.mending.kinks import without_kinks
 from limber.geometry.skeleton.skeleton import Skeleton
 
 

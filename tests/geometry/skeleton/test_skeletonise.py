@@ -8,6 +8,7 @@ from limber.errors import Cancelled, InputError
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import cloud_laplacian, contract
 from limber.geometry.skeleton.contraction.tangent_laplacian import tangent_laplacian
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonSettings, skeletonise, thinned
 from limber.progress import Progress
 
@@ -172,7 +173,6 @@ def test_the_order_of_the_points_changes_nothing() -> None:
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
     from limber.geometry.skeleton.radii.axis_fit import AxisFit
-    from limber.geometry.skeleton.skeleton import Skeleton
     from limber.geometry.skeleton.skeletonise import _with_full_tips
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
@@ -181,3 +181,19 @@ def test_an_end_is_not_left_beyond_the_points() -> None:
                                np.full(31, 0.01))
     fit = AxisFit(axis, np.zeros(0), np.zeros(0), 0.001)
     assert abs(_with_full_tips(axis, points, fit).nodes[0, 2]) < 0.008
+
+
+def test_an_end_that_slid_beyond_the_points_is_drawn_back() -> None:
+    """Both ends of an axis 12 mm past a tube: they come back to it; ends within it stay."""
+    from limber.geometry.skeleton.skeletonise import _ends_within
+
+    points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
+    for over, moved in ((0.012, True), (-0.002, False)):
+        z = np.concatenate([[-over], np.linspace(0.01, 0.29, 29), [0.3 + over]])
+        axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
+                                   np.full(31, 0.01))
+        ended = _ends_within(axis, points).nodes[[0, -1], 2]
+        if moved:
+            assert abs(ended - [0.0, 0.3]).max() < 0.002
+        else:
+            assert ended == pytest.approx(axis.nodes[[0, -1], 2])

@@ -54,8 +54,8 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
         points: [m], shape [n, 3].
     """
     order = own_order(points)
-    return [Leaf(order[leaf.points], leaf.area)
-            for leaf in _found(points[order] @ own_axes(points))]
+    points = points[order]
+    return [Leaf(order[leaf.points], leaf.area) for leaf in _found(points @ own_axes(points))]
 
 
 def _found(points: np.ndarray) -> list[Leaf]:

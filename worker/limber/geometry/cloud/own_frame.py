@@ -22,8 +22,10 @@ def own_order(points: np.ndarray) -> np.ndarray:
 def own_axes(points: np.ndarray) -> np.ndarray:
     """The directions in which a cloud extends, farthest first, as columns, shape [3, 3].
 
-    Each points to where the cloud has its longer tail.
+    Right-handed; the first two point to where the cloud has its longer tails.
     """
     offset = points - points.mean(axis=0)
     axes = np.linalg.eigh(offset.T @ offset)[1][:, ::-1]
-    return axes * np.where(((offset @ axes)**3).sum(axis=0) < 0, -1.0, 1.0)
+    axes = axes * np.where(((offset @ axes)**3).sum(axis=0) < 0, -1.0, 1.0)
+    axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])
+    return axes

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 _CHAIN = 6.0  # radii of an end that tell its direction
 _CHAIN_NODES = 4  # and so many nodes at least
+_UNSURE = 2  # nodes of a piece that tell none
 _TURN = np.deg2rad(35.0)  # a turn that doubles the price
 _SIDE = 0.25  # what a fork costs against going on
 _STAND = np.deg2rad(45.0), np.deg2rad(60.0)  # angle that twigs stand at, and what doubles the price
@@ -81,7 +82,7 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> En
         chain = _straight_chain(nodes, near, end, _CHAIN * thickness[end])
         chain = _straight_chain(nodes, near, end, _CHAIN * float(thickness[chain].max()))
         radius[place] = float(np.median(thickness[chain]))
-        if len(chain) > 1:
+        if len(chain) > _UNSURE:
             direction[place] = _direction(nodes[chain])
     return Ends(np.array(ends, np.int64), direction, radius)
 

@@ -15,7 +15,8 @@ _NAMED = 3  # gaps and loops that are named one by one
 _FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--skeleton)."
 
 
-def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str) -> None:
+def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
+                    axes: np.ndarray) -> None:
     """Refuse a ball, and two plants unless ``plants`` says which to take.
 
     Args:
@@ -23,6 +24,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str)
         count: Number of points that it was made of.
         diagonal: Size of the cloud [m].
         plants: ``refuse``, ``largest`` or ``joined``.
+        axes: Columns in which the graph's places are told, shape [3, 3].
 
     Raises:
         InputError: one of these.
@@ -41,8 +43,9 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str)
         return
     for plant in graph.plants:
         raise InputError(
-            f"There are two plants, {plant['distance']:.3g} m apart at {_place(plant['at'])}: "
-            f"{100 * plant['points'] / count:.0f} % of the points stand on a base of their own.",
+            f"There are two plants, {plant['distance']:.3g} m apart at "
+            f"{_place(axes @ plant['at'])}: {100 * plant['points'] / count:.0f} % of the points "
+            "stand on a base of their own.",
             "A branch is one plant, and which of them is meant the scan does not say.",
             f"{_FIX} Or take the larger one (--plants largest), or join them (--plants joined).")
     for piece in graph.split_off:

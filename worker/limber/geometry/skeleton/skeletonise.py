@@ -24,7 +24,8 @@ from limber.geometry.skeleton.contraction.laplacian_contraction import (
 )
 from limber.geometry.skeleton.contraction.level_sets import POINT_LIMIT, is_sparse, level_graph
 from limber.geometry.skeleton.contraction.pieces import second_base
-from limber.geometry.skeleton.kinks import without_kinks
+from limber.geometry.skeleton.mending.backwards import without_backward_starts
+from limber.geometry.skeleton.mending.kinks import without_kinks
 from limber.geometry.skeleton.plausibility import (
     check_no_sheet,
     check_one_plant,
@@ -135,15 +136,23 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     Raises:
         InputError: the cloud is not branch-like.
     """
+    # In the cloud's own order and axes: boxes around it, and the triangles of its Laplacian, would
+    # be others for a turned one.
     order = own_order(points)
-    found = _of_ordered(points[order], settings or SkeletonSettings(), root, up, camera, progress)
-    place = np.argsort(order)
-    return replace(found, node_of_point=found.node_of_point[place], residual=found.residual[place])
+    axes = own_axes(points[order])
+    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
+    found = _of_ordered(points[order] @ axes, settings or SkeletonSettings(),
+                        None if root is None else root @ axes, up @ axes, camera, axes, progress)
+    place, drawn = np.argsort(order), found.contraction
+    return replace(found.moved(lambda turned: turned @ axes.T), contraction=replace(
+        drawn, points=drawn.points @ axes.T, drawn=drawn.drawn @ axes.T),
+        node_of_point=found.node_of_point[place], residual=found.residual[place])
 
 
 def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray | None,
-                up: np.ndarray | None, camera: bool, progress: Progress) -> SkeletonResult:
-    up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
+                up: np.ndarray, camera: bool, axes: np.ndarray, progress: Progress,
+                ) -> SkeletonResult:
+    """The skeleton of points in the cloud's own order and ``axes``."""
     thin = thinned(points, settings.contraction_points)
     check_no_sheet(points[thin])
     contraction = contract(points[thin], attraction=settings.attraction,
@@ -155,7 +164,7 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     graph = curve_graph(points[thin], contraction.drawn, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal, up=up,
                         join_plants=settings.plants == "joined")
-    check_one_plant(graph, len(thin), diagonal, settings.plants)
+    check_one_plant(graph, len(thin), diagonal, settings.plants, axes)
     start, other_root = _root_node(graph, points[thin], root, up, settings.prune)
     if is_sparse(points[thin], contraction.drawn):
         thin, loops, base = thinned(points, POINT_LIMIT), graph.loops, graph.nodes[start]
@@ -297,7 +306,8 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     skeleton = resampled(skeleton, 1.5)
     fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
                    progress=progress.part(0.0, 0.5))
-    skeleton = _with_full_tips(_without_bare_ends(attached(fit.skeleton), points), points, fit)
+    hung, _ = without_backward_starts(attached(fit.skeleton))
+    skeleton = _with_full_tips(_without_bare_ends(hung, points), points, fit)
     # Noise makes a carrier look thicker, and its outliers look like twigs.
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
@@ -312,7 +322,8 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late,
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
-    told = assessed(tapered(limited(fit.skeleton, low, high)), points, fit.noise)
+    ended = _ends_within(fit.skeleton, points)
+    told = assessed(tapered(limited(ended, low, high)), points, fit.noise)
     return replace(fit, skeleton=without_kinks(told)[0]), pruned
 
 
@@ -399,6 +410,25 @@ def _without_bare_ends(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
     return Skeleton.from_edges(nodes[keep], moved, skeleton.radius[keep],
                                radius_sigma=skeleton.radius_sigma[keep],
                                radius_state=skeleton.radius_state[keep])
+
+
+def _ends_within(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Draw ends back that a fit let slide along their axis beyond the points."""
+    nodes = skeleton.nodes.copy()
+    segment, _ = nearest_cylinders(skeleton, points)
+    inner = np.flatnonzero(skeleton.parent == 0)
+    ends = [(int(tip), int(skeleton.parent[tip])) for tip in skeleton.tips()]
+    for end, before in [*ends, *([(0, int(inner[0]))] if len(inner) == 1 else [])]:
+        step = nodes[end] - skeleton.nodes[before]
+        length = float(np.linalg.norm(step))
+        mine = points[np.isin(segment, [end, before] if end else [
+            before, *np.flatnonzero(skeleton.parent == before)])]
+        if length == 0 or len(mine) < 3:
+            continue
+        reach = float(np.quantile((mine - skeleton.nodes[before]) @ step / length, 0.98))
+        if length > reach + 0.5 * skeleton.radius[end]:
+            nodes[end] = skeleton.nodes[before] + step * max(reach / length, 0.1)
+    return skeleton.moved(nodes)
 
 
 def _with_full_tips(skeleton: Skeleton, points: np.ndarray, fit: Any) -> Skeleton:

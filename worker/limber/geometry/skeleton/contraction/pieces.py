@@ -15,6 +15,7 @@ _SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any
 _REACH, _REACH_STRAIGHT, _STRAIGHT_ON = 5.0, 10.0, 1.5
 # Length in thicknesses, under which a piece tells no direction; and if it has few points.
 _SPECK, _SPECK_FEW, _FEW = 5.0, 10.0, 30
+_SINGLE = 2  # nodes of a piece that tells no direction
 _PLANT_SHARE = 0.2  # of all points, from which a piece may be a plant of its own
 _BASE_SHARE = 0.12  # of a piece's reach, up to which a bridge starts at its base
 _FAR_SHARE = 0.3  # from which it starts far from its base
@@ -73,7 +74,7 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
     """
     state = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
                    np.empty(0), np.empty((0, 2), np.int64), _labels(len(nodes), edges))
-    # Single nodes tell no direction: unless an end goes straight on to one, they come last.
+    # One node or two tell no direction: unless an end goes straight on to them, they come last.
     alone = True
     while True:
         weight = np.bincount(state.label, state.support)
@@ -101,7 +102,7 @@ def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, li
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first."""
     best: dict[int, int] = {}
     first: list[tuple[int, int, int]] = []
-    single = np.bincount(state.label) == 1
+    single = np.bincount(state.label) <= _SINGLE
     for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
         a, b = int(state.label[one]), int(state.label[other])
         if a in best and b in best:

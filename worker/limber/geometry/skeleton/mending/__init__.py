@@ -1,0 +1,1 @@
+"""What is put right in a skeleton: false ties, backward starts, kinks."""
