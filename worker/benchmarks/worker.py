@@ -72,7 +72,7 @@ def _kills(setting: Setting, progress: Progress) -> list[Row]:
 
 def _silicone_beam(_setting: Setting, _progress: Progress) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
-        return [truth_beam.real_row(Path(place))]
+        return [truth_beam.swing_row(Path(place))]
 
 
 def _readme(setting: Setting, progress: Progress) -> list[Row]:
