@@ -182,7 +182,8 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
     assert plain(asdict(read.result)) == plain(asdict(found))
     arrays = dict(np.load(path))
     for name, value in (("parent", np.arange(6)), ("node_of_point", np.full(40, 6)),
-                        ("told", np.array("{}")), ("nodes", np.full((6, 3), np.nan))):
+                        ("told", np.array("{}")), ("nodes", np.full((6, 3), np.nan)),
+                        ("nodes", np.zeros((6, 3))), ("radius", np.zeros(6))):
         np.savez(path, **arrays | {name: value})
         with pytest.raises(InputError, match=r"found\.npz"):
             FoundSkeleton.read(path)

@@ -69,6 +69,8 @@ class FoundSkeleton:
         if not _is_tree(skeleton.parent) or not _are_below(
                 arrays["node_of_point"], skeleton.node_count):
             raise _damaged(path, "Its nodes hang on no tree.")
+        if not ((skeleton.radius > 0).all() and 0 < skeleton.length < np.inf):
+            raise _damaged(path, "Its axes have no length, or no thickness.")
         contraction = Contraction(arrays["contracted"], arrays["linearity"], told.iterations,
                                   told.status)
         return cls(SkeletonResult(
