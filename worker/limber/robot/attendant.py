@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from limber.errors import InputError
 
 if TYPE_CHECKING:
+    from limber.progress import Progress
     from limber.robot.cell import Cell
     from limber.robot.link import RobotLink
 
@@ -40,10 +41,14 @@ def retreat_if_chosen(link: RobotLink, choice: AfterStop) -> None:
         link.retreat()
 
 
-def grip(cell: Cell, link: RobotLink, *, close: bool) -> None:
+def grip(cell: Cell, link: RobotLink, *, close: bool, progress: Progress) -> None:
     """Close or open the gripper; one without a wire by the person at the terminal."""
     if cell.tool.gripper == "digital_output":
         link.gripper(close)
         time.sleep(cell.tool.grip_seconds)
     elif cell.tool.gripper == "by_hand" and sys.stdin.isatty():
         input(f"{'Close' if close else 'Open'} the gripper by hand, then press Enter ")
+    elif cell.tool.gripper == "by_hand":
+        progress.warn(f"The gripper is {'closed' if close else 'opened'} by hand, and here nobody "
+                      "can be asked to: it was taken as done. Run it at a terminal, or state "
+                      "tool.gripper in the cell file.")

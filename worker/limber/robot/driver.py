@@ -12,6 +12,7 @@ by the next target within the same step. Nothing here waits for a motion.
 import json
 import os
 import queue
+import signal
 import sys
 import threading
 import time
@@ -189,7 +190,7 @@ class Driver:
 
     # The loop
 
-    def run(self, orders: "queue.Queue[dict[str, Any] | None]") -> None:
+    def run(self, orders: "queue.SimpleQueue[dict[str, Any] | None]") -> None:
         """Serve orders until they end."""
         quiet = 2.0 / self._stream.rate + 0.005
         self._stream.skip()
@@ -211,7 +212,7 @@ class Driver:
                 self._move(len(samples) / self._stream.rate)
             self._send_batch()
 
-    def _take(self, orders: "queue.Queue[dict[str, Any] | None]") -> None:
+    def _take(self, orders: "queue.SimpleQueue[dict[str, Any] | None]") -> None:
         while True:
             try:
                 order = orders.get_nowait()
@@ -506,7 +507,7 @@ class Driver:
         self._dashboard.close()
 
 
-def _read_orders(orders: "queue.Queue[dict[str, Any] | None]") -> None:
+def _read_orders(orders: "queue.SimpleQueue[dict[str, Any] | None]") -> None:
     for line in sys.stdin:
         try:
             orders.put(json.loads(line))
@@ -524,8 +525,11 @@ def main() -> int:
     try:
         driver = Driver(Cell.model_validate_json(sys.stdin.readline()), words)
         driver.tell(event="connected", **driver.facts)
-        orders: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        orders: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
+        # Where a whole group of processes is asked to end, the arm is stopped in order, not by its
+        # watchdog; this one then ends with whoever gives it orders.
+        signal.signal(signal.SIGTERM, lambda *_: orders.put({"order": "stop"}))
         driver.run(orders)
     except (LimberError, RuntimeError, ConnectionError, ImportError) as error:
         words.tell(event="failed", reason=str(error), code=getattr(error, "exit_code", 3))

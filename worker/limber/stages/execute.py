@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from limber.robot.execution import RobotMotion
     from limber.robot.expected import Predicted
     from limber.robot.link import RobotLink
+    from limber.robot.live import LiveForce
     from limber.robot.trajectory import Trajectory
 
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
@@ -332,6 +333,7 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
     from limber.robot.execution import followed
     from limber.robot.kinematics import matrices
     from limber.robot.link import COLUMNS, RobotLink
+    from limber.robot.live import LiveForce
 
     log = f"executions/{name}/samples.csv"
     with branch.writing(f"the execution of {name}"):
@@ -340,12 +342,16 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
         try:
             stream.append(",".join(COLUMNS))
 
+            live = LiveForce(branch.folder, f"Following {name}", cell.limits.soft_force_n)
+
             def take(rows: np.ndarray) -> None:
                 batches.append(rows)
                 for row in rows:
                     stream.append(",".join("" if np.isnan(x) else f"{x:.7g}" for x in row))
-            with RobotLink(cell, take) as link:
-                event, on_path = _steps(cell, link, motion, settings, options, batches, progress)
+                live.take(rows)
+            with live, RobotLink(cell, take) as link:
+                event, on_path = _steps(cell, link, motion, settings, options, batches, live,
+                                        progress)
                 warnings = list(link.warnings)
         finally:
             stream.close()
@@ -380,10 +386,11 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
 
 
 def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSettings,
-           options: ExecuteOptions, batches: list[np.ndarray], progress: Progress,
-           ) -> tuple[dict[str, Any], tuple[int, int] | None]:
+           options: ExecuteOptions, batches: list[np.ndarray], live: LiveForce,
+           progress: Progress) -> tuple[dict[str, Any], tuple[int, int] | None]:
     """Go through approach, grasp, path, return and leaving; stops at the first that stops."""
     progress(0.5, "taring: keep the gripper free")
+    live.at("taring")
     time.sleep(0.2)
     link.tare(1.0)
     on_path: tuple[int, int] | None = None
@@ -393,6 +400,7 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
     event: dict[str, Any] = {}
     for number, (title, trajectory) in enumerate(legs):
         progress(0.55 + 0.1 * number, title)
+        live.at(title)
         begin = sum(map(len, batches))
         event = _followed_to_its_end(link, trajectory)
         if title == "path":
@@ -401,11 +409,11 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
             retreat_if_chosen(link, options.after_stop)
             return event, on_path
         if title == "approach":
-            grip(cell, link, close=True)
+            grip(cell, link, close=True, progress=progress)
         elif title == "path":
             time.sleep(settings.hold)
         elif title == "return":
-            grip(cell, link, close=False)
+            grip(cell, link, close=False, progress=progress)
     return event, on_path
 
 

@@ -131,6 +131,7 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
 def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
               options: RecordOptions, blocked: Blocked, progress: Progress) -> dict[str, Any]:
     from limber.robot.link import RobotLink
+    from limber.robot.live import LiveForce
     from limber.robot.recorder import MarkerStream, PullRecorder
 
     stream = branch.stream(f"pulls/{name}/robot.csv")
@@ -141,7 +142,13 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
     try:
         progress(0.02, "connecting")
         recorders: list[PullRecorder] = []
-        with RobotLink(cell, lambda rows: recorders[0].take(rows) if recorders else None) as link:
+        live = LiveForce(branch.folder, f"Recording {name}", cell.limits.soft_force_n)
+
+        def take(rows: np.ndarray) -> None:
+            if recorders:
+                recorders[0].take(rows)
+            live.take(rows)
+        with live, RobotLink(cell, take) as link:
             point = _grasp_point(branch, cell, link)
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
@@ -150,12 +157,14 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             trajectory = _pull(branch, cell, point, recorder.last, settings, blocked,
                                progress.part(0.02, 0.1))
             progress(0.1, "taring: keep the gripper free")
+            live.at("taring")
             tared = link.tare(1.0)
-            grip(cell, link, close=True)
+            grip(cell, link, close=True, progress=progress)
             time.sleep(0.5)
             _write_entry(entry_lines, cell, point, tared, trajectory.duration, tracker,
                          marker_lines)
             recorder.close_gripper()
+            live.at("pulling")
             link.start(trajectory)
             event = _watched(link, tracker, marker_lines, recorder, trajectory, progress)
             ended = {"ended": "reached" if event["event"] == "reached" else event["reason"],
@@ -164,7 +173,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 # What was seen last comes a little later.
                 time.sleep(0.5)
                 _write_markers(tracker, marker_lines, recorder)
-                grip(cell, link, close=False)
+                grip(cell, link, close=False, progress=progress)
             else:
                 retreat_if_chosen(link, options.after_stop)
             ended |= {"peak_force_n": recorder.peak_force, "sample_count": recorder.count}
