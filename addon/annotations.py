@@ -1,6 +1,7 @@
-"""What is drawn about a branch beside its marks: rods with values, and the half ball of grasps.
+"""What is drawn about a branch beside its marks: rods with values, the half ball of grasps, and
+what was measured in a pull.
 
-All hidden at first: the panel's "Show" brings each into sight.
+All but the last are hidden at first: the panel's "Show" brings each into sight.
 """
 
 import json
@@ -8,10 +9,14 @@ import json
 import bpy
 
 from .branches import SCALE_KEY, ShownBranch, add_object
-from .bridge import materials, meshes
+from .bridge import animation, materials, meshes
 from .scene_data import SceneData
 
 _HALF_BALL = (0.35, 0.45, 0.55)
+MEASURED = (0.0, 0.55, 0.75)
+"""Linear colour of what was measured."""
+_SHARE = 0.011
+"""Radius of a measured point in sizes of the branch."""
 
 
 def add_rods(shown: ShownBranch, data: SceneData) -> None:
@@ -38,6 +43,24 @@ def add_hemisphere(shown: ShownBranch, data: SceneData) -> None:
     thing.display_type, thing.color = "WIRE", (*_HALF_BALL, 1.0)
     _hide(thing)
     shown.objects["hemisphere"] = [thing]
+
+
+def add_measured(shown: ShownBranch, data: SceneData, speed: float) -> None:
+    """Add the points that were seen in the pull whose motion is shown: where they were in each
+    frame, gone where they were not seen."""
+    if "observation_motion" not in data.arrays:
+        return
+    ball = meshes.new_sphere("Measured", 1.0)
+    meshes.set_one_color(ball, MEASURED)
+    material = materials.plain_material("Measured", MEASURED, alpha=0.6, roughness=0.3)
+    places, seen = data.arrays["observation_motion"], data.arrays["observation_seen"]
+    shown.objects["observed"] = []
+    for number in range(places.shape[1]):
+        thing = add_object(shown.collection, f"Measured point {number + 1}", ball, material)
+        thing.show_in_front = True
+        animation.move_along(thing, places[:, number], speed=speed)
+        animation.appear(thing, seen[:, number], _SHARE * data.info["size_m"], speed=speed)
+        shown.objects["observed"].append(thing)
 
 
 def _hide(thing: bpy.types.Object) -> None:

@@ -105,7 +105,8 @@ def _add_keys(sheet: _Sheet, data: SceneData, shown: ShownBranch) -> None:
     keys += [("goal", _goal_words(data.info.get("goal") or {}), "", dot),
              ("grasp", "grasp", "", dot),
              ("targets", ", ".join(data.info.get("targets") or ()), "", dot),
-             ("control_points", "control points", "", dot), ("rest", "rest shape", "", dot),
+             ("control_points", "control points", "", dot),
+             ("observed", "measured in the pull", "", dot), ("rest", "rest shape", "", dot),
              ("base", "fixed base", "", dot)]
     for name, words, note, (width, height) in keys:
         if name not in shown.objects:

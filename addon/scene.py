@@ -39,6 +39,7 @@ COLORS = {
     "base": (0.10, 0.075, 0.06),
     "rest": (0.22, 0.22, 0.22),
     "robot": (0.32, 0.40, 0.48),
+    "observed": annotations.MEASURED,
 }
 
 
@@ -336,6 +337,7 @@ def _add_motion(scene: bpy.types.Scene, shown: ShownBranch, data: SceneData) -> 
         for number, thing in enumerate(shown.objects.get(name, ())):
             animation.move_along(thing, data.arrays[f"{name}_motion"][:, number], speed=speed)
     _add_robot(shown, data, speed)
+    annotations.add_measured(shown, data, speed)
     # Last: what was keyed stands where it is at the first frame, not at its last key.
     scene.frame_set(1)
     if "frame_energy" in data.arrays:

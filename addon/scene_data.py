@@ -38,6 +38,7 @@ _SHAPES = {
     "path_strain": "p r", "path_color": "p4 r", "tree": "q3 r", "tree_parent": "q i",
     "observation": "om3 r", "observation_visible": "om b", "observation_times": "o r",
     "observation_grasp": "g3 r", "observation_grasp_times": "g r",
+    "observation_motion": "sm3 r", "observation_seen": "sm b",
     "rods": "u3 r", "rod_faces": "x3 i", "rod_color": "u4 r",
     "robot_links": "s83 r", "robot_radius": "1 r",
     "view_points": "w3 r", "view_direction": "3 r"}
@@ -188,6 +189,7 @@ def _pairs_trouble(arrays: dict[str, np.ndarray], info: dict[str, Any]) -> str:
     wanted += [f"{kind}:{name}" for name in info.get("trees") or {}
                for kind in ("tree", "tree_parent")]
     wanted += [f"frame_scalar:{name}" for name in info.get("frame_scalars") or {}]
+    wanted += ["observation_seen"] * ("observation_motion" in arrays)
     wanted += [f"{kind}:{name}" for name in info.get("rods") or {}
                for kind in ("rods", "rod_faces", "rod_color")]
     if len(arrays.get("targets", ())) != len(info.get("targets") or ()):

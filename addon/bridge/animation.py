@@ -11,12 +11,14 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Vector
+from mathutils import Quaternion, Vector
 
 from .. import compat
 
 _HEADER = struct.Struct("<12siiffi")
 MODIFIER = "Limber motion"
+_STEPPED, _STRAIGHT = 0, 1
+"""Blender's numbers for interpolation between keys."""
 
 
 class CacheError(ValueError):
@@ -114,12 +116,18 @@ def move_along(target: bpy.types.Object, points: np.ndarray, frame_start: int = 
 
     It is left at its first place, where it stands at ``frame_start``.
     """
-    points = np.asarray(points, float)
-    for number, point in enumerate(points):
-        target.location = point
-        target.keyframe_insert("location", frame=frame_start + number / speed)
-    if len(points):
-        target.location = points[0]
+    _key(target, "location", np.asarray(points, float), frame_start, speed)
+
+
+def appear(target: bpy.types.Object, seen: np.ndarray, size: float, frame_start: int = 1, *,
+           speed: float = 1.0) -> None:
+    """Key the scale of ``target``: ``size`` where ``seen`` [frames] is true, else nothing of it.
+
+    By its scale, so that hiding it is still the user's.
+    """
+    sizes = np.where(np.asarray(seen, bool), size, 0.0)
+    _key(target, "scale", np.repeat(sizes[:, None], 3, axis=1), frame_start, speed,
+         is_stepped=True)
 
 
 def move_between(target: bpy.types.Object, starts: np.ndarray, ends: np.ndarray,
@@ -128,22 +136,41 @@ def move_between(target: bpy.types.Object, starts: np.ndarray, ends: np.ndarray,
 
     Both have the shape [frames, 3]; otherwise as :func:`move_along`.
     """
+    starts, ends = np.asarray(starts, float), np.asarray(ends, float)
     target.rotation_mode = "QUATERNION"
-    before = None
-    poses = []
-    for start, end in zip(np.asarray(starts, float), np.asarray(ends, float), strict=True):
-        turn = Vector(end - start).to_track_quat("Z", "Y")
-        if before is not None:
+    turns: list[Quaternion] = []
+    for way in ends - starts:
+        turn = Vector(way).to_track_quat("Z", "Y")
+        if turns:
             # Of the two quaternions of a rotation the one on this side: no spin in between.
-            turn.make_compatible(before)
-        before = turn
-        poses.append((Vector((start + end) / 2), turn))
-    for number, (place, turn) in enumerate(poses):
-        target.location, target.rotation_quaternion = place, turn
-        for channel in ("location", "rotation_quaternion"):
-            target.keyframe_insert(channel, frame=frame_start + number / speed)
-    if poses:
-        target.location, target.rotation_quaternion = poses[0]
+            turn.make_compatible(turns[-1])
+        turns.append(turn)
+    _key(target, "location", (starts + ends) / 2, frame_start, speed)
+    _key(target, "rotation_quaternion", np.array(turns, float).reshape(-1, 4), frame_start, speed)
+
+
+def _key(target: bpy.types.Object, channel: str, values: np.ndarray, frame_start: int,
+         speed: float, *, is_stepped: bool = False) -> None:
+    """Key a channel to rows of ``values``, all at once, and leave it at the first.
+
+    Straight from one key to the next, as the cache goes, or in steps.
+    """
+    if not len(values):
+        return
+    setattr(target, channel, values[0].tolist())
+    # The first makes the curves, whatever this Blender keeps them in.
+    target.keyframe_insert(channel, frame=frame_start)
+    frames = frame_start + np.arange(len(values)) / speed
+    for curve in compat.fcurves_of(target):
+        if curve.data_path != channel:
+            continue
+        points = curve.keyframe_points
+        points.add(len(values) - len(points))
+        points.foreach_set("co", np.column_stack(
+            [frames, values[:, curve.array_index]]).astype(np.float32).ravel())
+        points.foreach_set("interpolation", np.full(len(values), _STEPPED if is_stepped else
+                                                    _STRAIGHT, np.int32))
+        curve.update()
 
 
 def retime(things: Iterable[bpy.types.Object], moved: bpy.types.Object, frame_start: float,

@@ -20,6 +20,7 @@ GROUPS = {
     "skeleton": ("Skeleton", ("skeleton",)),
     "radii": ("Skeleton Radii", ("rods:skeleton",)),
     "fit": ("Measured over Simulated", ("rods:fit",)),
+    "observed": ("Measured Points", ("observed",)),
     "rest": ("Rest Shape", ("rest",)),
     "base": ("Fixed Base", ("base",))}
 """What can be shown and hidden: its title, and the keys of the objects that show it."""

@@ -86,7 +86,7 @@ def _draw() -> None:
     right = context.region.width - covered_width(context, "UI") - (_MARGIN + _RIGHT + _WIDTH) * size
     frame = _Frame(right, (_MARGIN + _BELOW) * size, size)
     _draw_paper(frame, graph)
-    _draw_content(frame, graph, _cursor(graph, surface, context.scene))
+    _draw_content(frame, graph, cursor_of(settings.graph, surface, context.scene))
     gpu.state.blend_set("NONE")
 
 
@@ -125,12 +125,14 @@ def _draw_content(frame: _Frame, graph: dict, cursor: float | None) -> None:
             x += 14 + frame.text(part["label"], x, _HEIGHT + 10, color=(*part["color"], 1.0))
 
 
-def _cursor(graph: dict, surface: bpy.types.Object, scene: bpy.types.Scene) -> float | None:
-    """Return where the frame in sight stands in the graph, None where it is of something else."""
-    places = graph.get("cursor") or []
+def cursor_of(name: str, surface: bpy.types.Object, scene: bpy.types.Scene) -> float | None:
+    """Return where the frame in sight stands in a graph, None where it is of something else."""
     info = branches.info_of(surface)
-    frames = info.get("frames") or {}
-    if not places or frames.get("name") != info.get("plan") or frames.get("count") != len(places):
+    places = graphs_of(surface)[name].get("cursor") or []
+    frames, observation = info.get("frames") or {}, info.get("observation") or {}
+    is_of_frames = observation.get("is_shown", False) if name == "force" else (
+        frames.get("name") == info.get("plan"))
+    if not places or not is_of_frames or frames.get("count") != len(places):
         return None
     number = round(animation.cache_frame(surface, scene.frame_current))
     return places[min(max(number, 0), len(places) - 1)]

@@ -294,6 +294,31 @@ def test_a_way_from_a_table_is_followed(folder, tmp_path):
                  *common]) == 2
 
 
+def test_a_pull_is_replayed(folder, tmp_path):
+    """Grasp, way, kind and name are the recording's; beside it, not instead of a simulation."""
+    from limber.store import Branch
+
+    call(["simulate", str(folder), "--kind", "static", "--frame-rate", "4", "--progress", "none"])
+    branch = Branch.open(folder)
+    with branch.stage("pull:a") as stage:
+        stage.path("pulls/a/pull.toml").write_text(
+            "observation = 'none'\n[grasp]\npoint_m = [0.0, 0.0, 0.2]\nradius_m = 0.02\n"
+            "mode = 'pinned'\n")
+        stage.path("pulls/a/robot.csv").write_text(
+            "t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n7,0,0,0.2,0,0,0\n9,0.02,0,0.2,0,0,0\n"
+            "127,0,0,0.2,0,0,0\n")
+    assert call(["simulate", str(folder), "--pull", "a", "--progress", "none"]) == 0
+    frames = _frames(folder, "a")
+    assert frames["frame_count"] == 121 and frames["rate"] == pytest.approx(1.0)
+    peak = int(np.argmax(frames["energies_j"]))
+    assert peak == 2 and frames["energies_j"][-1] < 1e-3 * frames["energies_j"][peak]
+    stages = Branch.open(folder).manifest.stages
+    assert {"simulate", "replay:a"} <= set(stages)
+    assert stages["replay:a"].settings["kind"] == "static"
+    for wrong in (["--pull", "b"], ["--pull", "a", "--along", str(tmp_path / "x.csv")]):
+        assert call(["simulate", str(folder), *wrong, "--progress", "none"]) == 2
+
+
 def test_a_plan_takes_the_duration(folder, tmp_path):
     """A table without times, as plans are, is spread over --duration."""
     way = tmp_path / "plan.csv"

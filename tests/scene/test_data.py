@@ -378,21 +378,6 @@ def test_scan_skeleton_and_path_energy(tmp_path, mesh):
     assert arrays["path_color:plan"][1, 0] > arrays["path_color:plan"][0, 0]
 
 
-def test_what_was_measured_over_time(tmp_path, mesh):
-    """Observed points of a pull; one not seen stands where it was last and is flagged."""
-    pull = {
-        "pulls/a/pull.toml": "observation = 'markers'\n[grasp]\npoint_m = [0.0, 0.0, 0.3]\n"
-                             "radius_m = 0.01\n",
-        "pulls/a/robot.csv": "t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n0,0,0,0.3,0,0,0\n"
-                             "1,0.1,0,0.3,0,0,0\n",
-        "pulls/a/markers.csv": "t_s,m0_x_m,m0_y_m,m0_z_m\n0,0,0,0.5\n0.5,,,\n1,0.2,0,0.5\n"}
-    data = scene_data(_branch(tmp_path / "a.branch", mesh, pull__a=pull))
-    assert data.info["observation"] == {"pull": "a"}
-    np.testing.assert_allclose(data.arrays["observation"][:, 0, 0], [0, 0, 0.2])
-    np.testing.assert_array_equal(data.arrays["observation_visible"][:, 0], [True, False, True])
-    np.testing.assert_allclose(data.arrays["observation_grasp"][:, 0], [0, 0.1])
-
-
 def test_the_map_offset_is_kept_in_double_precision(tmp_path, mesh):
     """A scan in map coordinates: where the branch's origin is there, to the micrometre."""
     branch = Branch.create(tmp_path / "a.branch")

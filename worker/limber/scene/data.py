@@ -39,6 +39,8 @@ Arrays (m, s, J, Pa; what a folder does not have is left out):
 visible`` [t, m], ``observation_times`` [t],    ``info["observation"]`` names, and the gripper
 ``observation_grasp`` [g, 3], ``observation_
 grasp_times`` [g]
+``observation_motion`` [frames, m, 3],          the same points in each frame, where the frames
+``observation_seen`` [frames, m]                are of that pull
 ``robot_links`` [frames, 8, 3],                 the arm of the plan's dry run: base, the origins of
 ``robot_radius`` [1]                            its six links, grasp; how thick to draw it
 ``frame_bounds`` [2, 3], ``view_points``,       what the camera must see, and its direction
@@ -60,7 +62,8 @@ from limber.mechanics.loaded import NamedTarget
 from limber.scene.arrays import FORMAT, SceneData
 from limber.scene.colours import colour_scale
 from limber.scene.fit import add_fit
-from limber.scene.motion import add_motion, add_observation
+from limber.scene.motion import add_motion
+from limber.scene.observation import add_observation
 from limber.scene.paths import add_hemisphere, add_plan
 from limber.scene.robot import add_robot
 from limber.scene.shape import (
@@ -115,7 +118,7 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     add_hemisphere(data, branch)
     add_motion(data, branch, plan, motion, strength)
     add_robot(data, branch, plan)
-    add_observation(data, branch, (data.info.get("frames") or {}).get("name"))
+    add_observation(data, branch)
     add_fit(data, branch, (data.info.get("observation") or {}).get("pull"))
     add_view(data)
     data.arrays = {name: np.ascontiguousarray(array) for name, array in data.arrays.items()}

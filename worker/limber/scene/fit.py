@@ -8,11 +8,10 @@ from limber.estimation.estimate_file import read_estimate
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale
 from limber.scene.graphs import force_graph, young_graph
+from limber.scene.observation import RESIDUAL, times_of_frames
 from limber.scene.rods import add_rods
 from limber.scene.shape import add_scalar
 from limber.store import Branch
-
-_TITLE = "measured to simulated"
 
 
 def add_fit(data: SceneData, branch: Branch, shown: str | None) -> None:
@@ -35,7 +34,9 @@ def add_fit(data: SceneData, branch: Branch, shown: str | None) -> None:
     if not pulls:
         return
     pull = pulls.get(shown) or next(iter(pulls.values()))
-    if (force := force_graph(pull)) is not None:
+    if (force := force_graph(pull["name"], pull["all_times_s"], pull["measured_force_n"],
+                             pull["simulated_force_n"],
+                             times_of_frames(data, pull["name"]))) is not None:
         data.info["graphs"]["force"] = force
     _add_distances(data, pull)
 
@@ -48,7 +49,7 @@ def _add_distances(data: SceneData, pull: dict[str, Any]) -> None:
     known = np.isfinite(distance)
     if not known.any():
         return
-    scale = colour_scale(distance[known], f"{_TITLE}, pull {pull['name']}", "m", "inferno")
+    scale = colour_scale(distance[known], f"{RESIDUAL}, pull {pull['name']}", "m", "inferno")
     size = float(np.ptp(data.arrays["vertices"], axis=0).max())
     # Simulated points of a moment are joined along the branch; measured ones are balls upon them.
     number = np.cumsum(known).reshape(known.shape) - 1
@@ -59,10 +60,13 @@ def _add_distances(data: SceneData, pull: dict[str, Any]) -> None:
              np.tile(distance[known], 2), scale, ball_from=int(known.sum()),
              ball_radius=0.009 * size)
     seen = known.any(axis=0)
+    if "residual" in data.info["frame_scalars"]:
+        # Of each frame of the pull that is played, which says more.
+        return
     if len(data.arrays.get("control_points", ())) == measured.shape[1] and seen.all():
         mean = np.sqrt((np.where(known, distance, 0.0)**2).sum(axis=0) / known.sum(axis=0))
         values = _around(data.arrays["control_points"], mean, data.arrays["vertices"])
-        add_scalar(data, "residual", values, colour_scale(values, _TITLE, "m", "inferno"))
+        add_scalar(data, "residual", values, colour_scale(values, RESIDUAL, "m", "inferno"))
 
 
 def _around(points: np.ndarray, values: np.ndarray, vertices: np.ndarray) -> np.ndarray:

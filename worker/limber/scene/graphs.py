@@ -3,7 +3,8 @@
 A graph is drawn by whoever shows it, in a frame of its own: all places are shares of the frame's
 width and height from its lower left corner, ticks are words. Lines are ``{"label", "color",
 "points", "is_dotted"}``, bands ``{"label", "color", "rows"}`` with rows ``[x, low, high]``; colours
-are sRGB. ``cursor`` has the place of each frame of the plan's motion, where the graph is of one.
+are sRGB. ``cursor`` has the place of each frame of the plan's or the pull's motion, where the graph
+is of one.
 """
 
 import math
@@ -164,19 +165,27 @@ def energy_graph(paths: dict[str, tuple[str, np.ndarray, np.ndarray]]) -> dict[s
     return graph.told()
 
 
-def force_graph(pull: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the measured and the simulated force of a pull over time; None without a force.
+def force_graph(name: str, times: np.ndarray, measured: np.ndarray,
+                simulated: np.ndarray | None = None, cursor: np.ndarray | None = None,
+                ) -> dict[str, Any] | None:
+    """Return the force of a pull over time; None where none was measured.
 
     Args:
-        pull: One of ``estimate.json``'s.
+        name: Of the pull.
+        times: [s], shape [n].
+        measured: Force of the gripper [N], shape [n, 3]; NaN where it was not measured.
+        simulated: What the estimate has there, likewise.
+        cursor: When each frame of the motion in sight is [s], on the same clock.
     """
-    times = np.array(pull["all_times_s"], float)
-    measured, simulated = (np.linalg.norm(np.array(pull[name], float).reshape(-1, 3), axis=1)
-                           for name in ("measured_force_n", "simulated_force_n"))
-    if not (np.isfinite(measured).any() and np.isfinite(simulated).any()):
+    known = {"measured": measured, "simulated": simulated}
+    forces = {label: np.linalg.norm(np.asarray(values, float).reshape(-1, 3), axis=1)
+              for label, values in known.items() if values is not None}
+    if not all(np.isfinite(force).any() for force in forces.values()):
         return None
-    graph = Graph(f"Force of pull {pull['name']}", Axis.over("time", "s", [times]),
-                  Axis.over("force", "N", [measured, simulated]))
-    graph.line("measured", MEASURED, times, measured, is_dotted=True)
-    graph.line("simulated", SIMULATED, times, simulated)
+    graph = Graph(f"Force of pull {name}", Axis.over("time", "s", [times]),
+                  Axis.over("force", "N", list(forces.values())),
+                  np.empty(0) if cursor is None else cursor)
+    graph.line("measured", MEASURED, times, forces["measured"], is_dotted=True)
+    if "simulated" in forces:
+        graph.line("simulated", SIMULATED, times, forces["simulated"])
     return graph.told()

@@ -1,12 +1,11 @@
-"""What moves in a scene: frames with their values, marks along them, and what was observed."""
+"""What moves in a scene: frames with their values, and marks along them."""
 
 import numpy as np
 
-from limber.errors import BranchFolderError, InputError
+from limber.errors import BranchFolderError
 from limber.mechanics.frames import FramesFile, read_frames_file, read_pc2
 from limber.mechanics.strength import STRENGTH_OVER_YOUNG, strength_of
 from limber.reading import read_arrays, require_shapes
-from limber.recordings.recording import read_pull
 from limber.scene.arrays import SceneData
 from limber.scene.colours import colour_scale, levels_of, palette
 from limber.scene.shape import add_scalar
@@ -63,45 +62,6 @@ def add_motion(data: SceneData, branch: Branch, plan: str | None, motion: str | 
     _add_carried(data, positions, name == plan)
 
 
-def add_observation(data: SceneData, branch: Branch, shown: str | None) -> None:
-    """Add what was measured in the pull that is shown, or in the newest: points over time.
-
-    ``observation`` [t, m, 3] m (the last place seen where ``observation_visible`` [t, m] is
-    false), ``observation_times`` [t] s; ``observation_grasp`` [g, 3] m of the gripper, and
-    ``observation_grasp_times`` [g] s, on the same clock.
-    """
-    pulls = [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]
-    data.info["pulls"] = pulls
-    name = shown if shown in pulls else (pulls[-1] if pulls else None)
-    if name is None:
-        return
-    try:
-        pull = read_pull(branch.path(f"pulls/{name}"))
-    except InputError as error:
-        data.info["notes"].append(f"pull {name} cannot be shown: {error}")
-        return
-    data.info["observation"] = {"pull": name}
-    data.arrays["observation_grasp"] = pull.poses[:, :3]
-    data.arrays["observation_grasp_times"] = pull.times
-    if pull.observations is not None and pull.observations.visible.any():
-        seen = pull.observations
-        data.arrays["observation"] = _held_on(seen.positions, seen.visible)
-        data.arrays["observation_visible"] = seen.visible
-        data.arrays["observation_times"] = seen.times + pull.entry.time_offset_s
-
-
-def _held_on(positions: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    """Return positions with those not seen where the point was seen last, or first."""
-    found = positions.copy()
-    found[~visible] = 0.0
-    for point in range(positions.shape[1]):
-        seen = np.flatnonzero(visible[:, point])
-        if len(seen):
-            last = np.searchsorted(seen, np.arange(len(positions)), side="right") - 1
-            found[:, point] = positions[seen[np.maximum(last, 0)], point]
-    return found
-
-
 def _finished(branch: Branch, name: str) -> str:
     """Return when frames were written, as the manifest says: a file's own time a copy changes."""
     return max((entry.finished for entry in branch.manifest.stages.values()
@@ -151,7 +111,7 @@ def _add_values(data: SceneData, branch: Branch, name: str, about: FramesFile,
         if key not in content or content[key].shape != (count, vertex_count):
             continue
         require_shapes(path, content, {key: (count, vertex_count)}, "values of a motion's frames")
-        _add_frame_scalar(data, scalar, content[key], title, unit, colours)
+        add_frame_scalar(data, scalar, content[key], title, unit, colours)
 
 
 def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
@@ -161,13 +121,13 @@ def _add_share_of_strength(data: SceneData, strength: float | None) -> None:
         return
     told = (f"{100 * STRENGTH_OVER_YOUNG:g} % of E, assumed" if strength is None
             else f"{strength / 1e6:.3g} MPa")
-    _add_frame_scalar(data, "stress_over_strength", stress / strength_of(young, strength),
+    add_frame_scalar(data, "stress_over_strength", stress / strength_of(young, strength),
                       f"stress over strength ({told})", "", "inferno", is_from_zero=True)
 
 
-def _add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
-                      colours: str, *, is_from_zero: bool = False) -> None:
-    """Add a value in each frame, and the worst of all frames, both on one scale."""
+def add_frame_scalar(data: SceneData, name: str, values: np.ndarray, title: str, unit: str,
+                     colours: str, *, is_from_zero: bool = False) -> None:
+    """Add a value in each frame [frames, v], and the worst of all frames, both on one scale."""
     values = values.astype(np.float32)
     worst, word = (values.min(axis=0), "least") if name == "det_f" else (
         values.max(axis=0), "peak")

@@ -28,6 +28,8 @@ def add_robot(data: SceneData, branch: Branch, plan: str | None) -> None:
     # A dry run of an older Limber does not say which arm it was.
     if entry is None or grasps is None or "model" not in entry.result or not branch.has(name):
         return
+    if (data.info.get("frames") or {}).get("name") != plan:
+        return
     table = read_columns(branch.path(name), (*_POSE, *_JOINTS), "the table of a dry run")
     places, joints = (np.column_stack([table[column] for column in columns])
                       for columns in (_POSE, _JOINTS))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from limber.errors import ConvergenceError
+from limber.errors import ConvergenceError, InputError
 from limber.files import write_atomically
 from limber.mechanics.settings import SimulateSettings
 from limber.progress import SILENT, Progress
@@ -25,21 +25,28 @@ if TYPE_CHECKING:
 
 
 KEY = "simulate"
+_MOST_REPLAYED = 120
+"""Frames of a recording that is replayed slowly."""
 
 
 class SimulateInputs(BranchInputs):
     """A branch folder, and the grasp's way."""
 
-    groups: ClassVar[Groups] = {"motion": ("along",)}
+    groups: ClassVar[Groups] = {"motion": ("along", "pull")}
 
     along: Path | None = Field(
         None, description="The grasp moves as the poses of a table do, from where it is: a "
         "recording's robot.csv, or a plan's plans/NAME.csv, which takes --duration.",
         json_schema_extra={"metavar": "FILE"})
+    pull: str | None = Field(
+        None, description="Replay this recording of the branch: grasped where and held as it was, "
+        "moved as the gripper was; grasp, kind and name of the result are the recording's. What "
+        "was measured can then be seen over it, frame by frame.",
+        json_schema_extra={"metavar": "NAME"})
 
 
 def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
-             along: PoseTable | None = None, force: bool = False,
+             along: PoseTable | None = None, key: str = KEY, force: bool = False,
              progress: Progress = SILENT) -> dict[str, Any]:
     """Pull the branch of a folder; write ``frames/NAME.pc2`` and ``frames/NAME.json``.
 
@@ -47,6 +54,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
         branch_folder: With a mesh.
         settings: How to pull.
         along: The grasp's way instead of a motion of the settings.
+        key: Of its entry in the manifest.
 
     Returns:
         The keys of the design's table: ``converged``, ``frame_count``, ``energy_j``,
@@ -70,9 +78,9 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     digests = {"along": along.digest()} if along else {}
     reads = [name for name in ("mesh.vtu", "point_masses.json", "targets.json")
              if branch.has(name)]
-    stored = branch.manifest.stages.get(KEY)
+    stored = branch.manifest.stages.get(key)
     if not force and stored and stored.result.get("converged") and branch.is_current(
-            KEY, settings, reads=reads, digests=digests):
+            key, settings, reads=reads, digests=digests):
         return stored.result
     progress(0.0, "preparing")
     model = with_masses(_model(branch, settings, progress), settings)
@@ -80,7 +88,7 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
     motion = motion_of(case, settings, progress.part(0.2, 0.9))
     for message in motion.warnings:
         progress.warn(message)
-    with branch.stage(KEY, settings, reads=reads, digests=digests) as stage:
+    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
         result = _write(stage, case.model, settings, motion)
         stage.result.update(result)
     progress(1.0, "done")
@@ -150,9 +158,46 @@ def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
 def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
+    if inputs.pull is not None:
+        settings, along = _replay(Branch.open(inputs.branch_folder), inputs, settings)
+        return simulate(inputs.branch_folder, settings, along=along,
+                        key=f"replay:{inputs.pull}", force=options.force, progress=progress)
     along = _poses(inputs.along, settings.duration, progress) if inputs.along else None
     return simulate(inputs.branch_folder, settings, along=along, force=options.force,
                     progress=progress)
+
+
+def _replay(branch: Branch, inputs: SimulateInputs, settings: SimulateSettings,
+            ) -> tuple[SimulateSettings, PoseTable]:
+    """Return the settings and the gripper's way of a recording.
+
+    Raises:
+        InputError: there is none of that name, or its gripper does not lead the branch.
+    """
+    from limber.mechanics.pose_table import PoseTable
+    from limber.recordings.recording import read_pull
+    from limber.stages.loading import known_pulls
+
+    if inputs.along is not None:
+        raise InputError("Both --along and --pull were given.", "Each is a way of the gripper.",
+                         "Give one of them.")
+    if inputs.pull not in known_pulls(branch):
+        raise InputError(f"There is no pull {inputs.pull!r}.",
+                         f"There are: {', '.join(known_pulls(branch)) or 'none'}.",
+                         "Import or record it first.")
+    pull = read_pull(branch.path(f"pulls/{inputs.pull}"))
+    if pull.entry.motion == "swing":
+        raise InputError(f"{inputs.pull} is a free swing.", "No gripper leads the branch there.",
+                         "`limber swing` fits it.")
+    grasp, way = pull.entry.grasp, PoseTable(pull.times, pull.poses)
+    is_static = pull.entry.motion == "quasi_static"
+    told = {"name": inputs.pull, "kind": "static" if is_static else "dynamic", "hold": 0.0,
+            "grasp_point": grasp.point_m, "grasp_radius": grasp.radius_m,
+            "grasp_mode": grasp.mode, "move": None, "turn": None, "grasp_force": None}
+    if is_static:
+        # Each frame is an equilibrium of its own, and a recording may last for minutes.
+        told["frame_rate"] = min(settings.frame_rate, _MOST_REPLAYED / way.duration)
+    return settings.model_copy(update=told), way
 
 
 def _poses(path: Path, duration: float, progress: Progress) -> PoseTable:
