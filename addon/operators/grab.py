@@ -16,7 +16,7 @@ from ..bridge import animation, meshes
 from ..session import HeldFrame, Session
 from ..stages import stages
 from ..worker import WorkerNotFound
-from . import live_loads
+from . import limits, live_loads
 from .live_loads import LiveLoads
 from .needs_result import NeedsBranchInObjectMode
 
@@ -121,6 +121,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
     def _begin(self, context) -> None:
         mesh = self._surface.data
         self._loads = LiveLoads(context.scene, self._surface)
+        self._tint, self._reached = limits.Tint(self._surface), []
         self._panel_drawn = 0.0
         self._rest = meshes.positions(mesh)
         self._mouse = self._waiting = None
@@ -191,6 +192,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._frame = frame
             meshes.set_positions(self._surface.data, frame.positions)
             self._loads.tell(frame)
+            self._show_limits(context, frame)
             self._region.tag_redraw()
             self._draw_panel()
         self._loads.step(self._session)
@@ -199,6 +201,12 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
             self._waiting = None
         self._send()
         return {"RUNNING_MODAL"}
+
+    def _show_limits(self, context, frame: HeldFrame) -> None:
+        """The branch is red while it is held beyond a limit of the plan."""
+        self._reached = limits.reached(context.scene, frame)
+        self._tint.show(self._hold is not None and any(
+            one.share > 1.0 for one in self._reached))
 
     def _send(self) -> None:
         """Say where the grasp is to go, if that is not said yet."""
@@ -220,6 +228,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         rest, place = seen
         if self._hold is not None:
             self._session.release()
+        self._target = None
         self._hold = Hold(rest, place, self._session.grasp(tuple(rest), self.radius))
 
     def _seen(self, context, mouse: tuple[int, int]) -> tuple[Vector, Vector] | None:
@@ -308,6 +317,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         self._session = None
         if self._surface is not None:
             self._loads.end(is_kept=is_kept)
+            self._tint.show(False)
             meshes.set_positions(self._surface.data, self._rest)
             if self._had_motion:
                 self._surface.modifiers[animation.MODIFIER].show_viewport = True
@@ -331,6 +341,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         lines, colour = self._lines()
         x, y = self._mouse or (20, 60)
         scale = bpy.context.preferences.system.ui_scale
+        if (place := self._held_at()) is not None:
+            limits.draw_ring(place, self._reached[0].share if self._reached else None, scale)
         blf.size(0, 14 * scale)
         blf.enable(0, blf.SHADOW)
         blf.shadow(0, 5, 0.0, 0.0, 0.0, 0.9)
@@ -350,12 +362,21 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         words = _WORDS[self._frame.who]
         if self._frame.who == "learning" and self._session.message:
             words = f"full model, slow; {self._session.message}"
-        limits = properties.group_of(bpy.context.scene, stages()["plan"])
-        over = [f"over the plan's {title}" for name, value, title in (
-                    ("max_force", force, "force"), ("max_energy", self._frame.energy, "energy"))
-                if getattr(limits, properties.OPEN + name) and value > getattr(limits, name)]
-        lines = [f"{force:.3g} N   {1000 * self._frame.energy:.3g} mJ", words, *over]
-        return lines, _OVER if over or self._frame.who == "untrusted" else _NORMAL
+        told = [f"{100 * one.share:.0f} % of the plan's {one.title}" for one in self._reached]
+        lines = [f"{force:.3g} N   {1000 * self._frame.energy:.3g} mJ", words, *told]
+        if self._frame.who == "untrusted":
+            return lines, _OVER
+        return lines, limits.colour_of(self._reached[0].share) if self._reached else _NORMAL
+
+    def _held_at(self) -> tuple[float, float] | None:
+        """Return where the grasp is in the view [pixels]; None where nothing is held or seen."""
+        hold = self._hold
+        if hold is None or hold.position is None:
+            return None
+        place = self._surface.matrix_world @ (self._target or hold.position)
+        seen = view3d_utils.location_3d_to_region_2d(
+            self._region, self._area.spaces.active.region_3d, place)
+        return None if seen is None else (seen.x, seen.y)
 
 
 class LIMBER_TOOL_grab(bpy.types.WorkSpaceTool):

@@ -99,6 +99,23 @@ def is_bent():
     return bent > 0.02
 
 
+def colour():
+    return surface().data.color_attributes.active_color.name
+
+
+def limit():
+    """A force that is passed by now: the branch is red from the next frame on."""
+    seen["colour"] = colour()
+    plan = bpy.context.scene.limber.plan
+    plan.use_max_force, plan.max_force = True, 1e-3
+    return event("MOUSEMOVE", move=(61, -4))
+
+
+def is_over():
+    seen["colour_over"] = colour()
+    return colour() == "limber_limit"
+
+
 def let_go():
     return event("LEFTMOUSE", "RELEASE", move=(60, -4))
 
@@ -114,6 +131,7 @@ def is_kept():
     seen["kept"] = [group.use_move, list(group.move), list(group.grasp_point), group.grasp_mode]
     seen["restored"] = max((now - then).length for now, then in zip(
         tip()[1], state["before"], strict=True))
+    seen["colour_after"] = colour()
     seen["motion_shown"] = surface().modifiers["Limber motion"].show_viewport
     return True
 
@@ -171,6 +189,6 @@ def is_whole():
     return waited(0.3) and not sessions()
 
 
-drive([open_result, begin, is_loaded, hover, press, drag, is_bent, picture("grab"), let_go, keep,
-       is_kept, undo, begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
+drive([open_result, begin, is_loaded, hover, press, drag, is_bent, limit, is_over, picture("grab"),
+       let_go, keep, is_kept, undo, begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
        is_loaded_down, picture("loads"), escape, is_whole, is_left], longest=100)

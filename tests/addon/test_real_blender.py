@@ -177,6 +177,7 @@ def test_grab(run, blender, environment, beam, tmp_path):
     assert abs(move[0]) > 0.02 and abs(move[1]) < 0.005
     assert abs(place[2] - 0.57) < 0.06, "where it was pressed"
     assert seen["restored"] < 1e-6 and seen["motion_shown"]
+    assert (seen["colour_over"], seen["colour_after"]) == ("limber_limit", seen["colour"])
     assert not seen["after_undo"]
     assert seen["sessions_left"] == 0 and not Path(f"/proc/{seen['session']}").exists()
     live = seen["live"]

@@ -1,0 +1,50 @@
+"""The limits of a plan while the branch is held: shares, colours, and colours that come back."""
+
+import importlib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture()
+def limits(registered):
+    return importlib.import_module("limber_addon.operators.limits")
+
+
+def test_only_limits_that_are_set_count(bpy, limits):
+    """Force 5 of 10 N, strain 3 of 2 %: the most used first; energy has no limit."""
+    plan = bpy.context.scene.limber.plan
+    frame = SimpleNamespace(force=(3.0, 4.0, 0.0), energy=99.0, strain=0.03)
+    assert limits.reached(bpy.context.scene, frame) == []
+    plan.use_max_force, plan.max_force = True, 10.0
+    plan.use_max_strain, plan.max_strain = True, 0.02
+    found = limits.reached(bpy.context.scene, frame)
+    assert [(one.title, one.share) for one in found] == [
+        ("strain", pytest.approx(1.5)), ("force", pytest.approx(0.5))]
+
+
+def test_colours_go_from_green_to_red(limits):
+    """Ever less green and more red; at the limit red at once."""
+    colours = np.array([limits.colour_of(share) for share in (0.0, 0.35, 0.7, 0.99, 1.0, 5.0)])
+    assert (np.diff(colours[:3, 0]) > 0).all() and colours[0, 1] > colours[0, 0]
+    np.testing.assert_allclose(colours[2], colours[3])
+    assert colours[4, 1] < 0.3 and (colours[4] == colours[5]).all()
+
+
+def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits, beam):
+    """Whatever it was coloured by; turning it on or off twice is nothing."""
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    surface = importlib.import_module("limber_addon.branches").find_surface(bpy.context.scene)
+    bpy.ops.limber.color_by(scalar="strain_energy")
+    tint, attributes = limits.Tint(surface), surface.data.color_attributes
+    for _ in range(2):
+        tint.show(True)
+        assert attributes.active_color.name == "limber_limit"
+        values = np.empty(4 * len(surface.data.vertices), np.float32)
+        attributes.active_color.data.foreach_get("color", values)
+        assert (values.reshape(-1, 4)[:, 0] > 10 * values.reshape(-1, 4)[:, 1]).all()
+    for _ in range(2):
+        tint.show(False)
+        assert attributes.active_color.name == "strain_energy_color"
+        assert "limber_limit" not in attributes
