@@ -9,6 +9,7 @@ import numpy as np
 from . import branches, compat
 from .overlays import graph as viewport_graph
 from .stages import Field, SettingError, Stage, rows_of, stages
+from .steps import DRY_RUNS, NOT_FROM_HERE
 
 OPEN = "use_"
 """Before the name of a field that may be left open: whether it is given."""
@@ -202,6 +203,18 @@ def _digits(field: Field) -> int:
     return 6 if field.unit == "m" or 0.0 < (field.default or 1.0) < 0.01 else 3
 
 
+def arguments_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> list[str]:
+    """Return the command line that runs a stage in a branch folder with what is set in ``scene``.
+
+    Raises:
+        SettingError: what is required is missing, or a text is no list of what it should be.
+    """
+    values = values_of(group_of(scene, stage), stage)
+    for name in NOT_FROM_HERE.get(stage.name, ()):
+        values.pop(name)
+    return stage.arguments({**values, "branch_folder": folder})
+
+
 def outcome_of(scene: bpy.types.Scene, stage: Stage, folder: str) -> dict[str, Any]:
     """Return how the stage last ended for the branch in ``folder``: error, warnings, status."""
     try:
@@ -215,11 +228,12 @@ def keep_outcome(scene: bpy.types.Scene, stage: Stage, folder: str, outcome: dic
                  ) -> None:
     """Keep what the user shall still read when the message is gone.
 
-    Where the branch folder keeps no result (of loads, of an export), that too.
+    Where the branch folder keeps no result (of loads, of an export, of a dry run), that too.
     """
-    common = ("status", "error", "warnings", "seconds")
+    common = ("status", "error", "warnings", "seconds", "arguments")
     kept = {name: outcome[name] for name in common if name in outcome}
-    if not stage.keeps_entry(values_of(group_of(scene, stage), stage, {"name"})):
+    if stage.name in DRY_RUNS or not stage.keeps_entry(
+            values_of(group_of(scene, stage), stage, {"name"})):
         kept["result"] = {name: value for name, value in outcome.items()
                           if name not in (*common, "command")}
     group_of(scene, stage).outcome = json.dumps({"folder": folder, **kept})

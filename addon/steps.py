@@ -10,8 +10,13 @@ FROM_SCENE = frozenset({"branch_folder", "output", "data", "render"})
 """Inputs that the add-on gives itself: no panel asks for them."""
 SHOWN_FILES = {"export": frozenset({"output"}), "skeleton": frozenset({"output"})}
 """Of those, what a stage does ask for: a file that is for other programs."""
-NOT_FROM_HERE = {"execute": frozenset({"arm", "confirm", "after_stop"})}
-"""What the add-on never sets: a robot is set in motion at a terminal, by who stands beside it."""
+NOT_FROM_HERE = {"execute": frozenset({"arm", "confirm", "after_stop"}),
+                 "record": frozenset({"confirm", "after_stop"}), "simulate": frozenset({"pull"})}
+"""What no panel keeps: that a robot may move is typed each time, a pull has a button of its own."""
+DRY_RUNS = frozenset({"execute"})
+"""Stages of which the add-on's button runs a part that the branch folder keeps no result of."""
+MOVES_ROBOT = frozenset({"record"})
+"""Stages whose button asks for a name to be typed first."""
 WAYS = frozenset({"move"})
 """Vectors in metres that say how far, not where: the 3D cursor does not give them."""
 REGIONS = ("goal", "tip_goal", "target_box", "workspace_low")
@@ -80,6 +85,7 @@ STEPS = (
          scene_operator=("limber.color_by", "Show Young's Modulus")),
     Step("pulls", "Pulls", StageView("import-pull", "Import Pull"),
          others=(StageView("virtual-pull", "Simulate a Pull"),
+                 StageView("record", "Record a Pull"),
                  StageView("export-pull", "Export a Pull"))),
     Step("estimate", "Estimate", StageView("estimate", "Estimate"),
          others=(StageView("swing", "Fit a Free Swing"),
@@ -92,7 +98,7 @@ STEPS = (
     Step("plan", "Plan", StageView("plan", "Plan Path", (
         "output", "weights and limits", "timing", "solver", "running"))),
     Step("robot", "Robot", StageView("execute", "Check With Robot"),
-         hint="A dry run: a robot is armed at a terminal"),
+         hint="A dry run first: nothing moves"),
     Step("report", "Report", StageView("report", "Write Report"),
          others=(StageView("export", "Export for Other Programs"),)),
 )
@@ -100,7 +106,7 @@ STEPS = (
 RUN = tuple(dict.fromkeys(view.stage for step in STEPS for view in (step.view, *step.others)))
 """The stages that the add-on can run."""
 NOT_RUN_HERE = {
-    "record": "it moves a robot", "generate": "it makes scans, no branch",
+    "generate": "it makes scans, no branch",
     "scene": "`limber.open_result` draws what it says"}
 """The others, and why."""
 

@@ -6,7 +6,7 @@ import bpy
 
 from .. import branch_folder, jobs, properties
 from ..stages import SettingError, Stage, stages
-from ..steps import NOT_FROM_HERE, RUN, button_of
+from ..steps import MOVES_ROBOT, NOT_FROM_HERE, RUN, button_of
 from .worker_operator import WorkerOperator
 
 _registered: list[type] = []
@@ -17,6 +17,8 @@ class StageOperator(WorkerOperator):
 
     stage_name = ""
     _folder: Path | None = None
+    _given: list[str] | None = None
+    _name = ""
     _is_asked = False
 
     @property
@@ -51,8 +53,8 @@ class StageOperator(WorkerOperator):
     def arguments(self, context):
         self._take_keywords(context)
         stage, settings = self.stage, context.scene.limber
-        values = properties.values_of(properties.group_of(context.scene, stage), stage)
         if _makes_branch(stage):
+            values = properties.values_of(properties.group_of(context.scene, stage), stage)
             trouble = self._foreign(context)
             if trouble and not self.replace:
                 raise ValueError(f"{trouble} Choose another branch folder, or run it with "
@@ -60,15 +62,15 @@ class StageOperator(WorkerOperator):
             if not settings.branch_folder:
                 settings.branch_folder = str(branch_folder.folder_for(self._source(context)))
             values["output"] = bpy.path.abspath(settings.branch_folder)
-        else:
-            if branch_folder.read_record(_folder_of(context)) is None and (
-                    not jobs.works_in(str(_folder_of(context)))):
-                raise ValueError("Choose a branch folder: one that holds a file branch.json.")
-            values["branch_folder"] = bpy.path.abspath(settings.branch_folder)
-        for name in NOT_FROM_HERE.get(stage.name, ()):
-            values.pop(name)
-        self._folder = _folder_of(context)
-        return stage.arguments(values)
+            self._folder = folder_of(context)
+            return stage.arguments(values)
+        if branch_folder.read_record(folder_of(context)) is None and (
+                not jobs.works_in(str(folder_of(context)))):
+            raise ValueError("Choose a branch folder: one that holds a file branch.json.")
+        self._folder = folder_of(context)
+        self._given = properties.arguments_of(context.scene, stage, str(self._folder))
+        self._name = getattr(properties.group_of(context.scene, stage), "name", "")
+        return self._given
 
     def folder(self, context):
         return str(self._folder)
@@ -84,15 +86,30 @@ class StageOperator(WorkerOperator):
                                   f"{best['end_m']} m")
         if bpy.app.background or not _is_seen(self.stage):
             return
+        self._show_what_was_made(context)
         # The folder that this job filled, whatever the scene names by now.
         bpy.ops.limber.open_result("INVOKE_DEFAULT", directory=str(self._folder))
 
+    def _show_what_was_made(self, context) -> None:
+        """Let the scene show the plan or the motion that this stage has just made, whatever it
+        was told to show before."""
+        shown = context.scene.limber.scene
+        made = next((name.removeprefix("frames/").removesuffix(".pc2")
+                     for name in self.stage.writes if name.endswith(".pc2")), "")
+        if not made or not self._name:
+            return
+        if any(name.startswith("plans/") for name in self.stage.writes):
+            shown.plan, shown.motion = self._name, ""
+        else:
+            shown.motion = made.format(name=self._name)
+
     def ended(self, context, outcome):
-        properties.keep_outcome(context.scene, self.stage, str(self._folder), outcome)
+        properties.keep_outcome(context.scene, self.stage, str(self._folder),
+                                {**outcome, "arguments": self._given})
 
     def _take_keywords(self, context) -> None:
         group = properties.group_of(context.scene, self.stage)
-        for name in properties.stage_properties(self.stage):
+        for name in _own_properties(self.stage):
             if not self.properties.is_property_set(name):
                 continue
             if name == ("output" if _makes_branch(self.stage) else "branch_folder"):
@@ -119,13 +136,14 @@ class StageOperator(WorkerOperator):
         source = self._source(context)
         if not context.scene.limber.branch_folder:
             return ""
-        folder = _folder_of(context)
+        folder = folder_of(context)
         if branch_folder.belongs(folder, branch_folder.file_sha256(source)):
             return ""
         return f"{folder.name} was not made of {source.name}: its results would be overwritten."
 
 
-def _folder_of(context) -> Path:
+def folder_of(context) -> Path:
+    """Return the branch folder that the scene names, absolute."""
     return Path(bpy.path.abspath(context.scene.limber.branch_folder))
 
 
@@ -140,24 +158,32 @@ def _is_seen(stage: Stage) -> bool:
                or name.startswith(("plans/", "frames/", "executions/")) for name in stage.writes)
 
 
+def stage_operator(name: str, base: type = StageOperator) -> type:
+    """Return the operator of a stage; ``base`` is the mix-in that runs it."""
+    stage = stages()[name]
+    return type(f"LIMBER_OT_{properties.attribute_name(name)}", (base, bpy.types.Operator), {
+        "__annotations__": _own_properties(stage) | {"replace": bpy.props.BoolProperty(
+            name="Replace", options={"HIDDEN", "SKIP_SAVE"},
+            description="Also where the folder holds the branch of another scan")},
+        "__doc__": stage.summary.rstrip("."), "__module__": __name__, "stage_name": name,
+        "bl_idname": f"limber.{properties.attribute_name(name)}", "bl_label": button_of(name)})
+
+
+def _own_properties(stage: Stage) -> dict:
+    """Return the properties of a stage's operator by name, but those that no panel keeps."""
+    kept = NOT_FROM_HERE.get(stage.name, frozenset())
+    hidden = {*kept, *(properties.OPEN + name for name in kept)}
+    # Not saved: what a script gave once is not given again by the button.
+    return {name: value for name, value in
+            properties.stage_properties(stage, {"SKIP_SAVE"}).items() if name not in hidden}
+
+
 def register() -> None:
     for name in RUN:
-        stage = stages()[name]
-        # Not saved: what a script gave once is not given again by the button.
-        own = properties.stage_properties(stage, {"SKIP_SAVE"})
-        for kept in NOT_FROM_HERE.get(name, ()):
-            own = {key: value for key, value in own.items()
-                   if key not in (kept, properties.OPEN + kept)}
-        operator = type(f"LIMBER_OT_{properties.attribute_name(name)}",
-                        (StageOperator, bpy.types.Operator), {
-            "__annotations__": own | {"replace": bpy.props.BoolProperty(
-                name="Replace", options={"HIDDEN", "SKIP_SAVE"},
-                description="Also where the folder holds the branch of another scan")},
-            "__doc__": stage.summary.rstrip("."), "__module__": __name__, "stage_name": name,
-            "bl_idname": f"limber.{properties.attribute_name(name)}",
-            "bl_label": button_of(name)})
-        bpy.utils.register_class(operator)
-        _registered.append(operator)
+        if name not in MOVES_ROBOT:
+            operator = stage_operator(name)
+            bpy.utils.register_class(operator)
+            _registered.append(operator)
 
 
 def unregister() -> None:

@@ -61,7 +61,7 @@ class WorkerOperator:
     def modal(self, context, event):
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
-        _redraw_sidebars(context)
+        redraw_sidebars(context)
         if self._job.poll() in (jobs.JobState.WAITING, jobs.JobState.RUNNING):
             return {"PASS_THROUGH"}
         self._remove_timer(context)
@@ -115,11 +115,11 @@ class WorkerOperator:
             self._timer = None
 
 
-def _redraw_sidebars(context: bpy.types.Context) -> None:
+def redraw_sidebars(context: bpy.types.Context) -> None:
+    """Let the panels be drawn again; not the view: a million points take their time."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "PREFERENCES":
                 area.tag_redraw()
             elif area.type == "VIEW_3D":
-                # Not the view itself: drawing a million points takes its time.
                 next(region for region in area.regions if region.type == "UI").tag_redraw()

@@ -9,6 +9,7 @@ from .. import branch_folder, jobs, properties
 from ..branch_folder import BranchRecord, StageRecord
 from ..stages import Field, Stage, stages
 from ..steps import (
+    DRY_RUNS,
     PLACES,
     REGIONS,
     STEPS,
@@ -21,7 +22,9 @@ from ..steps import (
 )
 from ..steps import next_step as step_after
 from .comparing import draw_moduli, draw_paths
+from .pulls import draw_pulls
 from .results import draw_results
+from .robot import draw_robot
 from .sidebar import SidebarPanel
 from .skeleton import draw_skeleton
 
@@ -58,6 +61,10 @@ class StepPanel(SidebarPanel):
             _draw_stage(layout, context, view, is_primary=True)
         if step.name == "skeleton":
             draw_skeleton(layout, context)
+        if step.name == "pulls":
+            draw_pulls(layout, context)
+        if step.name == "robot":
+            draw_robot(layout, context)
         if step.name == "report":
             layout.operator("limber.open_report", icon="URL")
         _draw_groups(layout, context, view)
@@ -92,8 +99,8 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
         return StepState.FAILED, entry
     if entry is None:
         # What makes no entry (a prediction) is done where it has ended well.
-        return (StepState.DONE if outcome.get("status") == "done"
-                and not stage.keeps_entry(values) else StepState.NOT_RUN), None
+        return (StepState.DONE if outcome.get("status") == "done" and (
+            name in DRY_RUNS or not stage.keeps_entry(values)) else StepState.NOT_RUN), None
     return _age(stage, group, record, entry), entry
 
 

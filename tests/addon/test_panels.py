@@ -122,11 +122,12 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct", "limber.skeleton"]),
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
     ("material", ["limber.color_by", "limber.simulate", "limber.load"]),
-    ("pulls", ["limber.import_pull", "limber.virtual_pull", "limber.export_pull"]),
+    ("pulls", ["limber.import_pull", "limber.virtual_pull", "limber.record",
+               "limber.export_pull"]),
     ("estimate", ["limber.estimate", "limber.swing", "limber.vibration", "limber.predict",
                   "limber.suggest_pull"]),
     ("goal", ["limber.energy", "limber.target"]), ("plan", ["limber.plan"]),
-    ("robot", ["limber.execute"]),
+    ("robot", ["limber.execute", "limber.arm"]),
     ("report", ["limber.report", "limber.open_report", "limber.export"])])
 def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, operators):
     """Its stages' buttons in order, and every setting of the schema that is not for experts."""
@@ -142,7 +143,7 @@ def test_a_step_has_one_primary_button_and_its_settings(bpy, panels, name, opera
             hidden = steps.hidden_fields(view.stage)
             wanted = view.groups is None and not field.is_expert and field.name not in hidden
             assert not wanted or field.name in drawn.names("prop"), (view.stage, field.name)
-    assert "arm" not in drawn.names("prop"), "no button moves a robot"
+    assert not {"arm", "confirm"} & set(drawn.names("prop")), "that it may move is typed each time"
 
 
 def test_the_expert_settings_are_shown_on_demand(bpy, panels):

@@ -1,0 +1,52 @@
+"""The force that a moving robot feels, read from the file that the worker writes meanwhile. No bpy.
+
+It is there also where the robot was armed at a terminal. Nothing is ordered from here.
+"""
+
+import json
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+FILE = ".robot-live.json"
+FORMAT = 1
+_OLDEST_SECONDS = 3.0
+"""What is older was left behind by a worker that was killed."""
+
+
+@dataclass(frozen=True)
+class LiveForce:
+    """What the gripper feels now [N]; ``force`` and ``expected`` are None where not known."""
+
+    title: str
+    step: str
+    force: float | None
+    expected: float | None
+    peak: float
+    limit: float
+
+    @property
+    def share(self) -> float:
+        """Of the limit, at which the guard pauses the robot."""
+        return (self.force or 0.0) / self.limit
+
+
+def read(folder: Path, now: float | None = None) -> LiveForce | None:
+    """Return what the robot at a branch feels; None while none moves, or what is there is no such
+    file."""
+    try:
+        told = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        if told["format"] != FORMAT or (time.time() if now is None else now) - told["at"] > (
+                _OLDEST_SECONDS):
+            return None
+        found = LiveForce(str(told["title"]), str(told["step"]), _number(told["force_n"]),
+                          _number(told["expected_n"]), _number(told["peak_n"]) or 0.0,
+                          _number(told["limit_n"]) or 0.0)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return found if found.limit > 0 else None
+
+
+def _number(value: float | None) -> float | None:
+    return float(value) if value is not None and math.isfinite(value) else None

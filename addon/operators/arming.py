@@ -1,0 +1,128 @@
+"""Let a robot move, once somebody has typed the name of what it shall do."""
+
+from typing import ClassVar
+
+import bpy
+
+from .. import branch_folder, jobs, properties
+from ..stages import stages
+from ..steps import MOVES_ROBOT
+from .run_stage import StageOperator, folder_of, stage_operator
+
+_WIDTH = 420
+_WARNING = ("The robot will move. Clear its workspace, and keep a hand",
+            "at the emergency stop: Stop Robot below is no substitute.")
+
+
+class MovesRobot(StageOperator):
+    """Mix-in: a stage that moves a robot; the worker compares what was typed with ``name``."""
+
+    confirm: bpy.props.StringProperty(
+        name="Type its name", options={"SKIP_SAVE"},
+        description="The name, typed by whoever stands beside the robot")
+
+    def invoke(self, context, event):
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        self._is_asked = True
+        return context.window_manager.invoke_props_dialog(self, width=_WIDTH,
+                                                          confirm_text="Move the Robot")
+
+    def draw(self, context):
+        column = self.layout.column(align=True)
+        for number, line in enumerate(_WARNING):
+            column.label(text=line, icon="BLANK1" if number else "ERROR")
+        name = self.name_of(context)
+        self.layout.label(text=f"To go on, type: {name}")
+        row = self.layout.row()
+        row.alert = bool(self.confirm) and self.confirm != name
+        row.prop(self, "confirm")
+
+    def arguments(self, context):
+        if jobs.is_running() or jobs.waiting():
+            # It would move when its turn comes, perhaps with nobody there any more.
+            raise ValueError("The worker is busy. A robot moves at once or not at all: try again "
+                             "when nothing runs or waits.")
+        if trouble := self.trouble(context):
+            raise ValueError(trouble)
+        if not self.confirm:
+            raise ValueError("Nobody confirmed that the robot may move: "
+                             f"type {self.name_of(context)}.")
+        given = super().arguments(context)
+        return [given[0], *self.orders(), *given[1:]]
+
+    def orders(self) -> list[str]:
+        """Return the options that let the robot move."""
+        return ["--confirm", self.confirm, "--after-stop", "hold"]
+
+    def name_of(self, context) -> str:
+        """Return what has to be typed."""
+        return properties.group_of(context.scene, self.stage).name
+
+    def trouble(self, context) -> str:
+        """Return why the robot may not move yet, or nothing."""
+        return ""
+
+
+class LIMBER_OT_arm(MovesRobot, bpy.types.Operator):
+    """Follow the plan with the robot that the dry run was made for: approach, grasp, path and
+    back. Asks for the plan's name to be typed"""
+
+    bl_idname = "limber.arm"
+    bl_label = "Move the Robot"
+    bl_options: ClassVar = {"REGISTER"}
+    stage_name = "execute"
+    title = "Robot follows the plan"
+
+    replace: bpy.props.BoolProperty(options={"HIDDEN", "SKIP_SAVE"})
+
+    @classmethod
+    def poll(cls, context):
+        if trouble := why_not_armed(context):
+            cls.poll_message_set(trouble)
+        return not trouble
+
+    def orders(self):
+        return ["--arm", *super().orders()]
+
+    def trouble(self, context):
+        return why_not_armed(context)
+
+    def _take_keywords(self, context) -> None:
+        """It has none of the stage's: the panel's settings are those of the dry run."""
+
+
+def why_not_armed(context: bpy.types.Context) -> str:
+    """Return why the plan may not be followed yet: it was not checked as it is now; or nothing."""
+    stage, folder = stages()["execute"], folder_of(context)
+    group = properties.group_of(context.scene, stage)
+    outcome = properties.outcome_of(context.scene, stage, str(folder))
+    if outcome.get("status") != "done":
+        return "Check it with the robot first: a dry run"
+    try:
+        given = properties.arguments_of(context.scene, stage, str(folder))
+    except ValueError as error:
+        return str(error)
+    if outcome.get("arguments") != given:
+        return "The settings have changed since the dry run: check it with the robot again"
+    record = branch_folder.read_record(folder)
+    preview = record.stages.get(f"execute-preview:{group.name}") if record else None
+    plan = f"plans/{group.name}.csv"
+    if preview is None or plan not in record.files or (
+            preview.reads.get(plan) != record.files[plan][0]):
+        return "The plan has changed since the dry run: check it with the robot again"
+    return ""
+
+
+_registered: list[type] = []
+
+
+def register() -> None:
+    for operator in (LIMBER_OT_arm, *(stage_operator(name, MovesRobot) for name in MOVES_ROBOT)):
+        bpy.utils.register_class(operator)
+        _registered.append(operator)
+
+
+def unregister() -> None:
+    while _registered:
+        bpy.utils.unregister_class(_registered.pop())

@@ -1,0 +1,53 @@
+"""Move the branch as a recording says, and show what was measured over it."""
+
+from pathlib import Path
+from typing import ClassVar
+
+import bpy
+
+from .. import branch_folder
+from .run_stage import folder_of
+from .worker_operator import WorkerOperator
+
+
+class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
+    """Move the branch, as the model has it now, as this recording moved the real one; what was
+    measured is shown over it, frame by frame"""
+
+    bl_idname = "limber.replay_pull"
+    bl_label = "Replay a Pull"
+    bl_options: ClassVar = {"REGISTER"}
+    title = "Replaying the pull"
+
+    pull: bpy.props.StringProperty(name="Pull", description="Name of the recording")
+    _folder: Path | None = None
+
+    def arguments(self, context):
+        folder = folder_of(context)
+        if self.pull not in pulls_of(branch_folder.read_record(folder)):
+            raise ValueError(f"The branch has no pull {self.pull!r}: import one first.")
+        self._folder = folder
+        return ["simulate", "--pull", self.pull, "--", str(folder)]
+
+    def folder(self, context):
+        return str(self._folder)
+
+    def finish(self, context, result):
+        context.scene.limber.scene.motion = self.pull
+        bpy.ops.limber.open_result(
+            "EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT",
+            directory=str(self._folder))
+
+
+def pulls_of(record: branch_folder.BranchRecord | None) -> list[str]:
+    """Return the names of a branch's recordings, sorted."""
+    return sorted(name.split("/")[1] for name in (record.files if record else ())
+                  if name.startswith("pulls/") and name.endswith("/pull.toml"))
+
+
+def register() -> None:
+    bpy.utils.register_class(LIMBER_OT_replay_pull)
+
+
+def unregister() -> None:
+    bpy.utils.unregister_class(LIMBER_OT_replay_pull)

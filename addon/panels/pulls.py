@@ -1,0 +1,45 @@
+"""The part of the pulls' panel that plays recordings over the branch."""
+
+from pathlib import Path
+
+import bpy
+
+from .. import branch_folder, branches
+from ..operators.replay import pulls_of
+
+
+def draw_pulls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the recordings of the branch; of that in sight, when it is and what is measured."""
+    folder = bpy.path.abspath(context.scene.limber.branch_folder)
+    names = pulls_of(branch_folder.read_record(Path(folder)) if folder else None)
+    if not names:
+        return
+    surface = branches.find_surface(context.scene)
+    info = branches.info_of(surface) if surface is not None else {}
+    shown = info.get("observation") or {}
+    layout.label(text="Replay over the branch:")
+    for name in names:
+        is_shown = shown.get("is_shown", False) and shown["pull"] == name
+        layout.operator("limber.replay_pull", text=name, depress=is_shown,
+                        icon="PLAY").pull = name
+        if is_shown:
+            _draw_timeline(layout, context, info)
+
+
+def _draw_timeline(layout: bpy.types.UILayout, context: bpy.types.Context, info: dict) -> None:
+    """Draw where in the recording the frame in sight is."""
+    frames, scene = info["frames"], context.scene
+    count = sum(thing.get(branches.SHOWS_KEY) == "observed" for thing in scene.objects)
+    column = layout.column(align=True)
+    column.label(text=f"{(frames['count'] - 1) / frames['rate_hz']:.3g} s, {count} points seen"
+                 if count else "No points were observed", icon="TIME")
+    row = column.row(align=True)
+    playing = bool(context.screen) and context.screen.is_animation_playing
+    row.operator("limber.play", text="", icon="PAUSE" if playing else "PLAY")
+    row.prop(scene, "frame_current", text="Frame")
+    if "force" in (info.get("graphs") or {}):
+        column.operator("limber.graph", text="Force over Time", icon="GRAPH",
+                        depress=scene.limber.graph == "force").graph = "force"
+    if "residual" in (info.get("frame_scalars") or {}):
+        button = column.operator("limber.color_by", text="Colour by the Distance", icon="COLOR")
+        button.scalar, button.each_frame = "residual", True

@@ -1,0 +1,78 @@
+"""The part of the robot's panel that arms it, and shows what it feels while it moves."""
+
+from pathlib import Path
+
+import bpy
+
+from .. import jobs, live_force
+from ..operators.arming import LIMBER_OT_arm, why_not_armed
+from ..operators.worker_operator import redraw_sidebars
+from ..steps import MOVES_ROBOT, button_of
+
+_TITLES = (LIMBER_OT_arm.title, *(button_of(name) for name in MOVES_ROBOT))
+"""Jobs in which a robot moves."""
+_LOOK_SECONDS = 0.2
+_LOOK_AGAIN_SECONDS = 1.0
+_seen: dict[str, bool] = {}
+
+
+def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the live force where a robot moves, else the button that lets it."""
+    folder = _folder(context)
+    live = live_force.read(folder) if folder is not None else None
+    job = jobs.current()
+    is_ours = job is not None and job.state is jobs.JobState.RUNNING and job.title in _TITLES
+    if live is not None:
+        _draw_force(layout, live)
+    if is_ours:
+        row = layout.row()
+        row.scale_y = 2.0
+        row.alert = True
+        row.operator("limber.cancel_job", text="Stop Robot", icon="CANCEL")
+        layout.label(text="No emergency stop: that is the robot's own", icon="INFO")
+        return
+    trouble = why_not_armed(context)
+    column = layout.column()
+    column.operator("limber.arm", icon="ARMATURE_DATA")
+    if trouble:
+        words, _, rest = trouble.partition(": ")
+        column.label(text=words, icon="LOCKED")
+        if rest:
+            column.label(text=rest, icon="BLANK1")
+
+
+def _draw_force(layout: bpy.types.UILayout, live: live_force.LiveForce) -> None:
+    column = layout.column(align=True)
+    column.label(text=f"{live.title}: {live.step}" if live.step else live.title, icon="FORCE_FORCE")
+    words = "no reading" if live.force is None else f"{live.force:.2f} N"
+    bar = column.row()
+    bar.alert = live.share > 1.0
+    bar.progress(factor=min(live.share, 1.0), text=f"{words} of {live.limit:.3g} N")
+    expected = "" if live.expected is None else f", expected {live.expected:.2f} N"
+    column.label(text=f"Peak {live.peak:.2f} N{expected}")
+
+
+def _folder(context: bpy.types.Context) -> Path | None:
+    folder = context.scene.limber.branch_folder
+    return Path(bpy.path.abspath(folder)) if folder else None
+
+
+def _look() -> float:
+    """Redraw the sidebars while a robot moves, whoever let it; returns when to look again [s]."""
+    folder = _folder(bpy.context)
+    is_there = folder is not None and (folder / live_force.FILE).is_file()
+    if is_there or _seen.get("there"):
+        redraw_sidebars(bpy.context)
+    _seen["there"] = is_there
+    return _LOOK_SECONDS if is_there else _LOOK_AGAIN_SECONDS
+
+
+def register() -> None:
+    if not bpy.app.background:
+        bpy.app.timers.register(_look, first_interval=_LOOK_AGAIN_SECONDS, persistent=True)
+
+
+def unregister() -> None:
+    if bpy.app.timers.is_registered(_look):
+        bpy.app.timers.unregister(_look)
+    _seen.clear()
