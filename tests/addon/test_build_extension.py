@@ -1,5 +1,7 @@
 """scripts/build_extension: what is in the zip, with Blender's validator or without any."""
 
+import importlib.machinery
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -11,6 +13,55 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture()
+def build():
+    """The script, imported."""
+    loader = importlib.machinery.SourceFileLoader("build_extension",
+                                                  str(ROOT / "scripts" / "build_extension"))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(loader.name, loader))
+    loader.exec_module(module)
+    return module
+
+
+def _wheel(folder, name, needs=(), **files):
+    path = folder / name
+    with zipfile.ZipFile(path, "w") as archive:
+        package = "-".join(name.split("-")[:2])
+        archive.writestr(f"{package}.dist-info/METADATA", "Metadata-Version: 2.1\n" + "".join(
+            f"Requires-Dist: {need}\n" for need in needs))
+        for part, content in files.items():
+            archive.writestr(part.replace("__", "/") + ".so", content)
+    return path
+
+
+ELF = b"\x7fELF" + bytes(14) + b"\x3e\x00"
+ARM_MAC = b"\xcf\xfa\xed\xfe\x0c\x00\x00\x01"
+
+
+def test_wheels_are_judged_by_tag_content_and_what_they_require(build, tmp_path):
+    """One that fits; another Python's, another machine's program under a fitting name, a
+    requirement that is not there, one of too old a version, one that holds on Windows alone."""
+    good = _wheel(tmp_path, "fits-1.0-cp311-cp311-manylinux_2_17_x86_64.manylinux2014_x86_64.whl",
+                  ["needed>=2", "numpy>=1.26", "colorama; sys_platform == 'win32'",
+                   "docs; extra == 'docs'"], fits=ELF)
+    needed = _wheel(tmp_path, "Needed-2.1-py3-none-any.whl")
+    assert build.wheels_trouble([good, needed], "linux-x64", "3.11") == []
+    assert build.wheels_trouble([good], "linux-x64", "3.11") == [f"{good.name} requires needed>=2"]
+    old = _wheel(tmp_path, "needed-1.9-py3-none-any.whl")
+    assert build.wheels_trouble([good, old], "linux-x64", "3.11") == [
+        f"{good.name} requires needed>=2"]
+    assert "is not for Python 3.13" in build.wheels_trouble([good, needed], "linux-x64", "3.13")[0]
+    stable = _wheel(tmp_path, "stable-1.0-cp36-abi3-macosx_11_0_arm64.whl", library=ARM_MAC)
+    assert build.wheels_trouble([stable], "macos-arm64", "3.13") == []
+    wrong = _wheel(tmp_path, "wrong-1.0-cp311-cp311-macosx_10_9_universal2.whl", library=ELF)
+    assert build.wheels_trouble([wrong], "macos-arm64", "3.11") == [
+        f"{wrong.name}: library.so is no program for macos-arm64"]
+    on_windows = _wheel(tmp_path, "w-1.0-py3-none-win_amd64.whl",
+                        ["colorama; sys_platform == 'win32'"])
+    assert build.wheels_trouble([on_windows], "windows-x64", "3.13") == [
+        f"{on_windows.name} requires colorama; sys_platform == 'win32'"]
 
 
 def _build(root, out):
