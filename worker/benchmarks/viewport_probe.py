@@ -109,8 +109,9 @@ def grab_loop(branch: Path, count: int) -> None:
         number, start = reply["grasp"], np.array(reply["pose"][:3])
         # The reduced model answers from here on.
         learnt = _until(lambda: _who(held, number, start) == "reduced", 400, fail=False)
-        held_back, waits = _streamed(held, surface, meshes, number, start, count)
+        held_back, own, waits = _streamed(held, surface, meshes, number, start, count)
         say("grab", who="reduced" if learnt else "full", **spread(held_back),
+            **{f"own_{name}": value for name, value in spread(own).items()},
             **{f"drawn_{name}": value for name, value in spread(waits).items()})
         before = _memory_mb()
         for step in range(count):
@@ -136,12 +137,13 @@ def _who(held, number: int, start: np.ndarray) -> str:
 
 
 def _streamed(held, surface, meshes, number, start, count):
-    """Time of a loop on Blender's side, and from a pose to the mesh that shows it, each [s]."""
-    ours, waits, sent = [], [], {}
+    """Time of a loop on Blender's side, its processor's share of it, and from a pose to the mesh
+    that shows it, each [s]."""
+    ours, own, waits, sent = [], [], [], {}
     shown = held.frame().sequence
     for step in range(count):
         turn = 2 * np.pi * step / 200
-        began = time.perf_counter()
+        began, worked = time.perf_counter(), time.thread_time()
         held.poll()
         wanted = held.move(number, tuple(start + 0.01 * np.array([np.sin(turn), 0.0, 0.0])))
         sent[wanted] = began
@@ -150,6 +152,7 @@ def _streamed(held, surface, meshes, number, start, count):
             shown = frame.sequence
             meshes.set_positions(surface.data, frame.positions)
         ours.append(time.perf_counter() - began)
+        own.append(time.thread_time() - worked)
         while time.perf_counter() - began < 1 / 60:
             newer = held.frame(shown)
             if newer is None:
@@ -160,7 +163,7 @@ def _streamed(held, surface, meshes, number, start, count):
             bpy.context.view_layer.update()
             if newer.answers in sent:
                 waits.append(time.perf_counter() - sent[newer.answers])
-    return ours, waits
+    return ours, own, waits
 
 
 def job_memory(count: int) -> None:
