@@ -76,7 +76,7 @@ class StageOperator(WorkerOperator):
         return str(self._folder)
 
     def finish(self, context, result):
-        self.report({"INFO"}, f"{self.title}: done in {result['seconds']:.0f} s")
+        self.report({"INFO"}, f"{self.title}: done in {result.get('seconds', 0.0):.0f} s")
         if self.stage_name == "predict":
             position = result.get("grasp_position_m") or result.get("position_m")
             if position:

@@ -93,6 +93,8 @@ class WorkerOperator:
 
     def _end(self, context):
         job = self._job
+        if job.state is jobs.JobState.DONE and "status" not in job.result:
+            job.state, job.error = jobs.JobState.FAILED, _no_result(job)
         self.ended(context, {**job.result, "status": job.state.value, "error": job.error})
         for warning in job.result.get("warnings", []):
             self.report({"WARNING"}, warning)
@@ -113,6 +115,12 @@ class WorkerOperator:
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
+
+
+def _no_result(job: jobs.Job) -> str:
+    said = " ".join(line for line in list(job.log)[-2:] if line.strip())[:200]
+    return ("The worker ended without a result, so nothing is shown. Is the Python in the "
+            f"extension's preferences Limber's, and of this version? It said: {said or 'nothing'}")
 
 
 def redraw_sidebars(context: bpy.types.Context) -> None:
