@@ -11,7 +11,7 @@ import bpy
 sys.path.insert(0, str(Path(__file__).parent))
 from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, view, waited
 
-BENT = 14
+BENT, MOST_PULLED = 14, 73
 
 
 def jobs():
@@ -59,6 +59,18 @@ def see(graph, scalar, frame, *groups):
     return step
 
 
+def replay():
+    with override():
+        bpy.ops.limber.replay_pull("INVOKE_DEFAULT", pull="pull-1")
+    return True
+
+
+def is_replayed():
+    return bpy.data.objects.get("Measured point 1") is not None and not jobs().is_running() and (
+        waited(1.5))
+
+
 drive([begin, is_tab_open, picture("start"), open_example, is_open, save,
        see("energy", "stress_over_strength", BENT, "energy"), picture("stress"),
-       see("young", "young", 1), picture("young")], longest=60)
+       see("young", "young", 1), picture("young"),
+       replay, is_replayed, see("force", "residual", MOST_PULLED), picture("pull")], longest=100)

@@ -217,7 +217,7 @@ def test_manual_pictures(run, blender, environment, tmp_path):
     require_screen()
     driven("drive_manual.py", blender, environment, tmp_path)
     Path(kept).mkdir(parents=True, exist_ok=True)
-    for name in ("start", "stress", "young"):
+    for name in ("start", "stress", "young", "pull"):
         assert _colour_count(tmp_path / f"{name}.png") > 50
         _cropped(tmp_path / f"{name}.png").save(Path(kept) / f"{name}.png", optimize=True)
 
