@@ -108,7 +108,7 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     if "young" in mesh.cell_data:
         young = (node_average(mesh) @ mesh.cell_data["young"])[used]
         add_scalar(data, "young", young,
-                   colour_scale(young, "Young's modulus", "Pa", "viridis"))
+                   colour_scale(young, f"Young's modulus ({_origin(branch)})", "Pa", "viridis"))
     add_cloud(data, branch)
     add_skeleton(data, branch)
     add_skeleton_rods(data)
@@ -123,6 +123,12 @@ def scene_data(branch: Branch, plan: str | None = None, motion: str | None = Non
     add_view(data)
     data.arrays = {name: np.ascontiguousarray(array) for name, array in data.arrays.items()}
     return data
+
+
+def _origin(branch: Branch) -> str:
+    """Return where the mesh's modulus is from: one that was assumed looks the same in colours."""
+    made = branch.manifest.files.get("mesh.vtu")
+    return "assumed" if made is None or made.stage in ("reconstruct", "mesh") else "estimated"
 
 
 def _size_note(branch: Branch, mesh: TetMesh) -> str:
