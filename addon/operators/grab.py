@@ -362,7 +362,7 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
         words = _WORDS[self._frame.who]
         if self._frame.who == "learning" and self._session.message:
             words = f"full model, slow; {self._session.message}"
-        told = [f"{100 * one.share:.0f} % of the plan's {one.title}" for one in self._reached]
+        told = [one.words for one in self._reached]
         lines = [f"{force:.3g} N   {1000 * self._frame.energy:.3g} mJ", words, *told]
         if self._frame.who == "untrusted":
             return lines, _OVER
@@ -392,16 +392,29 @@ class LIMBER_TOOL_grab(bpy.types.WorkSpaceTool):
         layout.prop(tool.operator_properties("limber.grab"), "radius")
 
 
+_shortcuts: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
+
+
 def register() -> None:
     bpy.utils.register_class(LIMBER_OT_grab)
-    if not bpy.app.background:
-        bpy.utils.register_tool(LIMBER_TOOL_grab, after={"builtin.transform"}, separator=True)
+    if bpy.app.background:
+        return
+    bpy.utils.register_tool(LIMBER_TOOL_grab, after={"builtin.transform"}, separator=True)
+    # Among the add-ons' shortcuts: the user's own come before them, and may change them.
+    keys = bpy.context.window_manager.keyconfigs.addon
+    if keys is not None:
+        keymap = keys.keymaps.new("Object Mode")
+        _shortcuts.append((keymap, keymap.keymap_items.new(
+            "limber.grab", "B", "PRESS", shift=True, alt=True)))
 
 
 def unregister() -> None:
     from .. import session
 
     session.close_all()
+    while _shortcuts:
+        keymap, item = _shortcuts.pop()
+        keymap.keymap_items.remove(item)
     if not bpy.app.background:
         bpy.utils.unregister_tool(LIMBER_TOOL_grab)
     bpy.utils.unregister_class(LIMBER_OT_grab)

@@ -17,6 +17,8 @@ _TINT = "limber_limit"
 _OVER_LINEAR = (0.80, 0.02, 0.02)
 _FAR, _NEAR, _OVER = (0.35, 0.85, 0.40), (1.0, 0.80, 0.20), (1.0, 0.20, 0.15)
 _NEAR_SHARE = 0.7
+_TIMES = 10.0
+"""From here on a share is told as so many times the limit."""
 _RING_PIXELS, _RING_CORNERS = 11.0, 24
 
 
@@ -26,6 +28,13 @@ class Reached:
 
     title: str
     share: float
+
+    @property
+    def words(self) -> str:
+        """What the user reads."""
+        if self.share >= _TIMES:
+            return f"{self.share:.0f} times the plan's {self.title}"
+        return f"{100 * self.share:.0f} % of the plan's {self.title}"
 
 
 def reached(scene: bpy.types.Scene, frame: HeldFrame) -> list[Reached]:

@@ -22,6 +22,8 @@ def test_only_limits_that_are_set_count(bpy, limits):
     found = limits.reached(bpy.context.scene, frame)
     assert [(one.title, one.share) for one in found] == [
         ("strain", pytest.approx(1.5)), ("force", pytest.approx(0.5))]
+    assert found[0].words == "150 % of the plan's strain"
+    assert limits.Reached("force", 31.2).words == "31 times the plan's force"
 
 
 def test_colours_go_from_green_to_red(limits):
