@@ -4,9 +4,10 @@ import bpy
 
 
 def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
-    """Select ``thing``, let the 3D views show it whole and in its colours; one step for undo.
+    """Make ``thing`` active, and let the 3D views show it whole, in its colours; one undo step.
 
-    Nothing happens without a window.
+    Not selected: an outline would lie over the colours of thin twigs. Nothing happens without a
+    window.
     """
     if bpy.app.background or context.window is None:
         return
@@ -21,4 +22,5 @@ def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
         region = next(region for region in area.regions if region.type == "WINDOW")
         with context.temp_override(area=area, region=region):
             bpy.ops.view3d.view_selected()
+    thing.select_set(False)
     bpy.ops.ed.undo_push(message="Limber")

@@ -19,10 +19,12 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context):
         settings = context.scene.limber
-        self.layout.prop(settings, "branch_folder")
+        surface = branches.find_surface(context.scene)
+        self.layout.prop(settings, "branch_folder", text="Folder")
         draw_branches(self.layout, context)
-        self.layout.prop(settings.scene, "plan")
-        self.layout.prop(settings.scene, "motion")
+        if surface is not None:
+            self.layout.prop(settings.scene, "plan")
+            self.layout.prop(settings.scene, "motion")
         self.layout.operator("limber.open_result", icon="FILE_FOLDER")
         self.layout.prop(settings, "show_expert")
         if not preferences.has_worker():
@@ -31,7 +33,6 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
             column.label(text="Name the Python that has limber:")
             column.operator("preferences.addon_show", text="Preferences",
                             icon="PREFERENCES").module = preferences.KEY
-        surface = branches.find_surface(context.scene)
         if surface is not None:
             self.layout.operator("limber.grab", icon="VIEW_PAN")
             _draw_live(self.layout, settings)
