@@ -98,7 +98,7 @@ def why_not_armed(context: bpy.types.Context) -> str:
     group = properties.group_of(context.scene, stage)
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("status") != "done":
-        return "Check it with the robot first: a dry run"
+        return "Check it with the robot first: nothing moves then"
     try:
         given = properties.arguments_of(context.scene, stage, str(folder))
     except ValueError as error:

@@ -67,6 +67,8 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         if data.info.get("plan"):
             # Its numbers are those that the panel shall show.
             context.scene.limber.plan.name = data.info["plan"]
+            # The plan in sight is the one that a robot would follow.
+            context.scene.limber.execute.name = data.info["plan"]
         self._take_over_settings(context, data.folder)
         look_at(context, shown.surface)
         self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")

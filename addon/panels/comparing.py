@@ -9,7 +9,7 @@ from .. import branch_folder, branches
 from ..branch_folder import BranchRecord
 from ..operators import several
 
-_PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy sum", "energy_sum_nmm", 1.0, "N mm"),
+_PATH_ROWS = (("Length", "length_m", 1e3, "mm"), ("Energy", "energy_sum_nmm", 1.0, "N mm"),
               ("Peak energy", "peak_energy_j", 1e3, "mJ"), ("Peak force", "peak_force_n", 1.0, "N"),
               ("Peak strain", "peak_strain", 1e2, "%"))
 _PLAN = "plan:"
@@ -28,7 +28,8 @@ def draw_paths(layout: bpy.types.UILayout, result: dict[str, Any],
     draw_table(layout, rows)
     saved, longer = result.get("energy_saved_percent"), result.get("length_added_percent")
     if saved is not None and longer is not None:
-        layout.label(text=f"{saved:.0f} % of the energy saved, {longer:.1f} % longer")
+        layout.label(text=f"{saved:.0f} % of the energy saved, {abs(longer):.1f} % "
+                     f"{'longer' if longer >= 0 else 'shorter'}")
     gap = (result.get("certificate") or {}).get("gap_percent")
     layout.label(text="No bound was proven" if gap is None else
                  f"Proven: {gap:.1f} % over the least at most",

@@ -57,6 +57,12 @@ def test_a_checked_plan_is_followed_once_its_name_is_typed(bpy, checked):
     assert given[given.index("--after-stop") + 1] == "hold"
 
 
+def test_the_plan_in_sight_is_what_a_robot_would_follow(bpy, registered, beam):
+    """Opened, its name stands in the robot's panel: the panel's default names no plan."""
+    bpy.ops.limber.open_result(directory=str(beam.folder))
+    assert bpy.context.scene.limber.execute.name == "to-goal"
+
+
 def test_not_without_a_dry_run_of_the_same(bpy, checked, tmp_path):
     """Other settings, a plan made anew, another folder: it has to be checked again."""
     folder, _ = checked
@@ -70,7 +76,7 @@ def test_not_without_a_dry_run_of_the_same(bpy, checked, tmp_path):
         stage.path("plans/to-goal.csv").write_text("x_m,y_m,z_m\n0,0,0\n0,0,1\n")
     assert "plan has changed" in arming.why_not_armed(bpy.context)
     bpy.context.scene.limber.branch_folder = str(tmp_path / "another.branch")
-    assert "dry run" in arming.why_not_armed(bpy.context)
+    assert "Check it" in arming.why_not_armed(bpy.context)
 
 
 def test_a_robot_never_waits_for_its_turn(bpy, checked):
