@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
-from limber.errors import BranchFolderError, InputError, SafetyStop
+from limber.errors import BranchFolderError, InputError, SafetyStop, WorkError
 from limber.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.robot.cell import Cell
@@ -69,6 +69,15 @@ def test_nothing_moves_without_a_typed_name(branch_folder, tmp_path, worker_addr
     for confirm in (None, "something"):
         with pytest.raises(InputError, match="Nobody confirmed"):
             record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm=confirm))
+
+
+def test_a_recording_that_never_began_leaves_nothing(branch_folder, tmp_path):
+    """Nobody answers at the address: the name stays free, nothing is told to be cut off."""
+    path = cell_file(standing_at(Branch.open(branch_folder), "127.0.0.98"), tmp_path)
+    for _ in range(2):
+        with pytest.raises(WorkError, match="No robot answers"):
+            record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm="r"))
+    assert Branch.open(branch_folder).streams() == []
 
 
 def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path, worker_address):

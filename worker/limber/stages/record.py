@@ -134,14 +134,14 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
     from limber.robot.live import LiveForce
     from limber.robot.recorder import MarkerStream, PullRecorder
 
+    tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
+               if options.markers else None)
     stream = branch.stream(f"pulls/{name}/robot.csv")
     entry_lines = branch.stream(f"pulls/{name}/pull.toml")
     marker_lines = branch.stream(f"pulls/{name}/markers.csv") if options.markers else None
-    tracker = (MarkerStream(cell.robot.address, options.markers, cell.base.pose)
-               if options.markers else None)
+    recorders: list[PullRecorder] = []
     try:
         progress(0.02, "connecting")
-        recorders: list[PullRecorder] = []
         live = LiveForce(branch.folder, f"Recording {name}", cell.limits.soft_force_n)
 
         def take(rows: np.ndarray) -> None:
@@ -182,6 +182,9 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
         for lines in (stream, entry_lines, marker_lines):
             if lines is not None:
                 lines.close()
+                if not (recorders and recorders[0].count):
+                    # No sample came: there is nothing to take over, and the name stays free.
+                    lines.path.unlink(missing_ok=True)
         if tracker is not None:
             tracker.close()
 
