@@ -120,8 +120,11 @@ def test_what_is_compared_fits_a_terminal():
               "predicted_peak_force_n": 6.0, "peak_force_n": 6.1, "force_within_share": 0.97,
               "force_error_of_peak": 0.03, "extrapolation_error_n": 0.1,
               "flower_goal_m": [0.1, 0, 0.4], "flower_planned_m": None, "flower_m": [0.1, 0, 0.4],
-              "overload_way_m": 0.002, "overload_standstill_s": 0.08, "overload_reason": "limit"}
+              "overload_way_m": 0.002, "overload_standstill_s": 0.08, "overload_reason": "limit",
+              "pull_count": 2, "open_factor": 2.61, "no_further_pull": "enough for this plan",
+              "holding_force_n": 4.2, "max_force_n": 8.4}
     tables = dict(comparison(result))
     assert tables["Young's modulus"][1][-1] == "yes"
+    assert ["pulls", "2"] in tables["Whether that is enough"]
     assert ["way after it", "2.0 mm"] in tables["Safety"]
     assert [row[0] for row in tables["The flower"]] == ["", "flower's goal", "where it came to"]

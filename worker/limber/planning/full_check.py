@@ -36,7 +36,7 @@ def broken_on_full_model(path: ResolvedPath, limits: Limits, goal: Goal, nodes: 
     whole = path.approach.joined(path.solved)
     told += [str(broken) for broken in limits.broken(whole)]
     if path.is_whole and isinstance(goal, TargetGoal):
-        off = float(goal.region.distance(goal.place(path.solved)[None])[0])
+        off = goal.missed_by(path.solved)
         if off > goal.tolerance * _SLACK:
             told.append(f"the {goal.name} ends {1e3 * off:.1f} mm outside its goal")
     if met := limits.met(whole, nodes):

@@ -1,6 +1,6 @@
 """Where a path may end: the grasp at a place, or a place on the branch in a region."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -73,11 +73,13 @@ class TargetGoal:
         region: Where it shall be.
         target: Number of the named target; None: the branch's tip.
         name: Of the target.
+        inset: What plans stay off the region's outside by [m]: as far as the field was off there.
     """
 
     region: Region
     target: int | None = None
     name: str = "tip"
+    inset: float = 0.0
 
     @property
     def tolerance(self) -> float:
@@ -85,7 +87,8 @@ class TargetGoal:
         return self.region.depth
 
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
-        return self.region.distance(field.tip(points, self.target)) + self.tolerance
+        outside = self.region.distance(field.tip(points, self.target))
+        return outside + self.tolerance + self.inset
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         # The region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
@@ -106,6 +109,16 @@ class TargetGoal:
     def place(self, states: SolvedPoses) -> np.ndarray:
         """Return where the target is in the last of the states [m], shape [3]."""
         return states.tips[-1] if self.target is None else states.targets[-1, self.target]
+
+    def missed_by(self, states: SolvedPoses) -> float:
+        """Return how far outside the region the target is in the last state [m]; inside: below 0.
+        """
+        return float(self.region.distance(self.place(states)[None])[0])
+
+    def drawn_in(self, states: SolvedPoses) -> "TargetGoal":
+        """Return the goal further in by what the last of the states misses it by, at most half."""
+        missed = max(self.missed_by(states), 0.0)
+        return replace(self, inset=min(self.inset + 1.5 * missed, 0.5 * self.tolerance))
 
     def describe(self) -> dict:
         return {"kind": "tip" if self.target is None else "target", "target": self.name,

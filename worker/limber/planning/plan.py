@@ -97,12 +97,12 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     pace = pace or Pace(settings.speed, settings.acceleration)
     rounds: list[dict[str, Any]] = []
     pair = baseline = moving = None
-    planned_limits, risks = limits, []
+    planned_limits, aim, risks = limits, goal, []
     for number in range(settings.replans + 1):
         ahead = progress.part(number / (settings.replans + 1), (number + 1) / (
             settings.replans + 1))
         began = perf_counter()
-        before, pair = pair, plan_within(field, start, goal, settings, planned_limits,
+        before, pair = pair, plan_within(field, start, aim, settings, planned_limits,
                                          before=pair, progress=ahead.part(0.0, 0.3))
         planned = perf_counter()
         stopped = pair.certificate.stopped
@@ -116,6 +116,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             workers, ahead.part(0.3, 0.95))
         baseline = other[0] if other else baseline
         broken = broken_on_full_model(plan, limits, goal, grasp_model.mesh.nodes)
+        if isinstance(aim, TargetGoal) and plan.is_whole:
+            aim = aim.drawn_in(plan.solved)
         if doubt is not None and not broken:
             risks.append(doubt.risk(grasp_model, plan, limits, settings.confidence))
             broken = risks[-1].told()
