@@ -16,7 +16,7 @@ SCENES = sorted(FOLDER.glob("*.blend"))
 
 def test_there_are_small_examples():
     """That of the add-on and more, each under 1 MB with the folder that it plays."""
-    assert {"bending_branch", "young"} <= {path.stem for path in SCENES}
+    assert {"bending_branch", "young", "mature", "artificial"} <= {path.stem for path in SCENES}
     for scene in SCENES:
         parts = [scene, *(path for path in scene.with_suffix("").rglob("*") if path.is_file())]
         assert sum(path.stat().st_size for path in parts) < 1 << 20, scene.stem
