@@ -51,7 +51,8 @@ def _where_off(field: EnergyField, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return places [n, 3] half-way between neighbours where the energy is off most, and the sample
     nearest to each, [n]."""
     chart, positions = field.region.chart, field.samples.positions
-    flat, edges = chart.map(positions), neighbours(chart.map(positions))
+    flat = chart.map(positions)
+    edges = neighbours(flat)
     off = np.where(field.region.is_face(), 0.0, np.abs(field.missed[:, 0]))
     apart = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
     middles = chart.curved(flat[edges].mean(axis=1))
