@@ -3,7 +3,9 @@ in words, and the next one works."""
 
 import importlib
 import json
+import os
 import sys
+import threading
 import time
 from types import SimpleNamespace
 
@@ -91,13 +93,9 @@ def test_a_worker_that_hangs(bpy, use, monkeypatch):
     assert bpy.ops.limber.report() == {"FINISHED"}
 
 
+@pytest.mark.skipif(not os.path.exists("/proc"), reason="reads /proc")
 def test_nothing_of_a_job_stays_open(bpy, use):
     """Pipes and threads of twenty jobs are gone with them."""
-    import os
-    import threading
-
-    if not os.path.isdir("/proc/self/fd"):
-        pytest.skip("no /proc")
     use(GOOD)
     bpy.ops.limber.report()
     before = len(os.listdir("/proc/self/fd")), threading.active_count()

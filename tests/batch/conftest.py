@@ -1,5 +1,8 @@
-"""A batch whose stages run in the test's own process: quick, and its disk can be made to fail."""
+"""What tests of batches share: branch folders, and a batch in the test's own process, which is
+quick and whose disk can be made to fail.
+"""
 
+import shutil
 from concurrent.futures import Future
 
 import pytest
@@ -42,3 +45,11 @@ def here(monkeypatch):
     """Batches run in this process; returns what runs their tasks."""
     monkeypatch.setattr(course, "_ThisProcess", Here)
     return Here
+
+
+@pytest.fixture
+def two_branches(tmp_path, branch_template):
+    """A folder with ``one.branch`` and ``two.branch``."""
+    for name in ("one", "two"):
+        shutil.copytree(branch_template, tmp_path / f"{name}.branch")
+    return tmp_path

@@ -40,12 +40,10 @@ reach = {reach}
 
 
 @pytest.fixture
-def orchard(tmp_path, branch_template):
+def orchard(two_branches):
     """Two branch folders and a job file for them."""
-    for name in ("one", "two"):
-        shutil.copytree(branch_template, tmp_path / f"{name}.branch")
-    (tmp_path / "jobs.toml").write_text(JOBS.replace("{reach}", "0.2"))
-    return tmp_path
+    (two_branches / "jobs.toml").write_text(JOBS.replace("{reach}", "0.2"))
+    return two_branches
 
 
 def call(capsys, *arguments) -> tuple[int, dict]:

@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 
 import pytest
 
@@ -26,11 +25,9 @@ farthest = "50 cm"
 
 
 @pytest.fixture
-def orchard(tmp_path, branch_template, here):
-    for name in ("one", "two"):
-        shutil.copytree(branch_template, tmp_path / f"{name}.branch")
-    (tmp_path / "jobs.toml").write_text(JOBS)
-    return tmp_path
+def orchard(two_branches, here):
+    (two_branches / "jobs.toml").write_text(JOBS)
+    return two_branches
 
 
 @pytest.fixture

@@ -124,6 +124,16 @@ def closed(held, flange) -> str:
     return held.state
 
 
+def pulled_aside(held, flange, steps):
+    """Move the flange by 10 mm and wait so many steps; where it is then."""
+    moved = flange.copy()
+    moved[1, 3] += 0.01
+    for _ in range(steps):
+        held.wrench(moved, 0.002)
+        held._pipe.poll(0.05)
+    return moved
+
+
 def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
     """After a way of 30 mm the wrench at the flange is that of an own solution there."""
     flange = Controller("ur5e").flange
@@ -204,11 +214,7 @@ def test_sliding_in_the_grip_lets_the_force_fall(held):
     flange = Controller("ur5e").flange
     held.wrench(flange, 0.002)
     assert closed(held, flange) == "held"
-    moved = flange.copy()
-    moved[1, 3] += 0.01
-    for _ in range(50):
-        held.wrench(moved, 0.002)
-        held._pipe.poll(0.05)
+    moved = pulled_aside(held, flange, 50)
     before = np.linalg.norm(held.wrench(moved, 0.002)[:3])
     held.slide(0.5)
     after = np.linalg.norm(held.wrench(moved, 0.002)[:3])
@@ -236,11 +242,7 @@ def test_what_is_seen_stays_behind_by_what_gives_way(held):
     held.setting = replace(held.setting, compliance=1e-2)
     held.wrench(flange, 0.002)
     assert closed(held, flange) == "held"
-    moved = flange.copy()
-    moved[1, 3] += 0.01
-    for _ in range(200):
-        held.wrench(moved, 0.002)
-        held._pipe.poll(0.05)
+    pulled_aside(held, flange, 200)
     solution = held._solution
     behind = (held._gripper @ held._offset)[:3, 3] - solution.frame[:3, 3]
     assert behind == pytest.approx(1e-2 * solution.wrench[:3], abs=5e-5)
