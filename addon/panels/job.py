@@ -9,6 +9,9 @@ from .sidebar import SidebarPanel
 
 _LETTERS = 40
 _LOG_LINES = 12
+_MODULI_LINES = 8
+_OPEN = 100.0
+"""A modulus that may be so many times more or less is not known."""
 
 
 class LIMBER_PT_job(SidebarPanel, bpy.types.Panel):
@@ -84,9 +87,23 @@ def number_lines(numbers: dict) -> list[str]:
     lines = []
     if isinstance(numbers.get("best_m2"), int | float):
         lines.append(f"Loss {numbers['best_m2']:.3g} m² at best")
-    if isinstance(numbers.get("young_mpa"), str):
-        lines.append(f"E {numbers['young_mpa']} MPa"[:_LETTERS + 8])
+    young, factor = numbers.get("young_mpa"), numbers.get("young_factor")
+    if isinstance(young, str):
+        values = young.split()
+        if isinstance(factor, str) and len(factor.split()) == len(values):
+            values = [_with_interval(*pair) for pair in zip(values, factor.split(), strict=True)]
+        lines += textwrap.wrap(f"E {', '.join(values)} MPa", _LETTERS + 8)[:_MODULI_LINES]
     return lines
+
+
+def _with_interval(value: str, factor: str) -> str:
+    """Return a modulus as what its interval's ends are, where a worker's words are numbers."""
+    try:
+        middle, times = float(value), float(factor)
+    except ValueError:
+        return value
+    return f"{value} ({middle / times:.3g} to {middle * times:.3g})" if times < _OPEN else (
+        f"{value} (not known yet)")
 
 
 def register() -> None:

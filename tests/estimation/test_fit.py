@@ -193,6 +193,20 @@ def test_a_stopped_estimate_keeps_its_best_and_resumes(tmp_path, small_bench, no
     assert EvaluationLog(path, "another").resumed_count == 0
 
 
+def test_a_running_fit_tells_how_well_it_knows_the_moduli(small_bench, noisy):
+    """What is shown while it runs: E, and the factor of its 95 % interval."""
+    told = []
+    plain = small_bench.objective([noisy], SETTINGS)
+    objective = Objective(plain.forwards, plain.space, force_sigma=plain.force_sigma,
+                          progress=Progress(lambda _share, _message, numbers: told.append(numbers)))
+    objective.evaluate(np.log(TRUTH))
+    found = objective.evaluate(np.log(TRUTH) + 0.1, jacobian=True)
+    assert "young_factor" not in told[0]
+    factors = [float(word) for word in told[1]["young_factor"].split()]
+    covariance = np.linalg.inv(found.jacobian.T @ found.jacobian)
+    assert np.log(factors) == pytest.approx(1.96 * np.sqrt(np.diag(covariance)), rel=0.1)
+
+
 def test_three_pulls_know_more_than_one(small_bench, small_pull):
     """The same pull measured three times narrows every interval by about the root of three."""
     names = [replace(measured(small_pull, seed), name=f"pull-{seed}") for seed in (1, 2, 3)]

@@ -55,6 +55,13 @@ class Evaluation:
         """Half the sum of squared residuals."""
         return 0.5 * float(self.residual @ self.residual)
 
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviation that each free value has by these derivatives, shape [p]."""
+        _, values, rows = np.linalg.svd(self.jacobian, full_matrices=False)
+        spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
+        return np.sqrt(np.sum(spread**2, axis=1))
+
 
 @dataclass(frozen=True)
 class RawSlopes:
@@ -137,7 +144,8 @@ class Objective:
             best = self.log.best
             self._progress(min(self.forward_count / self._expected, 0.99), "fitting",
                            loss_m2=found.loss if found else np.inf, best_m2=best.loss,
-                           young_mpa=" ".join(f"{young / 1e6:.3g}" for young in values.young))
+                           young_mpa=" ".join(f"{young / 1e6:.3g}" for young in values.young),
+                           **_known_so_far(found, self.space))
         except (KeyboardInterrupt, Cancelled) as stop:
             raise Stopped("The estimate was stopped.") from stop
         if found is not None:
@@ -412,6 +420,15 @@ def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Sim
 
 def _seen(frames: Frames) -> np.ndarray:
     return np.isfinite(frames.positions).all(axis=2)
+
+
+def _known_so_far(found: Evaluation | None, space: ParameterSpace) -> dict[str, str]:
+    """By which factor each modulus may be wrong (95 %) if the fit ended here."""
+    if found is None or found.jacobian is None:
+        return {}
+    deviations = found.deviations[list(space.groups)]
+    return {"young_factor": " ".join(f"{np.exp(min(1.96 * each, 35.0)):.3g}"
+                                     for each in deviations)}
 
 
 def _whitening(frames: Frames) -> np.ndarray:

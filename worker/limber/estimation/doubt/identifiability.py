@@ -34,13 +34,11 @@ class Identifiability:
 def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiability:
     """Judge the data at an evaluation with derivatives."""
     jacobian = evaluation.jacobian
-    _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
-    spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
-    covariance = spread @ spread.T
+    values = np.linalg.svd(jacobian, compute_uv=False)
     together = np.r_[np.ones(space.group_count), np.zeros(space.size - space.group_count)]
     # Of the scale with the ratios known: the best that the data can do for it.
     information = float(np.sum((jacobian @ together)**2))
-    return Identifiability(values, np.sqrt(np.diag(covariance)),
+    return Identifiability(values, evaluation.deviations,
                            float(information**-0.5) if information > 0 else np.inf)
 
 

@@ -83,6 +83,8 @@ def follow(folder: Path, name: str, subject: Subject, settings: EstimateSettings
                 latest = states[-1]
                 progress(0.5 + 0.45 * share, "following", time_s=frame.time,
                          young_mpa=" ".join(f"{young / 1e6:.4g}" for young in latest.young),
+                         young_factor=" ".join(
+                             f"{np.sqrt(high / low):.3g}" for low, high in latest.interval),
                          enough=latest.enough)
                 for kind, is_so in (("enough", latest.enough), ("idle", latest.idle)):
                     if is_so and kind not in told:
