@@ -7,6 +7,8 @@ from pathlib import Path
 
 import fsspec
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+from fsspec.utils import infer_storage_options
 
 from limber import cli
 from limber.batch.addresses import checked_address, fetch, is_address, matching, plain_name
@@ -87,6 +89,33 @@ def test_a_transfer_that_is_stopped_or_fails_leaves_what_was_there(memory, tmp_p
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".csv"] == ["a.csv"]
     with pytest.raises(InputError, match="no address that can be used"):
         matching("nonsense://a/*")
+
+
+class Hosted(MemoryFileSystem):
+    """As fsspec has SFTP: the host belongs to the connection, and paths are without it."""
+
+    protocol = "hosted"
+
+    def __init__(self, host: str, **options):
+        super().__init__(**options)
+        self.host = host
+
+    @classmethod
+    def _strip_protocol(cls, path):
+        return infer_storage_options(path)["path"].rstrip("/")
+
+    @staticmethod
+    def _get_kwargs_from_urls(address):
+        return {"host": infer_storage_options(address)["host"]}
+
+
+def test_what_a_pattern_stands_for_keeps_its_host(memory, tmp_path):
+    fsspec.register_implementation("hosted", Hosted, clobber=True)
+    memory.pipe_file("/scans/a.ply", b"one")
+    assert matching("hosted://greenhouse/scans/*") == ["hosted://greenhouse/scans/a.ply"]
+    fetch("hosted://greenhouse/scans/a.ply", tmp_path / "a.ply", on)
+    fetch("hosted://greenhouse/scans", tmp_path / "scans", on)
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "scans/a.ply").read_bytes() == b"one"
 
 
 def test_a_folder_is_fetched_with_what_is_in_it(tmp_path):
@@ -195,7 +224,7 @@ name = "flower"
 at = [0.0, 0.0, 0.1]
 """)
     checked = read_jobs(jobs)
-    assert checked.branches[0].fetched[0][0] == "memory:///scans/one.csv"
+    assert checked.branches[0].fetched[0][0] == "memory://scans/one.csv"
     with pytest.raises(InputError, match="has addresses"):
         write_script(checked, "slurm")
     # A scan that is gone costs its own branch alone.
@@ -205,7 +234,7 @@ at = [0.0, 0.0, 0.1]
     (one, two) = ([records.of(branch, task) for task in branch.tasks]
                   for branch in checked.branches)
     assert [record.status for record in one] == ["done", "done"]
-    assert two[0].status == "failed" and "no memory:///scans/two.csv" in two[0].error
+    assert two[0].status == "failed" and "no memory://scans/two.csv" in two[0].error
     assert not memory.exists("/night/two.branch")
     memory.pipe_file("/scans/two.csv", BODY.encode())
     code, told = call(capsys, "batch", jobs, "--workers", "1", "--retry-failed")

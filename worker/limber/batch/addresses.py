@@ -79,7 +79,8 @@ def matching(pattern: str) -> list[str]:
     system, path = _system(checked_address(pattern))
     with _explained(pattern, "listed"):
         system.invalidate_cache()
-        return sorted(system.unstrip_protocol(found).rstrip("/") for found in system.glob(path))
+        before = _before(system, checked_address(pattern), path)
+        return sorted(f"{before}{found}".rstrip("/") for found in system.glob(path))
 
 
 def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
@@ -113,7 +114,7 @@ def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
             for place, one in found.items():
                 inner = made / _inside(path, place) if is_folder else made
                 inner.parent.mkdir(parents=True, exist_ok=True)
-                with _explained(system.unstrip_protocol(place), "read"):
+                with _explained(f"{_before(system, address, path)}{place}", "read"):
                     _copy(system, place, inner, one.get("size"), stop)
             if is_folder:
                 remove(target)
@@ -200,6 +201,13 @@ def _system(address: str) -> tuple[Any, str]:
         raise InputError(f"{address} is no address that can be used "
                          f"({type(error).__name__}: {error}).", "",
                          "fsspec's documentation lists the kinds there are.") from error
+
+
+def _before(system: Any, address: str, path: str) -> str:
+    """What stands in an address before its path: SFTP and its like leave the host out of paths."""
+    if address.endswith(path):
+        return address.removesuffix(path)
+    return system.unstrip_protocol(path).removesuffix(path)
 
 
 @contextmanager
