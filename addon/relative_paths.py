@@ -2,7 +2,8 @@
 
 A result opened before the first save has an absolute path: Blender cannot know better then. It is
 made relative when the file is saved. What is relative already, Blender itself keeps right in a
-modifier; of the settings and of what a collection shows, it does not know.
+modifier; of the settings and of what a collection shows, it does not know. So it is with what is
+appended from another file; Blender 4.2 does not tell of that, and *Find the Folder Again* has to.
 """
 
 from pathlib import Path
@@ -37,9 +38,37 @@ def _moved(value: str, folder: Path) -> str:
     return animation.relative_path(bpy.path.abspath(value), folder) if value else value
 
 
+@persistent
+def _after_import(context: "bpy.types.BlendImportContext", *_) -> None:
+    for item in context.import_items:
+        thing, library = item.id, item.source_library
+        if thing is None or thing.library is not None or library is None:
+            continue
+        there = Path(bpy.path.abspath(library.filepath)).parent
+        if isinstance(thing, bpy.types.Collection) and FOLDER_KEY in thing:
+            thing[FOLDER_KEY] = _brought(thing[FOLDER_KEY], there)
+        elif isinstance(thing, bpy.types.Scene):
+            settings = thing.limber
+            settings.branch_folder = _brought(settings.branch_folder, there)
+            settings.reconstruct.cloud = _brought(settings.reconstruct.cloud, there)
+
+
+def _brought(value: str, there: Path) -> str:
+    """Return a path of a file in ``there`` as the open file has it."""
+    if not value:
+        return value
+    path = bpy.path.abspath(value, start=str(there))
+    here = bpy.data.filepath
+    return animation.relative_path(path, Path(here).parent) if here else path
+
+
 def register() -> None:
     bpy.app.handlers.save_pre.append(_before_saving)
+    if hasattr(bpy.app.handlers, "blend_import_post"):
+        bpy.app.handlers.blend_import_post.append(_after_import)
 
 
 def unregister() -> None:
     bpy.app.handlers.save_pre.remove(_before_saving)
+    if hasattr(bpy.app.handlers, "blend_import_post"):
+        bpy.app.handlers.blend_import_post.remove(_after_import)

@@ -118,3 +118,24 @@ def test_folder_and_file_move_together(bpy, opened, beam, tmp_path):
     assert folder() == (moved / beam.folder.name).resolve()
     assert bpy.ops.limber.open_result() == {"FINISHED"}
     assert len([c for c in bpy.context.scene.collection.children if "limber_folder" in c]) == 1
+
+
+def test_a_branch_is_appended_to_another_file(bpy, opened, beam, tmp_path):
+    """Its folder is named as the other file sees it, saved or not; before 4.3 by one button."""
+    from pathlib import Path
+
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    for there in (tmp_path / "deep" / "er" / "b.blend", None):
+        bpy.ops.wm.read_homefile(use_empty=True)
+        if there is not None:
+            there.parent.mkdir(parents=True)
+            bpy.ops.wm.save_as_mainfile(filepath=str(there))
+        bpy.ops.wm.append(directory=str(tmp_path / "a.blend" / "Collection"), filename="beam")
+        branch = next(c for c in bpy.data.collections if "limber_folder" in c)
+        assert branch["limber_folder"].startswith("//") == (there is not None)
+        if not hasattr(bpy.app.handlers, "blend_import_post"):
+            assert bpy.ops.limber.relink(directory=str(beam.folder)) == {"FINISHED"}
+        assert Path(bpy.path.abspath(branch["limber_folder"])).resolve() == beam.folder.resolve()
+        assert bpy.ops.limber.choose_branch(branch=branch.name) == {"FINISHED"}
+        assert bpy.ops.limber.play() == {"FINISHED"}
+        assert bpy.ops.limber.color_by(scalar="strain_energy", each_frame=True) == {"FINISHED"}
