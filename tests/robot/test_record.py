@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
-from limber.errors import BranchFolderError, InputError, SafetyStop, WorkError
+from limber.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
 from limber.progress import SILENT
 from limber.recordings.recording import read_pull
 from limber.robot.cell import Cell
@@ -215,6 +215,17 @@ def test_way_points_begin_at_the_gripper(tmp_path):
     assert frames[:, :3, :3] == pytest.approx(np.tile(frames[0, :3, :3], (3, 1, 1)))
     with pytest.raises(InputError, match=r"10\.0 mm from the gripper"):
         way_through(path, gripper + np.r_[-9e-3, np.zeros(5)])
+
+
+def test_way_points_out_of_reach_are_refused(tmp_path):
+    """Before anything moves; said with the place, and how far the arm comes."""
+    path = tmp_path / "way.csv"
+    path.write_text("x_m,y_m,z_m\n0,0,0.5\n0,0,0.55\n-0.9,0,0.55\n")
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0.55, 0.1, 0.0, 0, 0, 0.4)},
+                tool={"grasp_pose": (0, 0, 0.15, 0, 0, 0)})
+    frames = way_through(path, np.array([0.0, 0.0, 0.5, 0, 1.2, 0]))
+    with pytest.raises(NoPathError, match=r"out of the arm.s reach.*nearer"):
+        there_and_back(cell, frames, speed=0.03, cycles=1, pause=0.5)
 
 
 def test_out_and_back_takes_as_long_each_way():

@@ -12,6 +12,7 @@ from limber.robot.kinematics import BRANCH_COUNT, inverse, singularity_distance
 # Between neighbouring poses of a path a joint turns little; more is a jump to another solution.
 _LARGEST_STEP = 0.35  # rad
 _NAMES = ("wrist", "elbow", "shoulder")
+_OUT_OF_REACH = "out of the arm's reach"
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def _one_branch(arm: Arm, branch: int, joints: np.ndarray, limits: np.ndarray,
                 singularity_margin: float, joint_margin: float) -> JointPath | Refusal:
     missing = np.isnan(joints).any(axis=1)
     if missing.any():
-        return Refusal(branch, int(missing.argmax()), "out of the arm's reach")
+        return Refusal(branch, int(missing.argmax()), _OUT_OF_REACH)
     joints = np.unwrap(joints, axis=0)
     distance = singularity_distance(arm, joints)
     close = distance.min(axis=1) < singularity_margin
@@ -158,5 +159,6 @@ def no_branch(refusals: list[Refusal], frames: np.ndarray) -> NoPathError:
         f"No joint branch of the arm carries the path: the best one ends at pose "
         f"{farthest.index + 1} of {len(frames)}, flange at ({place}) m in the robot's base frame: "
         f"{'; '.join(reasons)}.",
+        "The arm ends short of it." if reasons == [_OUT_OF_REACH] else
         "The arm would have to turn over on the way, and would swing the branch.",
         "Move the robot's base, choose a path nearer to it, or turn the tool.")
