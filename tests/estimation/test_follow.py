@@ -31,7 +31,7 @@ def test_rows_are_taken_as_they_are_written(tmp_path, plain_pull, monkeypatch):
         (live / name).write_text(text[:int(0.25 * len(text))])
     recorder = threading.Thread(target=record)
     recorder.start()
-    times = [frame.time for frame, _ in follow.paced(live, 1000.0)]
+    times = [frame.time for frame, _ in follow.paced(lambda: live, 1000.0)]
     recorder.join()
     assert np.all(np.diff(times) > 0)
     assert np.allclose(times, plain_pull.observations.times)
@@ -42,7 +42,7 @@ def test_a_replay_keeps_its_pace(tmp_path, plain_pull):
     write_pull(tmp_path / "p", plain_pull)
     started = time.monotonic()
     frames = []
-    for frame, share in follow.paced(tmp_path / "p", 20.0):
+    for frame, share in follow.paced(lambda: tmp_path / "p", 20.0):
         frames.append((frame.time, share))
         if share == 1.0:
             break
@@ -58,11 +58,40 @@ def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
     settings = EstimateSettings(pull=("live",))
     with bare_branch.stream("pulls/live/pull.toml") as lines:
         lines.append("# growing")
-        name, folder = _followed(bare_branch, settings)
-    assert name == "live" and (folder / "pull.toml").read_text() == "# growing\n"
+        name, where = _followed(bare_branch, settings)
+    assert name == "live" and (where() / "pull.toml").read_text() == "# growing\n"
     with bare_branch.stage("record:live") as stage:
         stage.adopt("pulls/live/pull.toml")
-    assert _followed(bare_branch, settings)[1] == bare_branch.folder / "pulls" / "live"
+    for told in (where, _followed(bare_branch, settings)[1]):
+        assert told() == bare_branch.folder / "pulls" / "live"
+
+
+def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_path, plain_pull,
+                                                             monkeypatch):
+    """Its files move into the branch then; slow preparations may even see nothing else of it."""
+    from limber.estimation.settings import EstimateSettings
+    from limber.stages.estimate import _followed
+
+    monkeypatch.setattr(follow, "QUIET_SECONDS", 1.5)
+    write_pull(tmp_path / "whole", plain_pull)
+    names = ("pull.toml", "robot.csv", "markers.csv")
+    streams = [bare_branch.stream(f"pulls/live/{name}") for name in names]
+    texts = [(tmp_path / "whole" / name).read_text().splitlines() for name in names]
+    for stream, lines in zip(streams, texts, strict=True):
+        for line in lines if stream is streams[0] else lines[:len(lines) // 2]:
+            stream.append(line)
+    times = []
+    for frame, _ in follow.paced(_followed(bare_branch, EstimateSettings(pull=("live",)))[1], 1e3):
+        times.append(frame.time)
+        if len(times) == 10:
+            for stream, lines in zip(streams[1:], texts[1:], strict=True):
+                for line in lines[len(lines) // 2:]:
+                    stream.append(line)
+            with bare_branch.stage("record:live") as stage:
+                for stream, name in zip(streams, names, strict=True):
+                    stream.close()
+                    stage.adopt(f"pulls/live/{name}")
+    assert np.allclose(times, plain_pull.observations.times)
 
 
 @pytest.fixture

@@ -20,6 +20,8 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from limber.estimation.fit import Estimate
     from limber.estimation.subject import Subject
 
@@ -173,10 +175,10 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     from limber.stages.loading import load_subject
 
     branch = Branch.open(branch_folder)
-    name, folder = _followed(branch, settings)
+    name, where = _followed(branch, settings)
     subject = load_subject(branch, settings)
     result, history = follow_pull(
-        folder, name, subject, settings, pace=pace,
+        where, name, subject, settings, pace=pace,
         training_count=training_count, progress=progress,
         axes=branch.path("skeleton.csv") if branch.has("skeleton.csv") else None)
     with branch.stage("estimate-online", settings, digests={"pull": name}) as stage:
@@ -186,16 +188,19 @@ def follow(branch_folder: Path, settings: EstimateSettings, *, pace: float = 1.0
     return stage.result
 
 
-def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Path]:
-    """The pull to follow and its folder; one that is being recorded is not in the manifest."""
+def _followed(branch: Branch, settings: EstimateSettings) -> tuple[str, Callable[[], Path]]:
+    """The pull to follow, and what tells its folder; one that is being recorded is not in the
+    manifest, and stands elsewhere than when it has ended.
+    """
     from limber.stages.loading import pull_names
 
     name = settings.pull[0] if settings.pull else None
-    if name is not None and (growing := branch.growing(f"pulls/{name}")) is not None:
-        return name, growing
+    if name is not None and branch.growing(f"pulls/{name}") is not None:
+        return name, lambda: branch.growing(f"pulls/{name}") or branch.folder / "pulls" / name
     if name is None or not (branch.folder / "pulls" / name / "pull.toml").is_file():
         name = pull_names(branch, settings)[0]
-    return name, branch.path(f"pulls/{name}")
+    folder = branch.path(f"pulls/{name}")
+    return name, lambda: folder
 
 
 def _cloud(branch: Branch) -> np.ndarray | None:

@@ -1,7 +1,7 @@
 """``limber estimate --follow``: read a pull while it is recorded, or replay one at its own pace."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,17 +42,17 @@ PRIOR_DEVIATION = 0.4
 """Of log E around what the reduced model was built for: it knows no more than twice or half."""
 
 
-def follow(folder: Path, name: str, subject: Subject, settings: EstimateSettings, *,
+def follow(where: Callable[[], Path], name: str, subject: Subject, settings: EstimateSettings, *,
            axes: Path | None = None, pace: float = 1.0, training_count: int = 60,
            progress: Progress = SILENT) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Estimate frame by frame from the pull in ``folder``.
+    """Estimate frame by frame from a pull.
 
     A pull that is still being recorded is read as it grows, as fast as it comes; a finished one is
     replayed at ``pace`` times its own speed (0: as fast as it goes). The full model corrects the
     reduced one from a second process; when the pull is over it is waited for.
 
     Args:
-        folder: The pull's.
+        where: Gives the pull's folder as it is now: when a recording ends, its files move.
         name: What it is called in messages.
         axes: The table of cylinders that were fitted to the scan, or None.
 
@@ -62,13 +62,13 @@ def follow(folder: Path, name: str, subject: Subject, settings: EstimateSettings
     Raises:
         InputError: a pull without markers or without frames.
     """
-    size = _size(folder)
-    first = read_pull(folder)
+    size = _size(where())
+    first = read_pull(where())
     if first.observations is None:
         raise InputError(f"{name} has images.", "They are tracked when the pull is over.",
                          "Follow a pull with markers, or run `limber estimate` afterwards.")
     begun = begin(first, subject, settings, progress.part(0.0, 0.5), training_count)
-    if _size(folder) != size:
+    if _size(where()) != size:
         # It is being recorded now: what has been missed is caught up with.
         pace = np.inf
     states: list[OnlineState] = []
@@ -76,7 +76,7 @@ def follow(folder: Path, name: str, subject: Subject, settings: EstimateSettings
     with Beside(begun.branch) as beside:
         estimator = begun.estimator(beside)
         try:
-            for frame, share in paced(folder, pace):
+            for frame, share in paced(where, pace):
                 started = time.perf_counter()
                 states.append(estimator.update(frame))
                 slowest = max(slowest, time.perf_counter() - started)
@@ -193,21 +193,27 @@ def _rough(pull: Pull, subject: Subject, settings: EstimateSettings) -> Values |
 
 
 def _size(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.glob("*.csv"))
+    try:
+        return sum(path.stat().st_size for path in folder.glob("*.csv"))
+    except FileNotFoundError:
+        # Moved between the two looks.
+        return -1
 
 
-def paced(folder: Path, pace: float) -> Iterator[tuple[OnlineFrame, float]]:
+def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame, float]]:
     """Yield frames of a pull as they come, each with the share of what is there that is done."""
-    sent, start, last_growth, size = -np.inf, None, time.monotonic(), -1
+    sent, start, last_growth, size = -np.inf, None, time.monotonic(), None
     frames: list[OnlineFrame] = []
     while True:
-        now = _size(folder)
+        folder = where()
+        now = folder, _size(folder)
         if now != size:
             size, last_growth = now, time.monotonic()
             try:
                 frames = list(online_frames(clean(read_pull(folder))))
             except InputError:
-                # Caught in the middle of being written, or too little yet: the next look tells.
+                # Caught in the middle of being written or moved, or too little yet: the next look
+                # tells.
                 if pace == 0:
                     raise
         fresh = [frame for frame in frames if frame.time > sent]
