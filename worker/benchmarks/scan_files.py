@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +53,8 @@ class ScanRun:
     """What one scan gave, as it is or changed; ``failure`` where it was not reconstructed.
 
     ``seed`` drew the change and the generated scans; ``source`` (digest of the sources) says what
-    code it was. ``off_points`` is the share of :func:`off_any_point`.
+    code it was. ``off_points`` is the share of :func:`off_any_point`. The intervals are those that
+    the result states.
     """
 
     scan: str
@@ -62,6 +63,8 @@ class ScanRun:
     source: str
     length_m: float = np.nan
     volume_m3: float = np.nan
+    length_interval_m: list[float] = field(default_factory=list)
+    volume_interval_m3: list[float] = field(default_factory=list)
     off_points: float = np.nan
     failure: str = ""
     seconds: float = 0.0
@@ -70,6 +73,13 @@ class ScanRun:
         """How far length or volume are off another run's, whichever is farther."""
         return max(abs(self.length_m / other.length_m - 1),
                    abs(self.volume_m3 / other.volume_m3 - 1))
+
+    def agrees(self, other: "ScanRun") -> bool:
+        """Whether the stated intervals of both runs meet, of length and of volume."""
+        return all(max(low, other_low) <= min(high, other_high) for (low, high), (
+            other_low, other_high) in (
+                (self.length_interval_m, other.length_interval_m),
+                (self.volume_interval_m3, other.volume_interval_m3)))
 
 
 def metamorphic_rows(quick: bool, seed: int, progress: Progress, out: Path | None,
@@ -85,7 +95,7 @@ def metamorphic_rows(quick: bool, seed: int, progress: Progress, out: Path | Non
     """
     names = [Path(name).stem for name in SCANS] if DATA.is_dir() else []
     names = [only] if only else ["round", "one-sided", *(names[:1] if quick else names)]
-    worst, half, crashes, notes = 0.0, 0.0, [], []
+    worst, half, agree, count, crashes, notes = 0.0, 0.0, 0, 0, [], []
     for number, name in enumerate(names):
         first, *others = _runs(name, seed, progress.part(
             number / len(names), (number + 1) / len(names)), out)
@@ -94,6 +104,7 @@ def metamorphic_rows(quick: bool, seed: int, progress: Progress, out: Path | Non
         for run in others if not first.failure else ():
             if run.failure:
                 continue
+            agree, count = agree + run.agrees(first), count + 1
             off, limit = run.off(first), 0.10 if run.change == "half" else 0.03
             half, worst = (max(half, off), worst) if run.change == "half" else (
                 half, max(worst, off))
@@ -101,7 +112,8 @@ def metamorphic_rows(quick: bool, seed: int, progress: Progress, out: Path | Non
                 notes.append(f"{name} {run.change} {off:.1%}")
     return [Row(f"{only or len(names)} in another unit, shifted, turned, shuffled; halved: length "
                 "and volume", "3 %; 10 %; no crash",
-                f"worst {worst:.1%}; {half:.1%}; {len(crashes)} crashes"
+                f"worst {worst:.1%}; {half:.1%}; {len(crashes)} crashes; stated intervals meet in "
+                f"{agree} of {count}"
                 + "".join(f"; {text}" for text in notes + crashes),
                 worst < 0.03 and half < 0.10 and not crashes)]
 
@@ -148,8 +160,10 @@ def _run(run: ScanRun, cloud: Cloud, settings: dict, out: Path | None) -> ScanRu
         draw_reconstruction(out / f"{title.replace(' ', '_')}.png", made.cloud.points,
                             made.meshed.skeleton, made.meshed.surface, title)
     return replace(run, length_m=made.numbers["length_m"],
-                   volume_m3=made.numbers["mesh_volume_m3"], off_points=off_any_point(made),
-                   seconds=seconds)
+                   volume_m3=made.numbers["mesh_volume_m3"],
+                   length_interval_m=made.numbers["length_interval_m"],
+                   volume_interval_m3=made.numbers["volume_interval_m3"],
+                   off_points=off_any_point(made), seconds=seconds)
 
 
 def real_rows(quick: bool, seed: int, progress: Progress, out: Path | None) -> list[Row]:

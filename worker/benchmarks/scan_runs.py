@@ -176,11 +176,19 @@ def run_case(case: ScanCase, folder: Path) -> tuple[dict[str, Any], Skeleton]:
     scored = score(seen, found)
     scored |= {"seed": case.seed, "left_out": result["left_out_twigs"], "shown": shown,
                "unsaid_m": unsaid_length(aligned, branch),
+               "length_held": held(result["length_interval_m"], seen.length),
+               "volume_held": held(result["volume_interval_m3"], shown * case.volume)
+               if case.volume else True,
                "volume": result["mesh_volume_m3"] / (shown * case.volume) - 1 if case.volume else (
                    0.0)}
     if case.leaf is not None:
         scored["leaf_points_on_stems"] = points_on_axes(case.points[case.leaf], case.truth, found)
     return scored, found
+
+
+def held(interval: list[float], value: float) -> bool:
+    """Whether an interval holds a true value."""
+    return interval[0] <= value <= interval[1]
 
 
 def unsaid_length(aligned: Skeleton, branch: Path) -> float:

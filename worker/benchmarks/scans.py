@@ -67,8 +67,9 @@ def _view_rows(name: str, one: Outcomes, found: float | None, false: float | Non
         Row(f"{one.count} {name}: mesh volume, worst", f"{volume:.0%}" if asked else "report",
             f"worst {volumes.max():.1%}, median {np.median(volumes):.1%}, "
             f"{int((volumes > 0.08).sum())} over 8 % (of what points show; of all wood worst "
-            f"{np.abs((1 + one.column('volume')) * one.column('shown') - 1).max():.1%})"
-            f"{one.told()}",
+            f"{np.abs((1 + one.column('volume')) * one.column('shown') - 1).max():.1%}; stated "
+            f"intervals hold the volume of {int(one.column('volume_held').sum())}, the length of "
+            f"{int(one.column('length_held').sum())}){one.told()}",
             bool(volumes.max() < volume and not one.failed) if asked else None)]
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse.linalg import splu
 
+from limber.geometry.skeleton.confidence import given_carrier
 from limber.geometry.skeleton.radii.axis_fit import fit_precision
 from limber.geometry.skeleton.radii.cylinders import on_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -63,17 +64,12 @@ def likely_skeletons(skeleton: Skeleton, points: np.ndarray, count: int,
 
 
 def _there(skeleton: Skeleton, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Whether each node's run is there in each draw, shape [count, n].
-
-    The probability of a run holds its carriers': given these it is as much more likely.
-    """
-    runs = skeleton.runs()
-    stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
+    """Whether each node's run is there in each draw, shape [count, n]."""
+    chance, runs = given_carrier(skeleton), skeleton.runs()
     there = np.ones((count, len(runs)), bool)
     for run, members in enumerate(runs[1:], start=1):
         carrier = int(skeleton.branch[members[0]])
-        share = stated[run] / (max(float(stated[carrier]), 1e-12) if carrier else 1.0)
-        there[:, run] = there[:, carrier] & (rng.uniform(size=count) < share)
+        there[:, run] = there[:, carrier] & (rng.uniform(size=count) < chance[run])
     return there[:, skeleton.branch]
 
 

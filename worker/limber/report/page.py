@@ -127,6 +127,13 @@ def _summary(branch: Branch, picture: Path | None) -> Section:
             ("tet_count", "tetrahedra", "{:,.0f}")]:
         if result.get(key) is not None:
             rows.append([label, form.format(result[key])])
+    for name, unit, scale in (("length", "m", 1.0), ("volume", "m3", 1e6)):
+        interval = result.get(f"{name}_interval_{unit}")
+        if interval:
+            values = [f"{scale * v:.4g}" for v in (result[f"expected_{name}_{unit}"], *interval)]
+            rows.append([f"{name} of wood, doubted twigs by their probability (95 %) "
+                         f"[{'cm3' if scale > 1 else unit}]",
+                         f"{values[0]} ({values[1]} to {values[2]})"])
     section.tables.append(("", rows))
     return section
 

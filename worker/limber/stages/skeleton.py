@@ -169,6 +169,7 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
     from limber.geometry.reconstruct import labelled, mesh_skeleton
     from limber.geometry.skeleton.confidence import shares
     from limber.geometry.skeleton.edits import edited, edits_text
+    from limber.geometry.skeleton.totals import totals
     from limber.stages.loading import load_found_skeleton, load_masses
 
     known = branch.manifest.stages
@@ -194,7 +195,8 @@ def _remade(branch: Branch, edits: Sequence[Edit], progress: Progress) -> None:
             stage.path(EDITS).write_text(edits_text(edits), encoding="utf-8")
         else:
             stage.remove(EDITS)
-        stage.result.update(made.result | meshed.numbers | {
+        stage.result.update(made.result | meshed.numbers | totals(
+            skeleton, made.result.get("unlikely_twigs", [])) | {
             "length_shares": shares(skeleton), "warnings": warnings})
 
 

@@ -127,6 +127,20 @@ def likely(skeleton: Skeleton, least: float) -> tuple[Skeleton, list[dict]]:
     return (skeleton.subset(told[skeleton.branch] >= least) if dropped else skeleton), dropped
 
 
+def given_carrier(skeleton: Skeleton) -> np.ndarray:
+    """Probability of each run if the run that carries it is there, shape [runs]; the main's is 1.
+
+    The probability of a run's nodes holds its carriers'.
+    """
+    runs = skeleton.runs()
+    stated = np.array([skeleton.probability[members[1:]].max() for members in runs])
+    given = np.ones(len(runs))
+    for run, members in enumerate(runs[1:], start=1):
+        carrier = int(skeleton.branch[members[0]])
+        given[run] = stated[run] / (max(float(stated[carrier]), 1e-12) if carrier else 1.0)
+    return np.minimum(given, 1.0)
+
+
 def shares(skeleton: Skeleton) -> dict[str, float]:
     """Share of the axes' length in each state."""
     step = np.linalg.norm(skeleton.nodes[1:] - skeleton.nodes[skeleton.parent[1:]], axis=1)

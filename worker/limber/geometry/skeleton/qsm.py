@@ -27,20 +27,27 @@ class Caliper:
     diameter: float
 
 
+def cylinders(skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Length [m] and volume [m^3] of the cylinder below each node but the root, shape [n - 1] each.
+
+    They taper evenly; the first of a twig has the twig's radius all along.
+    """
+    step = np.linalg.norm(skeleton.nodes[1:] - skeleton.nodes[skeleton.parent[1:]], axis=1)
+    foot, radius = _feet(skeleton), skeleton.radius[1:]
+    return step, np.pi / 3 * step * (foot**2 + foot * radius + radius**2)
+
+
 def by_order(skeleton: Skeleton) -> list[dict[str, float]]:
     """Branch count, length [m], volume [m^3], mean taper [m of radius a m] of each order."""
-    step = np.linalg.norm(skeleton.nodes[1:] - skeleton.nodes[skeleton.parent[1:]], axis=1)
-    order, radius = skeleton.order[1:], skeleton.radius[1:]
-    foot = np.where(skeleton.branch[1:] == skeleton.branch[skeleton.parent[1:]],
-                    skeleton.radius[skeleton.parent[1:]], radius)
-    volume = np.pi / 3 * step * (foot**2 + foot * radius + radius**2)
+    step, volume = cylinders(skeleton)
+    order, narrowing = skeleton.order[1:], _feet(skeleton) - skeleton.radius[1:]
     table = []
     for value in np.unique(order):
         own = order == value
         runs = np.unique(skeleton.branch[1:][own])
         table.append({"order": int(value), "branch_count": len(runs),
                       "length_m": float(step[own].sum()), "volume_m3": float(volume[own].sum()),
-                      "taper": float((foot - radius)[own].sum() / max(step[own].sum(), 1e-300))})
+                      "taper": float(narrowing[own].sum() / max(step[own].sum(), 1e-300))})
     return table
 
 
@@ -116,3 +123,10 @@ def read_calipers(path: Path) -> list[Caliper]:
                 f"{path}, line {number}: {1e3 * one.diameter:g} mm at {one.along:g} m.",
                 "A diameter is above 0, and both are finite.", "Correct that line.")
     return values
+
+
+def _feet(skeleton: Skeleton) -> np.ndarray:
+    """Radius at the lower end of the cylinder below each node but the root [m], shape [n - 1]."""
+    up = skeleton.parent[1:]
+    return np.where(skeleton.branch[1:] == skeleton.branch[up], skeleton.radius[up],
+                    skeleton.radius[1:])

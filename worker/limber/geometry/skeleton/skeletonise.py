@@ -43,6 +43,7 @@ from limber.geometry.skeleton.radii.axis_fit import (
 )
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
+from limber.geometry.skeleton.totals import totals
 from limber.progress import SILENT, Progress
 
 FIT_POINT_LIMIT = 60_000
@@ -111,7 +112,8 @@ class SkeletonResult:
 
     def report(self) -> dict[str, Any]:
         """Numbers for the stage's result."""
-        return {"contraction_iterations": self.contraction.iterations,
+        return totals(self.skeleton, self.unlikely) | {
+                "contraction_iterations": self.contraction.iterations,
                 "contraction_status": self.contraction.status, "noise_m": self.noise,
                 "bridges": self.bridges, "length_shares": shares(self.skeleton),
                 "doubtful_run_count": len({int(run) for run in self.skeleton.branch[

@@ -1,0 +1,77 @@
+"""Length and volume of wood that is not known exactly: doubted twigs, radii, and whole scans."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.geometry.skeleton.confidence import likely
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.totals import total_length, total_volume, totals
+from limber.geometry.surface.tubes import branch_surface
+
+
+def _tree() -> Skeleton:
+    """A stem of 1 m, a twig of 0.3 m with one of 0.15 m on it, in steps of a centimetre."""
+    z = np.linspace(0, 1, 101)
+    one, two = 0.01 * np.arange(1, 31), 0.01 * np.arange(1, 16)
+    stem = np.column_stack([0 * z, 0 * z, z])
+    side = np.column_stack([one, 0 * one, 0 * one + 0.5])
+    last = np.column_stack([0 * two + 0.1, two, 0 * two + 0.5])
+    parent = np.concatenate([np.arange(101) - 1, [50], 101 + np.arange(29), [110],
+                             131 + np.arange(14)])
+    radius = np.repeat([0.008, 0.004, 0.003], [101, 30, 15])
+    return Skeleton.from_edges(np.vstack([stem, side, last]), parent, radius)
+
+
+def _with_chances(tree: Skeleton, side: float, last: float) -> Skeleton:
+    """The same with stated probabilities: of the twig on the stem, and of that on the twig."""
+    on_side = np.flatnonzero((tree.nodes[:, 0] > 0) & (tree.nodes[:, 1] == 0))
+    chance = np.ones(tree.node_count)
+    chance[on_side], chance[tree.nodes[:, 1] > 0] = side, last
+    return replace(tree, probability=chance)
+
+
+def test_doubted_twigs_count_by_their_probability() -> None:
+    """Mean and deviation are those of 40,000 draws, in which a twig goes with its carrier."""
+    tree = _with_chances(_tree(), 0.8, 0.5)
+    rng = np.random.default_rng(0)
+    side = rng.uniform(size=40_000) < 0.8
+    last = side & (rng.uniform(size=40_000) < 0.5 / 0.8)
+    drawn = 1 + 0.3 * side + 0.15 * last
+    found = total_length(tree)
+    assert found.expected == pytest.approx(drawn.mean(), abs=2e-3)
+    assert found.sigma == pytest.approx(np.hypot(drawn.std(), 0.015), rel=0.05)
+    sure = total_length(_tree())
+    assert sure.expected == pytest.approx(1.45) and sure.sigma < 0.02
+
+
+def test_a_dropped_twig_still_counts_by_its_probability() -> None:
+    """Whether a twig just stays or is just dropped hardly changes what is to be expected."""
+    stays, goes = (likely(_with_chances(_tree(), 0.99, chance), 0.5) for chance in (0.51, 0.49))
+    assert stays[0].branch_count == goes[0].branch_count + 1
+    kept, dropped = total_length(*stays), total_length(*goes)
+    assert kept.expected == pytest.approx(dropped.expected, abs=0.008)
+    assert kept.sigma == pytest.approx(dropped.sigma, rel=0.05)
+    assert kept.interval[0] < stays[0].length < kept.interval[1]
+
+
+def test_volume_is_that_of_the_surface() -> None:
+    """Of sure wood: what twigs have inside their carriers is not counted twice."""
+    tree = _tree()
+    found = total_volume(tree)
+    assert found.expected == pytest.approx(branch_surface(tree, sides=24).volume, rel=0.02)
+    assert found.sigma == 0 and totals(tree)["volume_interval_m3"] is None
+
+
+def test_errors_of_radii_average_out_but_for_what_all_share() -> None:
+    """Of deviations of 5 % each, all share what the surest has; over 10 radii they go together."""
+    tree = _tree()
+    same = total_volume(replace(tree, radius_sigma=0.05 * tree.radius))
+    assert same.sigma == pytest.approx(2 * 0.05 * same.expected)
+    sure = np.where(tree.nodes[:, 2] < 0.2, 0.0, 0.05) * tree.radius
+    apart = total_volume(replace(tree, radius_sigma=sure))
+    stem = np.pi * 0.008**2 * 1.0
+    expected = 0.1 * stem * np.sqrt(0.8 * 0.08)  # blocks of 8 cm of the stem's upper 80 cm
+    assert apart.sigma == pytest.approx(expected, rel=0.15)
+    assert apart.interval[0] > 0

@@ -1,0 +1,133 @@
+"""Length and volume of all wood as a scan leaves them open: what to expect, and how sure that is.
+
+A doubted twig counts by its probability, whether the skeleton has it or dropped it as more likely
+not there: so two scans of one plant, of which one shows a twig a little better, agree. What a scan
+does not show at all is not counted.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from limber.geometry.skeleton.confidence import given_carrier
+from limber.geometry.skeleton.qsm import cylinders
+from limber.geometry.skeleton.skeleton import BRIDGED, Skeleton
+
+_TOGETHER = 10.0  # median radii of a run, over which errors of its radii go together
+_COMMON = 0.1  # of the volume: those surest of their radii tell what all of them share
+_BRIDGED = 0.1  # of its length, to which the way through a gap is known
+_SURE = 1.96  # standard deviations to each side of an interval that covers 95 %
+
+
+@dataclass(frozen=True)
+class Total:
+    """A sum over all wood, not known exactly.
+
+    Attributes:
+        expected: Its mean [m or m^3].
+        sigma: Its standard deviation [m or m^3].
+    """
+
+    expected: float
+    sigma: float
+
+    @property
+    def interval(self) -> list[float]:
+        """The 95 % interval; nothing is less than nothing."""
+        reach = _SURE * self.sigma
+        return [max(self.expected - reach, 0.0), self.expected + reach]
+
+
+def total_length(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> Total:
+    """Return the length of all axes [m].
+
+    Args:
+        skeleton: With the probabilities of its nodes.
+        dropped: Twigs that it has no more, each with ``length`` [m] and ``probability``.
+    """
+    runs = skeleton.runs()
+    own, spread = np.empty(len(runs)), np.empty(len(runs))
+    for run, members in enumerate(runs):
+        step = np.linalg.norm(np.diff(skeleton.nodes[members], axis=0), axis=1)
+        own[run] = step.sum()
+        # A round end hides where its axis stops, a fork where in its carrier it began.
+        gap = float(step[skeleton.radius_state[members[1:]] == BRIDGED].sum())
+        spread[run] = np.linalg.norm([skeleton.radius[members[-1]], skeleton.radius[members[0]],
+                                      _BRIDGED * gap])
+    mean, variance = _of_tree(skeleton, own, spread**2)
+    chance = np.array([twig["probability"] for twig in dropped])
+    length = np.array([twig["length"] for twig in dropped])
+    return Total(mean + float(chance @ length),
+                 float(np.sqrt(variance + (chance * (1 - chance)) @ length**2)))
+
+
+def total_volume(skeleton: Skeleton) -> Total:
+    """Return the volume of all cylinders [m^3], without what of twigs lies inside their carriers.
+
+    Args:
+        skeleton: With the deviations of its radii, and the probabilities of its nodes.
+    """
+    step, volume = cylinders(skeleton)
+    runs = skeleton.runs()
+    relative = skeleton.radius_sigma[1:] / np.maximum(skeleton.radius[1:], 1e-300)
+    common = _share_of_all(relative, volume)
+    alone = np.sqrt(np.maximum(relative**2 - common**2, 0.0))
+    own, square = np.empty(len(runs)), np.empty(len(runs))
+    for run, members in enumerate(runs):
+        cylinder = members[1:] - 1
+        hidden = _hidden_share(skeleton, members, step[cylinder]) if run else 0.0
+        part = volume[cylinder] * (1 - hidden)
+        own[run] = part.sum()
+        block = np.cumsum(step[cylinder]) // max(
+            _TOGETHER * float(np.median(skeleton.radius[members[1:]])), 1e-300)
+        _, which = np.unique(block, return_inverse=True)
+        square[run] = (np.bincount(which, 2 * part * alone[cylinder])**2).sum()
+    mean, variance = _of_tree(skeleton, own, square)
+    return Total(mean, float(np.hypot(np.sqrt(variance), 2 * common * mean)))
+
+
+def totals(skeleton: Skeleton, dropped: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+    """Return both as numbers of a stage's result, with intervals that cover 95 %.
+
+    ``volume_interval_m3`` is None where no radius has a deviation: a given skeleton's.
+    """
+    length, volume = total_length(skeleton, dropped), total_volume(skeleton)
+    known = bool(skeleton.radius_sigma.any())
+    return {"expected_length_m": length.expected, "length_interval_m": length.interval,
+            "expected_volume_m3": volume.expected,
+            "volume_interval_m3": volume.interval if known else None}
+
+
+def _of_tree(skeleton: Skeleton, own: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
+    """Mean and variance of a sum over the runs that are there; with a run all on it goes.
+
+    Args:
+        skeleton: Whose runs they are.
+        own: What each run adds if it is there, shape [runs].
+        variance: Of that, shape [runs].
+    """
+    chance = given_carrier(skeleton)
+    mean, spread = own.astype(float), variance.astype(float)
+    # What hangs on a run has a higher number.
+    runs = skeleton.runs()
+    for run in range(len(runs) - 1, 0, -1):
+        carrier = int(skeleton.branch[runs[run][0]])
+        mean[carrier] += chance[run] * mean[run]
+        spread[carrier] += chance[run] * (spread[run] + (1 - chance[run]) * mean[run]**2)
+    return float(mean[0]), float(spread[0])
+
+
+def _share_of_all(relative: np.ndarray, volume: np.ndarray) -> float:
+    """Relative deviation that all radii share: not more than that of the surest of them."""
+    order = np.argsort(relative)
+    total = np.cumsum(volume[order])
+    return float(relative[order[int(np.searchsorted(total, _COMMON * total[-1]))]])
+
+
+def _hidden_share(skeleton: Skeleton, members: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Share of each of a side run's cylinders that lies inside its carrier, shape [k]."""
+    end = np.cumsum(step)
+    inside = float(skeleton.radius[members[0]]) - (end - step)
+    return np.clip(inside / np.maximum(step, 1e-300), 0.0, 1.0)
