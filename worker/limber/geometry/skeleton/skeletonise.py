@@ -32,14 +32,19 @@ from limber.geometry.skeleton.plausibility import (
     check_round,
     warnings,
 )
+from limber.geometry.skeleton.radii.along_runs import (
+    filled_in,
+    limited,
+    point_counts,
+    steadied,
+    tapered,
+)
 from limber.geometry.skeleton.radii.axis_fit import (
     AxisFit,
     attached,
     fit_axes,
-    limited,
     median_radii,
     resampled,
-    tapered,
 )
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import INTERPOLATED, Skeleton
@@ -305,7 +310,7 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
 def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
          camera: bool, progress: Progress):
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
-    skeleton = resampled(skeleton, 1.5)
+    skeleton = resampled(steadied(skeleton, points), 1.5)
     fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
                    progress=progress.part(0.0, 0.5))
     hung, _ = without_backward_starts(attached(fit.skeleton))
@@ -314,7 +319,7 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
     skeleton, strands = _without_strands(skeleton.subset(keep))
-    skeleton = resampled(limited(skeleton, low, high), 1.0)
+    skeleton = resampled(limited(steadied(skeleton, points), low, high), 1.0)
     fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
                    progress=progress.part(0.5, 0.8))
     skeleton, late = _without_strands(fit.skeleton)
@@ -325,7 +330,8 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
     ended = _ends_within(fit.skeleton, points)
-    told = assessed(tapered(limited(ended, low, high)), points, fit.noise)
+    ended = limited(filled_in(ended, points), low, high)
+    told = assessed(tapered(ended, point_counts(ended, points)), points, fit.noise)
     return replace(fit, skeleton=without_kinks(told)[0]), pruned
 
 

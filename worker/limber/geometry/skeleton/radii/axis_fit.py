@@ -23,7 +23,7 @@ from limber.geometry.skeleton.radii.noisy_rings import (
     seen_sides,
     side_doubt,
 )
-from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
+from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
@@ -36,7 +36,6 @@ _HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and th
 _KINK = np.deg2rad(50.0)
 # A twig's start may be as long as so many radii of its carrier, and end in such a kink.
 _HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
-_RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
 _ENOUGH = 200  # points that tell the noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
@@ -244,51 +243,6 @@ def _past_hook(skeleton: Skeleton, members: np.ndarray, first: int) -> int:
     return start
 
 
-def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
-    """Return the skeleton with radii limited to [low, high] [m], those nodes marked.
-
-    The paper's rule r in [alpha D, beta D], with the cloud's scale D.
-    """
-    outside = (skeleton.radius < low) | (skeleton.radius > high)
-    state = np.where(outside, LIMITED, skeleton.radius_state).astype(np.int8)
-    return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
-
-
-def tapered(skeleton: Skeleton, growth: float = 1.25) -> Skeleton:
-    """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
-
-    A run is no thicker than its carrier where it starts, nor ``growth`` times the median of what
-    was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
-    not resolve would otherwise become a fat cylinder. What is far thinner than most of the run
-    speaks for nothing: a rag at a stem's foot does not make a hair of the stem.
-    """
-    radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
-    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[np.maximum(skeleton.parent, 0)], axis=1)
-    for run, members in enumerate(skeleton.runs()):
-        own = members if run == 0 else members[1:]
-        carrier = members[0]
-        cap = np.inf if run == 0 else max(radius[carrier], radius[skeleton.parent[carrier]])
-        speaks = state[own] == MEASURED
-        if speaks.any():
-            speaks &= radius[own] > _RAG * _middle(radius[own[speaks]], step[own[speaks]])
-        for place, node in enumerate(own):
-            before = own[:place][speaks[:place]]
-            # The first few are too few to speak for the run: a cut stem starts with a ragged end.
-            if len(before) >= max(6, len(own) // 8):
-                allowed = growth + (1 - growth) * place / len(own)
-                cap = min(cap, allowed * float(np.median(radius[before])))
-            if radius[node] > cap:
-                radius[node], state[node] = cap, LIMITED
-    return replace(skeleton, radius=radius, radius_state=state)
-
-
-def _middle(values: np.ndarray, weight: np.ndarray) -> float:
-    """Median of values that count by their weight."""
-    order = np.argsort(values)
-    total = np.cumsum(weight[order])
-    return float(values[order[int(np.searchsorted(total, total[-1] / 2))]])
-
-
 def median_radii(skeleton: Skeleton, points: np.ndarray, neighbours: int = 24) -> np.ndarray:
     """The paper's radii: median distance of the k nearest points to each node [m], shape [n]."""
     distance, _ = cKDTree(points).query(skeleton.nodes, k=min(neighbours, len(points)))
@@ -399,7 +353,7 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
         before, after = step[:-1], step[1:]
         mean = (before + after) / 2
         # The first radii, since a radius that grows by mistake must not blur its own axis.
-        thick = np.minimum(radius, skeleton.radius)[chain[1:-1]]
+        thick = skeleton.radius[chain[1:-1]]
         band = thick * np.clip(_BAND + 8.0 * noise / thick, _BAND, _BAND_LIMIT)
         # Axes kink at forks: a branch's leader gives way to a strong twig.
         band *= np.where(forks[chain[1:-1]], 0.6, 1.0) * _straightness(skeleton.nodes[chain])

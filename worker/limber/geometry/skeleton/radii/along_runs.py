@@ -1,0 +1,111 @@
+"""Radii along a run as wood has them: steady, tapering, and within what a scan can show."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
+from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, Skeleton
+
+_RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
+_STEADY = 40  # points whose nodes' radii make a steady one
+_SPEAK = 1 / 8  # of a run's nodes, and of its points, that speak for what follows
+
+
+def point_counts(skeleton: Skeleton, points: np.ndarray) -> np.ndarray:
+    """Number of points on each node's cylinder, shape [n]."""
+    return np.bincount(nearest_cylinders(skeleton, points)[0], minlength=skeleton.node_count)
+
+
+def filled_in(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Return the skeleton with radii that no point tells taken from those beside them."""
+    blank = skeleton.radius_state == INTERPOLATED
+    if not blank.any():
+        return skeleton
+    return replace(skeleton, radius=np.where(blank, steadied(skeleton, points).radius,
+                                             skeleton.radius))
+
+
+def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Return the skeleton with each radius the median of those around it that points speak for.
+
+    Where points are missing, a first radius may be a tenth of its neighbours'. How finely an axis
+    is divided, and how far it is smoothed, go by the radius: such a stretch would be free to
+    follow the noise, and stay a hair.
+
+    Args:
+        skeleton: With first radii.
+        points: Scanned points [m], shape [m, 3].
+    """
+    count = point_counts(skeleton, points)
+    radius = skeleton.radius.copy()
+    for run, members in enumerate(skeleton.runs()):
+        own = members if run == 0 else members[1:]
+        speak = own[count[own] > 0]
+        if len(speak) == 0:
+            continue
+        step = np.linalg.norm(np.diff(skeleton.nodes[members], axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(step)])
+        there = along[np.searchsorted(members, speak)]
+        for node, here in zip(own, along[-len(own):], strict=True):
+            # Each has a point or more: no more nodes than that to either side.
+            middle = int(np.searchsorted(there, here))
+            around = slice(max(middle - _STEADY, 0), middle + _STEADY)
+            order = np.argsort(np.abs(there[around] - here), kind="stable")
+            near = speak[around][order]
+            near = near[:int(np.searchsorted(np.cumsum(count[near]), _STEADY)) + 1]
+            radius[node] = _middle(skeleton.radius[near], count[near])
+    return replace(skeleton, radius=radius)
+
+
+def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
+    """Return the skeleton with radii limited to [low, high] [m], those nodes marked.
+
+    The paper's rule r in [alpha D, beta D], with the cloud's scale D.
+    """
+    outside = (skeleton.radius < low) | (skeleton.radius > high)
+    state = np.where(outside, LIMITED, skeleton.radius_state).astype(np.int8)
+    return replace(skeleton, radius=np.clip(skeleton.radius, low, high), radius_state=state)
+
+
+def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float = 1.25) -> Skeleton:
+    """Return the skeleton with radii that hardly grow towards the tips, changed nodes marked.
+
+    A run is no thicker than its carrier where it starts, nor ``growth`` times the median of what
+    was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
+    not resolve would otherwise become a fat cylinder. What is far thinner than most of the run
+    speaks for nothing: a rag at a stem's foot does not make a hair of the stem. Nor do few points.
+
+    Args:
+        skeleton: Fitted.
+        count: Points on each node, shape [n]; None: on each as many.
+        growth: See above.
+    """
+    radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
+    count = np.ones(skeleton.node_count) if count is None else count
+    step = np.linalg.norm(skeleton.nodes - skeleton.nodes[np.maximum(skeleton.parent, 0)], axis=1)
+    for run, members in enumerate(skeleton.runs()):
+        own = members if run == 0 else members[1:]
+        carrier = members[0]
+        cap = np.inf if run == 0 else max(radius[carrier], radius[skeleton.parent[carrier]])
+        speaks = (state[own] == MEASURED) & (count[own] > 0)
+        if speaks.any():
+            speaks &= radius[own] > _RAG * _middle(radius[own[speaks]], step[own[speaks]])
+        told, total = np.cumsum(count[own] * speaks), float(count[own].sum())
+        for place, node in enumerate(own):
+            before = own[:place][speaks[:place]]
+            # The first few are too few to speak for the run: a cut stem starts with a ragged end.
+            if len(before) >= max(6, int(_SPEAK * len(own))) and (
+                    told[place - 1] >= _SPEAK * total):
+                allowed = growth + (1 - growth) * place / len(own)
+                cap = min(cap, allowed * _middle(radius[before], count[before]))
+            if radius[node] > cap:
+                radius[node], state[node] = cap, LIMITED
+    return replace(skeleton, radius=radius, radius_state=state)
+
+
+def _middle(values: np.ndarray, weight: np.ndarray) -> float:
+    """Median of values that count by their weight."""
+    order = np.argsort(values)
+    total = np.cumsum(weight[order])
+    return float(values[order[int(np.searchsorted(total, total[-1] / 2))]])
