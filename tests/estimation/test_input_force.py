@@ -107,8 +107,8 @@ def test_a_clamped_gripper_needs_its_torque(small, small_bench):
     off = np.linalg.norm(found.pulls[0].positions - pull.observations.positions, axis=2)
     moved = np.linalg.norm(pull.observations.positions[-1] - pull.observations.positions[0],
                            axis=1)
-    # The patch is not stiffened, and the mesh another one (half as coarse: 0.001 of the motion).
-    assert np.all(off[-1] < 0.03 * moved.max())
+    # The mesh is another one (half as coarse: 0.001 of the motion).
+    assert np.all(off[-1] < 0.02 * moved.max())
     deaf = driven(pull, sensor=sensor.model_copy(update={"torque_sigma_nm": None}))
     with pytest.raises(InputError, match="torque is not known"):
         small_bench.objective([deaf], SETTINGS)

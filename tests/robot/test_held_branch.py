@@ -155,9 +155,9 @@ def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
     model = model_of(beam)
     base = matrices(np.array(setting.base_pose))
     gripper = base @ moved @ matrices(np.array(setting.grasp_pose))
-    grasp = Grasp.at(beam, np.array([*beam.nodes[:, :2].mean(axis=0), TIP[2]]), setting.jaw)
+    grasp = Grasp.gripping(beam, np.array([*beam.nodes[:, :2].mean(axis=0), TIP[2]]), setting.jaw)
     pose = grasp.rest_pose + [0, 0.03, 0, 0, 0, 0]
-    result = solve_static(model, grasp=grasp, pose=pose).require()
+    result = solve_static(model.gripped(grasp), grasp=grasp, pose=pose).require()
     # By hand: the opposite wrench, taken to the flange and its axes.
     rotation = (base @ moved)[:3, :3]
     force = -rotation.T @ result.reaction_force

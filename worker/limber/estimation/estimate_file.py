@@ -39,6 +39,7 @@ class _Deviation(_Told):
     mesh: list[_Maybe] | None = None
     path: list[_Maybe] | None = None
     hung: list[_Maybe] | None = None
+    grip: list[_Maybe] | None = None
     total: list[_Maybe] | None = None
 
 
@@ -116,7 +117,7 @@ class _Estimate(_Told):
             "control_points_m": self.control_points_m, "fractions": self.fractions,
             "groups": self.groups,
             **{f"young_deviation.{name}": getattr(told, name)
-               for name in ("sensor", "geometry", "mesh", "path", "hung",
+               for name in ("sensor", "geometry", "mesh", "path", "hung", "grip",
                             "total")}}
         for name, values in lists.items():
             if values and len(values) != count:

@@ -11,6 +11,7 @@ import numpy as np
 
 from limber.errors import Cancelled, InputError, WorkError
 from limber.estimation.doubt.causes import largest, variance_parts
+from limber.estimation.doubt.grip_error import grip_error
 from limber.estimation.doubt.identifiability import (
     SCALE_DEVIATION,
     Identifiability,
@@ -104,8 +105,8 @@ class Estimate:
         sensor = np.minimum(np.sqrt(np.diag(self.uncertainty.covariance))[groups], 35.0)
         error = self.model_error
         return {"sensor": sensor, "geometry": error.geometry, "mesh": error.mesh,
-                "path": error.path, "hung": error.hung, "axis_is_exact": error.axis_is_exact,
-                "total": error.total(sensor)}
+                "path": error.path, "hung": error.hung, "grip": error.grip,
+                "axis_is_exact": error.axis_is_exact, "total": error.total(sensor)}
 
     @property
     def young(self) -> np.ndarray:
@@ -131,6 +132,8 @@ class Estimate:
             parts["mesh"] = self.model_error.mesh**2
         if self.model_error.hung is not None:
             parts["mass of twigs and leaves"] = self.model_error.hung**2
+        if self.model_error.grip is not None:
+            parts["length in the gripper"] = self.model_error.grip**2
         if self.model_error.path is not None:
             parts["gripper frame"] = parts.get("gripper frame", 0.0) + self.model_error.path**2
         return parts
@@ -490,7 +493,8 @@ def judge_model(found: Estimate, subject: Subject, grasp: GraspEntry, settings: 
             error = replace(error, mesh=stiff.deviation, mesh_factor=stiff.factor)
     found.model_error = replace(
         error, path=_path_error(found, progress),
-        hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma))
+        hung=hung_error(found.fit.evaluation, found.objective, settings.hung_sigma),
+        grip=grip_error(found.fit.evaluation, found.objective))
     _tell_largest_part(found.causes, progress)
 
 

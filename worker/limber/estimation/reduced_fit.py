@@ -242,7 +242,7 @@ def _file_name(forward: QuasiStaticForward, digest: str) -> str:
     joined = hashlib.sha256(
         f"{digest} {grasp.mode} {entry.gravity_m_s2} {entry.weightless} {model.gravity}"
         f" {sorted(map(repr, model.point_masses))} {STATES_PER_PULL} {STATES_AROUND}".encode())
-    for array in (forward.weights, grasp.nodes, grasp.weights, model.fixed):
+    for array in (forward.weights, grasp.nodes, grasp.weights, model.fixed, model.stiffening):
         joined.update(np.ascontiguousarray(array).tobytes())
     return f".reduced-{forward.mesh.geometry_digest()[:10]}-{joined.hexdigest()[:20]}.npz"
 

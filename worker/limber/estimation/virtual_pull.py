@@ -129,6 +129,7 @@ def simulate_pull(truth: TrueBranch, name: str, settings: VirtualPullSettings, *
     is_weightless = not (model.gravity.any() and (settings.own_weight or model.hanging))
     entry = _entry(truth, settings, is_weightless)
     grasp = grasp_on(truth.mesh, entry.grasp)
+    model = model.gripped(grasp)
     arc = settings.grasp_fraction * truth.skeleton.arc_length[truth.skeleton.main_path()[-1]]
     phase = rng.uniform(0, 2 * np.pi) if settings.phase is None else settings.phase
     made = moved(model, grasp, MotionWanted(

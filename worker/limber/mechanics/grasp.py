@@ -1,6 +1,6 @@
 """A grasp: the patch of nodes that a gripper holds, and poses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from limber.errors import InputError
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.elements.shapes import node_weights
+from limber.mechanics.grip import nodes_between, parts_between
 
 RADIAN = 0.3
 """What a turn by one radian counts as in distances of poses, as part of the branch's extent:
@@ -15,6 +16,10 @@ chosen, not measured."""
 
 _REACHED = 0.95
 """Part of a patch's extent within which its centre may be moved: beyond, weights turn negative."""
+_FEWEST_HELD = 3
+"""Nodes that hold a rotation."""
+_BESIDE = 1.3
+"""A ring of nodes so many half lengths from a gripper's middle is held where none is nearer."""
 _WIDER, _WIDEST = 1.25, 4.0
 """By how much a patch is widened at a time, and at most."""
 
@@ -33,15 +38,20 @@ class Grasp:
         weights: Parts of a force that the nodes take, shape [k]; they sum to 1. The position of
             a pinned grasp is the mean of the nodes with these weights, so that force and
             position are work-conjugate.
-        centre: The patch's weighted centre at rest [m], shape [3].
+        centre: What a pose is the place of, at rest [m], shape [3]: the patch's weighted centre, or
+            the middle of a gripper that holds a piece of a length, which may lie beside it.
         mode: ``clamped``: the patch moves as a rigid body with the pose. ``pinned``: its mean
             position follows the pose, its rotation is free.
+        held: Part of each tetrahedron that is inside a clamping gripper, shape [tet_count], where
+            that is known; the model is to be
+            :meth:`limber.mechanics.model.BranchModel.gripped` then.
     """
 
     nodes: np.ndarray
     weights: np.ndarray
     centre: np.ndarray
     mode: Literal["clamped", "pinned"] = "clamped"
+    held: np.ndarray | None = None
 
     @property
     def rest_pose(self) -> np.ndarray:
@@ -78,6 +88,38 @@ class Grasp:
                 break
             grasp = cls.of_nodes(mesh, nodes, mode, point)
         return grasp
+
+    @classmethod
+    def gripping(cls, mesh: TetMesh, point: np.ndarray, half_length: float,
+                 least: int = 1) -> "Grasp":
+        """Return the clamped grasp of a gripper that holds a piece of a length, not only nodes.
+
+        However coarse the mesh: what its nodes leave of that length is in ``held``.
+
+        Args:
+            point: The gripper's middle [m], on the branch.
+            half_length: Of the piece [m].
+            least: The nearest so many nodes are held where fewer are within.
+
+        Raises:
+            InputError: as :meth:`at`.
+        """
+        point = np.asarray(point, float)
+        distance = np.sort(np.linalg.norm(mesh.nodes - point, axis=1))
+        reach = half_length
+        if least > 1:
+            reach = max(half_length, distance[min(least, len(distance)) - 1] * (1 + 1e-9))
+        if distance[0] > reach:
+            # It is refused there.
+            return cls.at(mesh, point, reach)
+        for wider in (half_length, _BESIDE * half_length):
+            nodes = nodes_between(mesh, point, wider)
+            if len(nodes) >= _FEWEST_HELD:
+                grasp = cls.of_nodes(mesh, nodes, point=point)
+                break
+        else:
+            grasp = cls.at(mesh, point, reach)
+        return replace(grasp.holding(mesh, point, half_length), centre=point.copy())
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped",
@@ -123,6 +165,20 @@ class Grasp:
             weights = _centred(weights, mesh.nodes[nodes] - np.asarray(point, float))
         return cls(nodes, weights, weights @ mesh.nodes[nodes], mode)
 
+    def holding(self, mesh: TetMesh, point: np.ndarray, half_length: float) -> "Grasp":
+        """Return the grasp of the same nodes, of a gripper that holds so long a piece.
+
+        Arguments as of :meth:`gripping`.
+        """
+        return replace(self, held=parts_between(mesh, point, half_length))
+
+    def elsewhere(self, mesh: TetMesh, point: np.ndarray) -> "Grasp":
+        """Return the grasp of the same nodes where these lie elsewhere, about the same point."""
+        grasp = Grasp.of_nodes(mesh, self.nodes, self.mode, point)
+        # How much of each tetrahedron is inside hardly changes.
+        return grasp if self.held is None else replace(grasp, held=self.held,
+                                                       centre=np.array(point, float))
+
     def key(self) -> tuple[str, bytes, bytes]:
         """Return what tells constraints of different grasps apart."""
         return self.mode, self.nodes.tobytes(), self.weights.tobytes()
@@ -150,7 +206,30 @@ class Grasp:
             return np.concatenate([mean, np.zeros(3)])
         left, _, right = np.linalg.svd((self.weights[:, None] * (positions - mean)).T @ arm)
         turn = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
-        return np.concatenate([mean, rotation_vector(left @ turn @ right)])
+        turned = left @ turn @ right
+        if self.held is not None:
+            mean = mean - turned @ (self.weights @ arm)
+        return np.concatenate([mean, rotation_vector(turned)])
+
+    def place_slopes(self, rest: np.ndarray, displacement: np.ndarray, changes: np.ndarray,
+                     ) -> np.ndarray:
+        """Return how the pose's place changes with p changes of the displacement, shape [3, p].
+
+        Args:
+            rest, displacement: Of all nodes [m], shape [node_count, 3].
+            changes: Shape [node_count, 3, p].
+        """
+        patch = changes[self.nodes]
+        moved = np.einsum("k,kip->ip", self.weights, patch)
+        if self.held is None:
+            return moved
+        positions = rest[self.nodes] + displacement[self.nodes]
+        arms = positions - self.weights @ positions
+        squares = np.einsum("k,ki,kj->ij", self.weights, arms, arms)
+        spin = np.einsum("k,kip->ip", self.weights, np.cross(arms[..., None], patch, axis=1))
+        turns = np.linalg.pinv(np.trace(squares) * np.eye(3) - squares, rcond=1e-9) @ spin
+        lever = self.pose_of(rest, displacement)[:3] - self.weights @ positions
+        return moved + np.cross(turns, lever[:, None], axis=0)
 
 
 def rotation_matrix(vector: np.ndarray) -> np.ndarray:

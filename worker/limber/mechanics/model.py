@@ -25,6 +25,7 @@ from limber.mechanics.elements.forces import (
 )
 from limber.mechanics.elements.principal import largest_principal_strains
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.grip import stiffening
 from limber.mechanics.hanging import Hanging, carried
 from limber.mechanics.linear.equations import Equations, Viscous
 from limber.mechanics.materials import (
@@ -115,7 +116,10 @@ class BranchModel:
         lumped_mass: Diagonal mass matrix instead of the consistent one, but for twigs.
 
     Attributes:
-        lame_lambda, lame_mu: Lamé coefficients [Pa], shape [tet_count].
+        young: Young's modulus of the material [Pa], shape [tet_count].
+        stiffening: By how much a tetrahedron is stiffer than its material, as a gripper holds it
+            (see :meth:`gripped`), shape [tet_count]; 1 without.
+        lame_lambda, lame_mu: Lamé coefficients [Pa] with the stiffening, shape [tet_count].
         hanging: How the mesh's shape carries the weight; None where the mesh is the shape without
             load, which gravity bends. See :meth:`as_scanned`.
         gradients, weights: Strain operators at the quadrature points, from
@@ -141,6 +145,7 @@ class BranchModel:
         self.point_masses = tuple(point_masses)
         self.hanging: Hanging | None = None
         self.density: np.ndarray | None = None
+        self.stiffening: np.ndarray | float = 1.0
         self._set(young, poisson, density)
 
     @property
@@ -191,6 +196,21 @@ class BranchModel:
                    self.density if density is None else density)
         return other
 
+    def gripped(self, *grasps: Grasp) -> "BranchModel":
+        """Return the model that is as stiff as these clamping grippers hold it, and no others.
+
+        See :mod:`limber.mechanics.grip`. Pinned grasps, and those of which only the nodes are
+        known, change nothing.
+        """
+        held = [grasp.held for grasp in grasps
+                if grasp.mode == "clamped" and grasp.held is not None]
+        if not held and np.ndim(self.stiffening) == 0:
+            return self
+        other = copy.copy(self)
+        other.stiffening = stiffening(np.max(held, axis=0)) if held else 1.0
+        other._set(self.young, self.poisson, self.density)
+        return other
+
     def with_rest_nodes(self, nodes: np.ndarray) -> "BranchModel":
         """Return the model with other rest positions [m] of the same tetrahedra."""
         other = copy.copy(self)
@@ -215,9 +235,9 @@ class BranchModel:
         return other
 
     def linear(self, young: float, poisson: float) -> "BranchModel":
-        """Return the branch of one linear material, without what it carries."""
+        """Return the branch of one linear material, without what it carries and what grips it."""
         other = copy.copy(self)
-        other.hanging, other.material = None, Material.linear
+        other.hanging, other.material, other.stiffening = None, Material.linear, 1.0
         other._set(young, poisson, self.density)
         return other
 
@@ -430,7 +450,7 @@ class BranchModel:
         if self.density.min() <= 0:
             raise InputError(f"Density is {self.density.min():g} kg/m3.", "It must be positive.",
                              "Green wood has 500 to 1100 kg/m3.")
-        self.lame_lambda, self.lame_mu = lame(self.young, self.poisson)
+        self.lame_lambda, self.lame_mu = lame(self.young * self.stiffening, self.poisson)
         if changed:
             # Shared by the models that are made of this one with the same density.
             self._mass: dict[str, Any] = {}

@@ -182,7 +182,7 @@ def lame_changes(model: BranchModel, wanted: ParameterSet,
             changes += [(model.lame_lambda * part, model.lame_mu * part)
                         for part in young_shares(model, wanted)]
         elif name == "poisson":
-            changes.append(lame_by_poisson(model.young, model.poisson))
+            changes.append(lame_by_poisson(model.young * model.stiffening, model.poisson))
         else:
             changes.append(None)
     return changes

@@ -54,11 +54,14 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
         InputError: options that do not fit. ConvergenceError: the branch finds no rest.
     """
     def patch(point: Point, mode: str) -> Grasp:
+        if mode == "clamped" and settings.grasp_radius > 0:
+            return Grasp.gripping(model.mesh, np.array(point), settings.grasp_radius)
         return Grasp.at(model.mesh, np.array(point), settings.grasp_radius, mode)
 
     grasp = (Grasp.from_mesh(model.mesh, settings.grasp_mode, grasp_point)
              if settings.grasp_point is None else patch(settings.grasp_point, settings.grasp_mode))
     holds = tuple(patch(point, settings.grasp_mode) for point in settings.hold_at)
+    model = model.gripped(grasp, *holds)
     loads = np.zeros_like(model.mesh.nodes)
     for place in settings.load_at:
         loaded = patch(place[:3], "pinned")

@@ -38,6 +38,8 @@ class CalibrationEntry(BaseModel):
         2e-3, ge=0, description="Observer's clock against the robot's, left after alignment.")
     slip_sigma_m: float = Field(
         5e-4, ge=0, description="Creep of the grasp along the branch, from begin to end.")
+    held_length_sigma_m: float = Field(
+        1e-3, ge=0, description="Half the length of the piece that a clamping gripper holds.")
     repeat_sigma: float = Field(
         0.02, ge=0, description="Stiffness of one and the same branch from recording to recording, "
         "relative: creep, warmth, how it is held.")
@@ -46,12 +48,12 @@ class CalibrationEntry(BaseModel):
 EXACT = CalibrationEntry(
     pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
     force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=0.0,
-    clock_sigma_s=0.0, slip_sigma_m=0.0, repeat_sigma=0.0)
+    clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0, repeat_sigma=0.0)
 """Of a simulated cell without errors."""
 WITHOUT_GRIPPER = CalibrationEntry(
     pose_sigma_m=0.0, pose_sigma_rad=0.0, force_gain_sigma=0.0, force_bias_sigma_n=0.0,
     force_drift_sigma_n=0.0, torque_bias_sigma_nm=0.0, camera_sigma_m=0.0, camera_sigma_rad=1e-3,
-    clock_sigma_s=0.0, slip_sigma_m=0.0)
+    clock_sigma_s=0.0, slip_sigma_m=0.0, held_length_sigma_m=0.0)
 """Of a stated load and of markers that were laid onto the branch at rest: what is left is how far
 that laying turned them."""
 

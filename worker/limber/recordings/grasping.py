@@ -6,20 +6,27 @@ from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.recordings.recording import GraspEntry
 
+LEAST_NODES = 6
+"""A patch of fewer is widened."""
+
 
 def grasp_on(mesh: TetMesh, entry: GraspEntry) -> Grasp:
     """Return the recorded grasp as a patch of a mesh.
 
-    Its centre is the recorded point. A patch of under 6 nodes is widened.
+    Its centre is the recorded point. A patch of under 6 nodes is widened; how long a piece a
+    clamping gripper holds stays what was recorded.
 
     Raises:
         InputError: the point is not on the branch, or in its fixed base.
     """
     point = np.array(entry.point_m)
     distance = np.sort(np.linalg.norm(mesh.nodes - point, axis=1))
+    if entry.mode == "clamped":
+        is_off = distance[0] > 3 * entry.radius_m
+        return Grasp.gripping(mesh, point, entry.radius_m, 1 if is_off else LEAST_NODES)
     if distance[0] > 3 * entry.radius_m:
         return Grasp.at(mesh, point, entry.radius_m, entry.mode)
-    radius = max(entry.radius_m, distance[min(5, len(distance) - 1)] * (1 + 1e-9))
+    radius = max(entry.radius_m, distance[min(LEAST_NODES, len(distance)) - 1] * (1 + 1e-9))
     return Grasp.at(mesh, point, radius, entry.mode)
 
 

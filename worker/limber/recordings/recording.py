@@ -31,7 +31,8 @@ class GraspEntry(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     point_m: Vector = Field(description="Centre of the grasp patch at rest, branch frame.")
-    radius_m: float = Field(gt=0, description="Nodes within this distance are held.")
+    radius_m: float = Field(gt=0, description="Nodes within this distance are held; clamped, the "
+                            "branch as far to both sides along its axis.")
     mode: Literal["clamped", "pinned"] = "clamped"
 
 

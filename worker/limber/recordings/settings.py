@@ -43,7 +43,9 @@ class ImportSettings(Settings):
     grasp_point: tuple[float, float, float] | None = Field(
         None, description="Where the gripper holds or the load hangs, at rest [m]; else the "
         "robot's first pose.")
-    grasp_radius: float = Field(0.01, gt=0, description="Radius of the grasp patch [m].")
+    grasp_radius: float = Field(
+        0.01, gt=0, description="Radius of the grasp patch; half the length of the piece that a "
+        "clamping gripper holds [m].")
     grasp_mode: Literal["clamped", "pinned"] = Field(
         "clamped", description="clamped: the gripper also turns the branch.")
     weight: float | None = Field(

@@ -59,6 +59,7 @@ def deviation_rows(estimate: Mapping[str, Any]) -> list[list[str]]:
     known = {"sensor": "by sensors", "geometry": "by the scan's shape", "mesh": "by the mesh",
              **({"path": "by the gripper's path"} if parts.get("path") else {}),
              **({"hung": "by the mass of twigs"} if parts.get("hung") else {}),
+             **({"grip": "by the length in the gripper"} if parts.get("grip") else {}),
              "total": "together"}
     if not any(parts.get(name) for name in known):
         return []

@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import time
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -172,18 +171,20 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
     The grasp goes through the plan's positions turned as the branch would turn by itself, close
     enough that straight lines between stretch nothing; the wrench is that of the branch clamped so.
     """
-    from limber.mechanics import follow_poses
+    from limber.mechanics import Grasp, follow_poses
     from limber.mechanics.sensitivities import grasp_slopes
     from limber.planning.field.grasp_model import refusal
     from limber.robot.expected import Predicted
     from limber.stages.plan_doubt import estimated_doubt
+    from limber.stages.record_way import GRASP_RADIUS_M
 
     doubt = estimated_doubt(branch, model)
     if doubt is None:
         progress.warn("How uncertain Young's modulus is, is not known (no estimate): the interval "
                       "of the predicted force leaves it out.")
     positions = _closely(positions)
-    clamped = replace(model.grasp, mode="clamped")
+    clamped = Grasp.gripping(model.mesh, model.grasp.centre, GRASP_RADIUS_M)
+    firm = model.model.gripped(clamped)
     poses, wrenches, stiffness, covariances = [], [], [], []
     state = held = model.rest.displacement
     for number, position in enumerate(positions):
@@ -192,7 +193,7 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
         if reason is None:
             state = free.displacement
             pose = np.r_[position, model.pose(state)[3:]]
-            result = follow_poses(model.model, clamped, pose[None], start=held)[0]
+            result = follow_poses(firm, clamped, pose[None], start=held)[0]
             reason = refusal(result)
         if reason is not None:
             raise WorkError(f"Pose {number + 1} of {len(positions)} has no believable solution "
@@ -201,9 +202,9 @@ def _predicted(branch: Branch, model: GraspModel, positions: np.ndarray, progres
         held = result.displacement
         poses.append(pose)
         wrenches.append(np.r_[result.reaction_force, result.reaction_torque])
-        stiffness.append(grasp_slopes(model.model, clamped, held).wrench)
+        stiffness.append(grasp_slopes(firm, clamped, held).wrench)
         covariances.append(np.zeros((3, 3)) if doubt is None
-                           else _by_young(model.model, clamped, result, doubt))
+                           else _by_young(firm, clamped, result, doubt))
         progress(0.05 + 0.35 * number / len(positions), "forces along the path")
     return Predicted(np.array(poses), np.array(wrenches), np.array(stiffness),
                      np.array(covariances))

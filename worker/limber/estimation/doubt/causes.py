@@ -31,6 +31,8 @@ ADVICE = {
     "shape of the scan": "a scan from more sides, or with less noise",
     "mass of twigs and leaves": "weigh what hangs on the branch, and state it "
                                 "(--hung-sigma); or mesh more twigs (--twig-radius of reconstruct)",
+    "length in the gripper": "measure it, and state it under [grasp] (radius_m: its half) and "
+                             "[calibration] (held_length_sigma_m) of pull.toml",
     "mesh": "a finer mesh (--mesh-spacing of reconstruct)",
     "clamp": "scan farther down, so that the clamped place is known",
 }

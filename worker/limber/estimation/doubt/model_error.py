@@ -50,6 +50,8 @@ class ModelError:
             does (:func:`limber.estimation.doubt.path_error.path_error`).
         hung: From the mass of twigs and leaves beside the mesh, shape [K]; None where there are
             none (:func:`limber.estimation.doubt.shape_error.hung_error`).
+        grip: From the length of the piece in a clamping gripper, shape [K]; None where none clamps
+            (:func:`limber.estimation.doubt.grip_error.grip_error`).
     """
 
     geometry: np.ndarray | None = None
@@ -58,11 +60,12 @@ class ModelError:
     mesh_factor: np.ndarray | float = 1.0
     path: np.ndarray | None = None
     hung: np.ndarray | None = None
+    grip: np.ndarray | None = None
 
     def total(self, sensor: np.ndarray) -> np.ndarray:
         """Standard deviation of log E with that of the sensors, shape [K]."""
-        parts = [part for part in (sensor, self.geometry, self.mesh, self.path, self.hung)
-                 if part is not None]
+        parts = [part for part in (sensor, self.geometry, self.mesh, self.path, self.hung,
+                                   self.grip) if part is not None]
         return np.sqrt(np.sum(np.square(parts), axis=0))
 
 

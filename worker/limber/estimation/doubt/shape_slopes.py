@@ -26,6 +26,7 @@ from limber.mechanics.linear.equations import Tangent
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import reactions
+from limber.recordings.calibration import calibration_of
 
 STEP = 1e-4
 """Part of the way to another shape, or of a mass, over which the force's derivative is taken: a
@@ -83,6 +84,16 @@ def hung_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
     """
     size = 3 * len(forward.rest_points), forward.mesh.nodes.size
     return _slopes(forward, values, [forward.with_hung_mass(1 + STEP)], [sparse.csr_matrix(size)])
+
+
+def grip_slopes(forward: QuasiStaticForward, values: Values) -> ErrorSlopes:
+    """Return the change of a pull's observations by the deviation of the length in its gripper.
+
+    Arguments as of :func:`shape_slopes`.
+    """
+    size = 3 * len(forward.rest_points), forward.mesh.nodes.size
+    longer = STEP * calibration_of(forward.entry).held_length_sigma_m
+    return _slopes(forward, values, [forward.with_longer_grip(longer)], [sparse.csr_matrix(size)])
 
 
 def _slopes(forward: QuasiStaticForward, values: Values, asides: Sequence[QuasiStaticForward],

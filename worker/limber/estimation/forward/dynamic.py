@@ -48,8 +48,8 @@ class DynamicForward(Forward):
         self._arguments = (name, model, weights, entry)
         self.weights = weights
         self.field = field or YoungField(weights)
-        self._model = under_its_weight(model, entry)
         self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._model = under_its_weight(model, entry).gripped(self.grasp)
         self._operator = point_operator(model.mesh, self.rest_points)
         # Only the nodes that the observed points hang on need derivatives.
         self._nodes = np.unique(self._operator.indices // 3)

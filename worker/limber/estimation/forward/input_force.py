@@ -100,8 +100,8 @@ def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndar
                 components: int) -> np.ndarray:
     """Nodal forces of each component of the gripper's wrench, shape [c, node_count, 3].
 
-    A force acts on the patch's centre. A clamped gripper's torque, about the recorded point,
-    turns the patch by a couple of forces on its nodes, with the arms that they have at the
+    A force acts on the patch's weighted centre. A clamped gripper's torque, about the recorded
+    point, turns the patch by a couple of forces on its nodes, with the arms that they have at the
     recorded rotation.
 
     Args:
@@ -114,9 +114,10 @@ def nodal_loads(grasp: Grasp, entry: GraspEntry, pose: np.ndarray, rest: np.ndar
     if components == 3:
         return loads
     turn = rotation_matrix(pose[3:])
-    arms = (rest[grasp.nodes] - grasp.centre) @ turn.T
-    # The force acts on the centre, the torque was taken about the recorded point.
-    offset = turn @ (np.array(entry.point_m) - grasp.centre)
+    middle = grasp.weights @ rest[grasp.nodes]
+    arms = (rest[grasp.nodes] - middle) @ turn.T
+    # The force acts on the middle, the torque was taken about the recorded point.
+    offset = turn @ (np.array(entry.point_m) - middle)
     inertia = np.einsum("k,kij->ij", grasp.weights, np.einsum("ki,ki->k", arms, arms)[
         :, None, None] * np.eye(3) - arms[:, :, None] * arms[:, None, :])
     for axis in range(3):

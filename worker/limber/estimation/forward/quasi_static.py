@@ -19,7 +19,7 @@ from limber.estimation.forward.key_frames import key_frames, travel
 from limber.estimation.gripper_path import force_for_travel
 from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.mechanics.grasp import Grasp, rotation_matrix
+from limber.mechanics.grasp import rotation_matrix
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
@@ -83,9 +83,9 @@ class QuasiStaticForward(Forward):
             _require_torque(name, entry, frames)
         self.weights = weights
         self.field = field or YoungField(weights)
-        self._model = under_its_weight(model, entry)
-        self.uses_torque = uses_torque(entry, frames)
         self.grasp = grasp_on(model.mesh, entry.grasp)
+        self._model = under_its_weight(model, entry).gripped(self.grasp)
+        self.uses_torque = uses_torque(entry, frames)
         self._operator = point_operator(model.mesh, self.rest_points)
         self._zero = np.zeros(6)
         self.spread = np.empty((len(frames), 0))
@@ -249,8 +249,7 @@ class QuasiStaticForward(Forward):
         other = copy.copy(self)
         model = self._model.with_rest_nodes(nodes)
         other._model = model if self._model.hanging is None else model.as_scanned()
-        other.grasp = Grasp.of_nodes(other.mesh, self.grasp.nodes, self.grasp.mode,
-                                     np.array(self.entry.grasp.point_m))
+        other.grasp = self.grasp.elsewhere(other.mesh, np.array(self.entry.grasp.point_m))
         if self.drive == "pose":
             other._drives = [pose_on(other.grasp, self.entry.grasp, pose)
                              for pose in self.frames.poses[self.keys]]
@@ -262,6 +261,15 @@ class QuasiStaticForward(Forward):
         """Return the same pull with all that hangs on the branch ``factor`` times as heavy."""
         other = copy.copy(self)
         other._model = self._model.with_hung_mass(factor)
+        return other
+
+    def with_longer_grip(self, length: float) -> "QuasiStaticForward":
+        """Return the same pull where a clamping gripper holds ``length`` [m] more to both sides."""
+        other = copy.copy(self)
+        if self.grasp.held is not None:
+            held = self.entry.grasp
+            other._model = self._model.gripped(self.grasp.holding(
+                self.mesh, np.array(held.point_m), held.radius_m + length))
         return other
 
     def place(self, displacement: np.ndarray) -> np.ndarray:

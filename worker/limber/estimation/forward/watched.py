@@ -126,14 +126,14 @@ class WatchedForward(QuasiStaticForward):
             [self._tangent(memory.displacement) for memory in self._memory])
         if not sensitivities:
             return places, None
-        return places, np.array([np.einsum("k,kip->ip", self.grasp.weights,
-                                           memory.slope[self.grasp.nodes])
-                                 for memory in self._memory])
+        return places, np.array([self.grasp.place_slopes(self.mesh.nodes, memory.displacement,
+                                                         memory.slope) for memory in self._memory])
 
     def _response(self, compliances: list[np.ndarray]) -> Response:
         found = super()._response(compliances)
-        at_keys = np.array([[self.grasp.weights @ moved[self.grasp.nodes] for moved in each]
-                            for each in self._compliances])
+        at_keys = np.array([self.grasp.place_slopes(
+            self.mesh.nodes, memory.displacement, np.moveaxis(np.asarray(each), 0, -1)).T
+            for memory, each in zip(self._memory, self._compliances, strict=True)])
         grasps = np.einsum("fk,kci->fikc", self.spread, at_keys)
         return replace(found, grasps=grasps.reshape(*grasps.shape[:2], -1))
 

@@ -82,8 +82,8 @@ class ExactSolver:
 
     def __init__(self, branch: FullBranch):
         self.branch = branch
-        self._model = branch.model(np.ones(branch.weights.shape[1]))
         self.grasp = grasp_on(branch.mesh, branch.entry)
+        self._model = branch.model(np.ones(branch.weights.shape[1])).gripped(self.grasp)
         self._operator = point_operator(branch.mesh, branch.rest_points)
 
     def frame(self, pose: np.ndarray, log_young: np.ndarray,

@@ -165,10 +165,12 @@ def begin(pull: Pull, subject: Subject, settings: EstimateSettings, progress: Pr
                 f"E = {start.young[0] / 1e6:.3g} MPa throughout (--young gives another).")
         else:
             start = rough
-    model = under_its_weight(subject.model, pull.entry).with_young(subject.weights @ start.young)
+    grasp = grasp_on(subject.mesh, pull.entry.grasp)
+    model = under_its_weight(subject.model, pull.entry).gripped(grasp).with_young(
+        subject.weights @ start.young)
     training = TrainingSettings(grasp_count=training_count, young_spread=spread)
-    reduced, _ = build_reduced(model, grasp_on(subject.mesh, pull.entry.grasp), subject.weights,
-                               start.young, ReducedSettings(training=training), progress)
+    reduced, _ = build_reduced(model, grasp, subject.weights, start.young,
+                               ReducedSettings(training=training), progress)
     rest = subject.control_points if pull.entry.rest_points_m is None else np.array(
         pull.entry.rest_points_m)
     branch = FullBranch(subject.mesh, subject.weights, pull.entry.grasp, rest, start.poisson,

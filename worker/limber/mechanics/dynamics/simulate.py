@@ -202,7 +202,8 @@ class _Run:
         if self.drive.path:
             forces = reactions(grasps, out)
             for number, grasp in enumerate(grasps):
-                arm = positions[grasp.nodes] - grasp.weights @ positions[grasp.nodes]
+                arm = positions[grasp.nodes] - grasp.pose_of(model.mesh.nodes,
+                                                             state.displacement)[:3]
                 share = (out[grasp.nodes] if grasp.mode == "clamped"
                          else grasp.weights[:, None] * forces[number])
                 torques[number] = np.cross(arm, share).sum(axis=0)

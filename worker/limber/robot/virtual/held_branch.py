@@ -416,6 +416,7 @@ class _Solver:
         self._points = np.asarray(setting.points, float).reshape(-1, 3)
         self._operator = point_operator(mesh, self._points) if len(self._points) else None
         self._grasp = None
+        self._held = self._model
         self._state = np.zeros_like(mesh.nodes)
         self._last: Solution | None = None
         self._faces: np.ndarray | None = None
@@ -459,9 +460,10 @@ class _Solver:
         self._state = np.zeros_like(self._model.mesh.nodes)
         self._last = None
         try:
-            self._grasp = Grasp.at(self._model.mesh, position, self._setting.jaw)
+            self._grasp = Grasp.gripping(self._model.mesh, position, self._setting.jaw)
         except InputError as error:
             return {"error": error.seen}
+        self._held = self._model.gripped(self._grasp)
         frame = np.eye(4)
         frame[:3, 3] = self._grasp.centre
         return {"centre": self._grasp.centre, "solution": self.solve(frame)}
@@ -488,13 +490,13 @@ class _Solver:
         from limber.mechanics.strain import strain_state
 
         pose = np.r_[patch[:3, 3], rotation_vector(patch)]
-        result = solve_static(self._model, grasp=self._grasp, pose=pose, start=self._state)
+        result = solve_static(self._held, grasp=self._grasp, pose=pose, start=self._state)
         if not result.converged and self._last is not None:
             self._last = replace(self._last, seconds=result.seconds, converged=False)
             return self._last
         self._state = result.displacement
-        strain = strain_state(self._model, self._state).principal_strain
-        slopes = grasp_slopes(self._model, self._grasp, self._state)
+        strain = strain_state(self._held, self._state).principal_strain
+        slopes = grasp_slopes(self._held, self._grasp, self._state)
         points = (np.zeros((0, 6)) if self._operator is None
                   else self._operator @ slopes.displacement.reshape(-1, 6))
         self._last = Solution(
