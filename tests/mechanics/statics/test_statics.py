@@ -148,6 +148,28 @@ def test_result_does_not_depend_on_the_path():
         assert other.displacement == pytest.approx(once.displacement, abs=1e-5)
 
 
+@pytest.mark.parametrize("mode", ["pinned", "clamped"])
+def test_a_guess_of_the_end_saves_the_way(beam, slender_beam, mode):
+    """Near the end, or far off it: the state is the one that the way leads to; near it takes fewer
+    iterations, and the pose is the asked one to the last digit."""
+    grasp = Grasp.at(slender_beam, [0, 0, 0.45], 0.012, mode)
+    pose = grasp.rest_pose + np.array([0.12, 0.05, -0.03, 0, 0, 0])
+    near = pose + np.array([0.01, 0.0, 0.0, 0, 0, 0])
+    start = solve_static(beam, grasp=grasp, pose=near).require()
+    plain, = follow_poses(beam, grasp, pose[None], start=start)
+    other = solve_static(beam, grasp=grasp, pose=pose - [0.0, 0.005, 0.0, 0, 0, 0]).require()
+    close = 2.0 * other.displacement - solve_static(
+        beam, grasp=grasp, pose=pose - [0.0, 0.01, 0.0, 0, 0, 0]).require().displacement
+    for guess in (close, -3.0 * close):
+        led, = follow_poses(beam, grasp, pose[None], start=start, guess=guess)
+        assert led.converged and led.reached == 1.0
+        assert led.displacement == pytest.approx(plain.displacement, abs=1e-6)
+        assert led.reaction_force == pytest.approx(plain.reaction_force, rel=1e-5)
+        assert led.pose[:3] == pytest.approx(pose[:3], abs=1e-12)
+    assert follow_poses(beam, grasp, pose[None], start=start,
+                        guess=close)[0].iterations < plain.iterations
+
+
 def test_two_grasps_balance(beam, slender_beam):
     """Two grasps held at poses: each has its reaction; with the base they balance."""
     grasps = [Grasp.at(slender_beam, [0, 0, z], 0.01, mode)
@@ -357,6 +379,9 @@ def test_a_bow_that_turned_over_is_said_to_have_another_state(column):
                         start=bow).require()
     assert over.displacement[middle, 0].mean() < -0.02
     assert "another stable state" in over.doubt and over.doubt[1:] in "".join(over.warnings)
+    unasked = solve_static(model, grasp=end, pose=pressed, nodal_forces=-2 * push, start=bow,
+                           settings=StaticSettings(way_back=False)).require()
+    assert not unasked.doubt and np.array_equal(unasked.displacement, over.displacement)
     buckled = solve_static(model, grasp=end, pose=end.rest_pose - [0, 0, 0.01, 0, 0, 0])
     assert buckled.snapped_at and not buckled.doubt
 

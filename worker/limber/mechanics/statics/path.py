@@ -75,8 +75,11 @@ class Path:
                  for a, b in zip(self.begin_poses, self.end_poses, strict=True)]
         return self.problem.constraint(poses)[0] + (1 - part) * self.begin_rest, pins
 
-    def run(self, progress: Progress) -> StaticResult:
+    def run(self, progress: Progress, guess: np.ndarray | None = None) -> StaticResult:
+        """Go the way; where there is a ``guess`` of its end [node_count, 3], from that first."""
         step = 1.0
+        if guess is not None and not self._leap(guess):
+            step = 0.5
         while self.reached < 1.0:
             progress(self.reached, "seeking equilibrium", iteration=self.iterations)
             if self.iterations > self.settings.total_iterations:
@@ -88,6 +91,8 @@ class Path:
             if taken is None:
                 step = (part - self.reached) / 2
                 if step < self.settings.min_step:
+                    if not self.settings.snap:
+                        return self._result()
                     taken = settle(self, min(1.0, self.reached + _SNAP))
                     if taken is None:
                         return self._result()
@@ -124,6 +129,21 @@ class Path:
         # Its memory serves the tangents on the way.
         del tangent
         return self.correct(trial, increment, part, diagonal_norm, steady)
+
+    def _leap(self, guess: np.ndarray) -> bool:
+        """Try to reach the end from near it; return whether that was it."""
+        begin = self.displacement
+        trial = np.where(self.equations.held[:, None], self.goal.held, guess)
+        for grasp, pin in zip(self.equations.pinned, self.goal.pins, strict=True):
+            trial[grasp.nodes] += pin - grasp.weights @ trial[grasp.nodes]
+        longest = np.linalg.norm(trial - begin, axis=1).max()
+        # No linear step leads there, whose spurious strains mixed points would take off.
+        if longest <= self.settings.max_step * self.model.extent and self.correct(
+                trial, np.zeros_like(trial), 1.0, 0.0, True) is not None:
+            self.reached = 1.0
+            return True
+        self.status, self.trouble = Status.stalled, ""
+        return False
 
     def load_at(self, part: float) -> np.ndarray:
         return self.goal.load - (1.0 - part) * self.imbalance

@@ -24,6 +24,8 @@ class StaticSettings:
             line search.
         verify: Solve again from rest in small steps and compare energies; a difference is
             reported as a false equilibrium.
+        snap: Where a path of stable equilibria ends, let the branch snap to another one.
+        way_back: Where it snapped, walk back and say whether it ends elsewhere.
     """
 
     tolerance: float = 1e-7
@@ -34,6 +36,8 @@ class StaticSettings:
     stretch_limit: float = 2.0
     mixed: bool = True
     verify: bool = False
+    snap: bool = True
+    way_back: bool = True
 
 
 DEFAULT_SETTINGS = StaticSettings()

@@ -53,11 +53,16 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
 def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.ndarray, *,
                  nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
+                 guess: np.ndarray | None = None,
                  settings: StaticSettings = DEFAULT_SETTINGS,
                  progress: Progress = SILENT) -> list[StaticResult]:
     """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
 
     After a pose that fails the next starts from the last converged state.
+
+    Args:
+        guess: Displacement [m] that the first pose may have, shape [node_count, 3]: sought from
+            there first, and by the way from ``start`` if no stable equilibrium is near.
     """
     problem = StaticProblem(model, grasp, True, settings)
     displacement = problem.displacement_of(start)
@@ -65,7 +70,8 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
     for number, pose in enumerate(poses):
         progress(number / len(poses), "following poses", pose=number)
         goal = problem.target(pose, None, nodal_forces)
-        result = _walked(Path(problem, displacement, goal, pose), SILENT)
+        result = _walked(Path(problem, displacement, goal, pose), SILENT,
+                         guess if number == 0 else None)
         if settings.verify and result.converged:
             result = _verified(problem, result, goal, pose, SILENT)
         if result.converged:
@@ -91,10 +97,11 @@ def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
     return _walked(Path(problem, begin, replace(goal, held=held), None), SILENT)
 
 
-def _walked(path: Path, progress: Progress) -> StaticResult:
+def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None) -> StaticResult:
     """Return where a way leads, with what is doubtful about it."""
-    result = path.run(progress)
-    doubt = doubt_of(path, result) if result.converged else ""
+    result = path.run(progress, guess)
+    asked = result.converged and path.settings.way_back
+    doubt = doubt_of(path, result) if asked else ""
     if not doubt:
         return result
     return replace(result, doubt=doubt, warnings=[*result.warnings, f"{_capital(doubt)}."])
