@@ -8,6 +8,12 @@ import scipy.sparse as sp
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel
 
+ALL = slice(None)
+_UNIT = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # tensors in one row: 00 11 22 01 02 12
+_TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+_NEAR_STRAIN = 0.57
+_NEAR_STRESS = 0.3  # less: the norm is taken of the stress before it is turned and stretched
+
 
 @dataclass(frozen=True)
 class Place:
@@ -42,10 +48,11 @@ class StrainState:
     det_f: np.ndarray
 
 
-def deformation_gradients(model: BranchModel, displacement: np.ndarray) -> np.ndarray:
-    """Return F at all quadrature points, shape [tet_count, q, 3, 3]."""
-    local = displacement[model.mesh.tets]
-    H = np.matmul(model.gradients, local[:, None])
+def deformation_gradients(model: BranchModel, displacement: np.ndarray,
+                          tets: np.ndarray | slice = ALL) -> np.ndarray:
+    """Return F at the quadrature points of ``tets``, shape [tet_count, q, 3, 3]."""
+    local = displacement[model.mesh.tets[tets]]
+    H = np.matmul(model.gradients[tets], local[:, None])
     return np.swapaxes(H, 2, 3) + np.eye(3)
 
 
@@ -58,23 +65,59 @@ def principal_stretch(model: BranchModel, displacement: np.ndarray) -> Place:
 
 def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:
     """Return energy density, principal strain and stress of every tetrahedron."""
-    F = deformation_gradients(model, displacement)
-    part = model.weights / model.weights.sum(axis=1, keepdims=True)
-    F_t = np.swapaxes(F, 2, 3)
-    green = 0.5 * (F_t @ F - np.eye(3))
-    carried = _carried(model)
-    strain = np.einsum("eq,eqij->eij", part, green + strain_of(model, carried))
+    strain, stress, det = _means(model, displacement, ALL)
     energy = model.internal(displacement).tet_energy / model.weights.sum(axis=1)
-    det = np.linalg.det(F)
-    cauchy = _cauchy(model, F, green) + F @ carried @ F_t / det[..., None, None]
-    stress = np.einsum("eq,eqij->eij", part, cauchy)
     return StrainState(energy, np.linalg.eigvalsh(strain), np.linalg.eigvalsh(stress),
                        det.min(axis=1))
 
 
-def strain_of(model: BranchModel, stress: np.ndarray) -> np.ndarray:
-    """Return the small strain that a stress [Pa] makes, both of shape [tet_count, q, 3, 3]."""
-    young, poisson = (values[:, None, None, None] for values in (model.young, model.poisson))
+def peak_load(model: BranchModel, displacement: np.ndarray) -> tuple[float, int, float]:
+    """Return the largest principal strain by magnitude, its tetrahedron, and the largest principal
+    stress by magnitude [Pa]: those of :func:`strain_state`, a tenth of the time.
+
+    A symmetric tensor's largest principal value is at least its norm over the root of 3: only
+    tetrahedra whose norm comes near the largest are looked at closely.
+    """
+    part = model.weights / model.weights.sum(axis=1, keepdims=True)
+    green = np.einsum("eq,eqk->ek", part, model.strains(displacement))
+    carried = carried_strain(model)
+    strain = green if carried is None else green + carried
+    lam, mu = model.lame_lambda[:, None], model.lame_mu[:, None]
+    stress = lam * strain[:, :3].sum(axis=1, keepdims=True) * _UNIT + 2.0 * mu * strain
+    near = np.zeros(len(strain), bool)
+    for size, enough in ((_norms(strain), _NEAR_STRAIN), (_norms(stress), _NEAR_STRESS)):
+        near |= size >= enough * size.max()
+    tets = np.flatnonzero(near)
+    strain, stress, _ = _means(model, displacement, tets)
+    sizes = np.abs(np.linalg.eigvalsh(strain)).max(axis=1)
+    worst = int(sizes.argmax())
+    return (float(sizes[worst]), int(tets[worst]),
+            float(np.abs(np.linalg.eigvalsh(stress)).max()))
+
+
+def _norms(tensors: np.ndarray) -> np.ndarray:
+    return np.sqrt(tensors**2 @ _TWICE)
+
+
+def _means(model: BranchModel, displacement: np.ndarray, tets: np.ndarray | slice,
+           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean Green-Lagrange strain and Cauchy stress of ``tets``, each [n, 3, 3], and det F
+    at their quadrature points, [n, q]."""
+    F = deformation_gradients(model, displacement, tets)
+    weights = model.weights[tets]
+    part = weights / weights.sum(axis=1, keepdims=True)
+    F_t = np.swapaxes(F, 2, 3)
+    green = 0.5 * (F_t @ F - np.eye(3))
+    carried = _carried(model, tets)
+    strain = np.einsum("eq,eqij->eij", part, green + strain_of(model, carried, tets))
+    det = np.linalg.det(F)
+    cauchy = _cauchy(model, F, green, tets) + F @ carried @ F_t / det[..., None, None]
+    return strain, np.einsum("eq,eqij->eij", part, cauchy), det
+
+
+def strain_of(model: BranchModel, stress: np.ndarray, tets: np.ndarray | slice = ALL) -> np.ndarray:
+    """Return the small strain that a stress [Pa] makes in ``tets``, both [tet_count, q, 3, 3]."""
+    young, poisson = (values[tets, None, None, None] for values in (model.young, model.poisson))
     trace = np.trace(stress, axis1=2, axis2=3)[..., None, None]
     return ((1 + poisson) * stress - poisson * trace * np.eye(3)) / young
 
@@ -89,15 +132,16 @@ def carried_strain(model: BranchModel) -> np.ndarray | None:
     return strain[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
-def _carried(model: BranchModel) -> np.ndarray:
+def _carried(model: BranchModel, tets: np.ndarray | slice = ALL) -> np.ndarray:
     """Return the stress that carries the weight on the scan [Pa], shape [tet_count, q, 3, 3]."""
     if model.hanging is None:
-        return np.zeros((*model.weights.shape, 3, 3))
-    return model.hanging.total.stress[..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        return np.zeros((*model.weights[tets].shape, 3, 3))
+    return model.hanging.total.stress[tets][..., [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
 
 
-def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray) -> np.ndarray:
-    lam, mu = (values[:, None, None, None] for values in (model.lame_lambda, model.lame_mu))
+def _cauchy(model: BranchModel, F: np.ndarray, green: np.ndarray, tets: np.ndarray | slice,
+            ) -> np.ndarray:
+    lam, mu = (values[tets, None, None, None] for values in (model.lame_lambda, model.lame_mu))
     eye = np.eye(3)
     if model.material == Material.linear:
         small = 0.5 * (F + np.swapaxes(F, 2, 3)) - eye
