@@ -233,8 +233,7 @@ def _way_left(length: np.ndarray, depth: float, ground: Terrain) -> np.ndarray:
     h = ground.spacing
     flat = np.maximum(length, -depth)
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
-    rate = np.sqrt(corner_values(ground.rate_squared).mean(axis=0))
-    rate = np.where(ground.level, np.sqrt(ground.floor_squared), rate)
+    rate = np.where(ground.level, ground.floor, corner_values(ground.rate).mean(axis=0))
     growing = sum(np.gradient(rate, h, axis=axis) * np.gradient(length, h, axis=axis)
                   for axis in range(3))
     half_way = rate - 0.5 * length * np.nan_to_num(growing)

@@ -9,17 +9,18 @@ the edge h of a cell; with trilinear u it was of first order, 8 % instead of 2 %
 coefficient a cell. In a cell
 
 - each component of grad u is a polynomial in Bernstein form of degree 2 along each axis. At any
-  point grad u is a mean of the 27 Bernstein coefficients with the basis as weights, so |grad u|^2
-  is at most the same mean of their squares;
-- c^2 is at least the trilinear interpolation of its values at the corners, less
-  ``h^2 / 8 sum_i max |d^2 c^2 / dx_i^2|``; and the Bernstein coefficients of that interpolation are
+  point grad u is a mean of the 27 Bernstein coefficients with the basis as weights, so |grad u| is
+  at most the same mean of their magnitudes;
+- c is at least the trilinear interpolation of its values at the corners, less
+  ``h^2 / 8 sum_i max |d^2 c / dx_i^2|``; and the Bernstein coefficients of that interpolation are
   its values at the 27 points.
 
-So |g_m|^2 <= c^2(x_m) - allowance at the 27 points of every open cell is enough. The second
-derivatives are the one thing that is not proven: they are taken as at most ``CURVATURE_FACTOR``
-times the largest second difference of c^2 at the cell's corners. Where c has a kink inside a cell
-(the energy is cut off at zero), or the allowance would eat up c^2, the least c there is anywhere
-counts instead: the cost of length alone.
+So |g_m| <= c(x_m) - allowance at the 27 points of every open cell is enough. (With the squares of
+both the allowance would count the slope of c as well: four times as much about a narrow valley.)
+The second derivatives are the one thing that is not proven: they are taken as at most
+``CURVATURE_FACTOR`` times the largest second difference of c at the cell's corners. Where c has a
+kink inside a cell (the energy is cut off at zero), or the allowance would eat up c, the least c
+there is anywhere counts instead: the cost of length alone.
 """
 
 from typing import NamedTuple
@@ -44,18 +45,18 @@ class Terrain(NamedTuple):
     Attributes:
         spacing: Edge of a cell [m].
         open_cells: Cells that a path may enter, bool [nx, ny, nz]; none at the grid's border.
-        rate_squared: c^2 at the corners [1/m^2], shape [nx + 1, ny + 1, nz + 1].
+        rate: c at the corners [1/m], shape [nx + 1, ny + 1, nz + 1].
         allowance: What is subtracted from it in each cell, shape of ``open_cells``.
         level: Cells where the floor counts instead, shape of ``open_cells``.
-        floor_squared: What c^2 never falls below [1/m^2].
+        floor: What c never falls below [1/m].
     """
 
     spacing: float
     open_cells: np.ndarray
-    rate_squared: np.ndarray
+    rate: np.ndarray
     allowance: np.ndarray
     level: np.ndarray
-    floor_squared: float
+    floor: float
 
     @property
     def active(self) -> np.ndarray:
@@ -70,14 +71,12 @@ def terrain(rate: np.ndarray, positive: np.ndarray, open_cells: np.ndarray, spac
     ``positive`` says at which corners the energy is not cut off; corners that were not evaluated
     hold nan in ``rate`` and are no neighbours of an open cell's.
     """
-    squared = rate**2
-    allowance = np.nan_to_num(curvature_allowance(squared))
+    allowance = np.nan_to_num(curvature_allowance(rate))
     above = corner_values(positive.astype(float))
     level = (above.min(axis=0) < 0.5) & (above.max(axis=0) > 0.5)
-    least = np.nan_to_num(corner_values(squared).min(axis=0))
-    level |= least - allowance < floor**2
-    return Terrain(spacing, open_cells, np.nan_to_num(squared, nan=floor**2), allowance, level,
-                   floor**2)
+    least = np.nan_to_num(corner_values(rate).min(axis=0))
+    level |= least - allowance < floor
+    return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), allowance, level, floor)
 
 
 def curvature_allowance(values: np.ndarray) -> np.ndarray:
@@ -132,20 +131,20 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     The coefficients are ``factor * shape`` on ``known``; infinite where nothing leads from there.
     """
     active = ground.active
-    bound = np.sqrt(np.ascontiguousarray(corner_values(ground.rate_squared).mean(axis=0)))
+    bound = np.ascontiguousarray(corner_values(ground.rate).mean(axis=0))
     asked = ground.open_cells & ~free_cells
     held = known & active
     if not held.any():
         return np.full(active.shape, np.inf), 0.0
     steep = float(_excess(np.where(held, shape, np.inf), *ground, ground.open_cells).max())
-    factor = 1.0 / np.sqrt(steep) if steep > 0.0 else float(bound[held].min())
+    factor = 1.0 / steep if steep > 0.0 else float(bound[held].min())
     rate = bound.copy()
     u, used = bound, factor
     about = held
     for _ in range(rounds):
         used = factor
         u = march(rate, active, held, used * shape, ground.spacing)
-        over = np.maximum(np.sqrt(_excess(u, *ground, asked)), 1.0)
+        over = np.maximum(_excess(u, *ground, asked), 1.0)
         if over.max() <= _CLOSE:
             break
         factor /= float(over[about].max())
@@ -153,7 +152,7 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
         # The largest of the neighbours: reweighting cell by cell stirs up a chequerboard.
         over[held] = 1.0
         rate /= maximum_filter(over, 3)
-    worst = max(float(np.sqrt(_excess(u, *ground, asked).max())), 1.0)
+    worst = max(float(_excess(u, *ground, asked).max()), 1.0)
     # The rescaling is what makes it a proof; the rounds before only keep it small.
     return u / worst, used / worst
 
@@ -206,12 +205,11 @@ def _bernstein(source, out, axis, slope):
 
 
 @compiled
-def _excess(u, spacing, open_cells, rate_squared, allowance, level, floor_squared, asked):
-    """Return for each asked cell the largest |grad u|^2 over what is allowed there, else 0."""
+def _excess(u, spacing, open_cells, rate, allowance, level, floor, asked):
+    """Return for each asked cell the largest |grad u| over what is allowed there, else 0."""
     over = np.zeros(u.shape)
     block, one, two = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
     size = np.empty((3, 3, 3))
-    scale = 1.0 / (spacing * spacing)
     for i in range(1, u.shape[0] - 1):
         for j in range(1, u.shape[1] - 1):
             for k in range(1, u.shape[2] - 1):
@@ -230,11 +228,10 @@ def _excess(u, spacing, open_cells, rate_squared, allowance, level, floor_square
                 for p in range(3):
                     for q in range(3):
                         for r in range(3):
-                            allowed = floor_squared
+                            allowed = floor
                             if not level[i, j, k]:
-                                allowed = _between(rate_squared, i, j, k, p, q, r) - allowance[
-                                    i, j, k]
-                            worst = max(worst, size[p, q, r] * scale / allowed)
+                                allowed = _between(rate, i, j, k, p, q, r) - allowance[i, j, k]
+                            worst = max(worst, np.sqrt(size[p, q, r]) / (spacing * allowed))
                 over[i, j, k] = worst
     return over
 
