@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from limber.errors import InputError
-from limber.planning.chance import Exposure, YoungDoubt
+from limber.planning.chance import Exposure, YoungDoubt, _chosen
 from limber.planning.limits import Limits
 from limber.planning.resolve import resolve_path
 from limber.planning.settings import PlanSettings
@@ -67,6 +67,16 @@ def test_the_log_of_a_force_is_linear_in_the_logs_of_the_moduli(small_model, ben
     change = np.log(solved.force_sizes / bent.solved.force_sizes)
     assert np.allclose(slopes @ [1.0, -1.0], change, atol=0.015)
     assert np.abs(change).max() > 0.02
+
+
+def test_poses_are_asked_where_a_limit_may_break(small_model):
+    """Not on the way there, but about the peak of what each limit is on."""
+    way = np.concatenate([np.linspace(0.0, 1.0, 30), np.full(10, 1.0)])[:, None] * [0, 0.04, -0.002]
+    states = resolve_path(small_model, small_model.rest_position + way[::5],
+                          small_model.rest_position[None]).solved
+    chosen = _chosen(states, {"force": states.force_sizes.max()})
+    assert states.force_sizes[chosen].min() > 0.6 * states.force_sizes.max()
+    assert int(states.force_sizes.argmax()) in chosen and len(chosen) > 2
 
 
 @pytest.mark.parametrize(("settings", "words"), [

@@ -20,8 +20,9 @@ from limber.planning.limits import Limits, sizes
 from limber.planning.resolve import ResolvedPath, SolvedPoses
 from limber.progress import SILENT, Progress
 
-_POSES = 10  # along the motion, besides those where a limit is nearest
+_POSES = 10  # along the motion where a limit is near, besides those where one is nearest
 _NEAR = 0.3  # of a limit: what is farther below is taken to keep it
+_HIGH = 0.6  # of the peak of what a limit is on: poses of less are not the first to break it
 _FAR = 2.0  # standard deviations off, where the branch is solved once more
 _FARTHEST = 1.5  # times as far the bend that was found there is believed
 _DRAWS_LOG2 = 14  # quasi-random draws: the chance of 0.95 is off by some 0.0005
@@ -235,7 +236,10 @@ class YoungDoubt:
 
 
 def _chosen(states: SolvedPoses, asked: dict[str, float]) -> np.ndarray:
-    """Return the poses to ask: some along the motion, and where each limit is nearest."""
-    some = np.linspace(0, len(states.poses) - 1, min(_POSES, len(states.poses))).round()
+    """Return the poses to ask: some of those that may break a limit under some moduli, evenly along
+    the motion, and where each limit is nearest."""
     known = sizes(states)
-    return np.unique([*some.astype(int), *(int(known[name].argmax()) for name in asked)])
+    high = np.flatnonzero(np.any([known[name] > max(_HIGH * known[name].max(), _NEAR * limit)
+                                  for name, limit in asked.items()], axis=0))
+    some = np.linspace(0, len(high) - 1, min(_POSES, len(high))).round().astype(int)
+    return np.unique([*high[some], *(int(known[name].argmax()) for name in asked)]).astype(int)
