@@ -7,6 +7,7 @@ the gripper. Without weight it is the strain energy, the paper's measure of defo
 The field also gives the rotation that the grasped piece takes by itself, and the branch's tip.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,13 +37,11 @@ class FitChoice:
         return replace(chart, stretch=self.stretch, depth=self.depth * (chart.radius or 1.0))
 
 
-# Tried in turn; the least error on samples left out wins.
-CHOICES = tuple(
-    FitChoice(kernel, shape, stretch, depth)
-    for kernel, shape in (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0),
-                          ("multiquadric", 2.0))
-    for stretch, depth in ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
-                           (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005)))
+KERNELS_TRIED = (("cubic", 1.0), ("quintic", 1.0), ("multiquadric", 1.0), ("multiquadric", 2.0))
+CHARTS_TRIED = ((1.0, np.inf), (2.0, np.inf), (4.0, np.inf), (8.0, np.inf), (5.0, 0.02),
+                (12.0, 0.02), (30.0, 0.02), (12.0, 0.005), (30.0, 0.005), (80.0, 0.005))
+"""Stretch and depth; what bends how fast off the shell decides, whichever the kernel."""
+_FINALISTS = 3  # charts, the best with the first kernel, that the others are tried on
 _SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites round-off
 _CHOSEN_BY = ("energy_error", "force_error", "energy_error_median", "force_error_median")
 _OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
@@ -319,7 +318,7 @@ class EnergyField:
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
               *, progress: Progress = SILENT) -> EnergyField:
-    """Fit the field; of ``CHOICES`` the one with the least error on samples left out.
+    """Fit the field; of kernels and charts those with the least error on samples left out.
 
     Args:
         samples: What the branch model says.
@@ -335,34 +334,45 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
         raise WorkError(f"Only {len(samples.poses)} grasp poses were accepted.",
                         f"A field in three coordinates needs at least {needed}.",
                         "Sample more poses, or a smaller deflection.")
-    choices = [choice for choice in CHOICES if base is not None or choice.stretch == 1.0]
+    charts = CHARTS_TRIED if base is not None else CHARTS_TRIED[:1]
     if radius is None:
         radius = 0.0 if base is None else float(np.linalg.norm(samples.positions[0] - base))
     region = TrustRegion.of(samples.positions, samples.rejected_poses[:, :3], base, radius)
     chart = region.chart
-    some = _spread_out(region.is_face(), _CHOOSE_FROM)
-    scores = []
-    for number, choice in enumerate(choices):
-        progress(number / len(choices), "choosing the interpolation")
-        errors = left_out_errors(samples.take(some), choice.on(chart), choice,
-                                 region.is_face()[some])[0]
+    picked = _spread_out(region.is_face(), _CHOOSE_FROM)
+    some, face = samples.take(picked), region.is_face()[picked]
+    sure = _with_slopes(some)
+    bending, inside = some.take(sure), ~face[sure]
+
+    def energy_missed(choice: FitChoice) -> float:
+        errors = left_out_errors(some, choice.on(chart), choice, face)[0]
         # Their product: mean errors speak for the stiff poses, medians for the gentle ones.
-        scores.append(np.prod([errors[name] for name in _CHOSEN_BY]))
-    choice = choices[int(np.argmin(scores))]
-    shape = _shape_choice(samples.take(some), choices, chart, region.is_face()[some])
-    return _fitted(samples, choice, shape, region)
+        return float(np.prod([errors[name] for name in _CHOSEN_BY]))
 
-
-def _shape_choice(samples: GraspSamples, choices: list[FitChoice], chart: Chart, face: np.ndarray,
-                  ) -> FitChoice:
-    """Return the choice that misses the tips of samples left out by least."""
-    sure = _with_slopes(samples)
-    samples, inside = samples.take(sure), ~face[sure]
-
-    def missed(choice: FitChoice) -> float:
-        size = np.linalg.norm(_tips_missed(samples, choice, chart)[inside], axis=1)
+    def shape_missed(choice: FitChoice) -> float:
+        size = np.linalg.norm(_tips_missed(bending, choice, chart)[inside], axis=1)
         return float(np.median(size) * size.mean())
-    return min(choices, key=missed)
+
+    choice = _least(energy_missed, charts, progress.part(0.0, 0.5))
+    return _fitted(samples, choice, _least(shape_missed, charts, progress.part(0.5, 1.0)), region)
+
+
+def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, float]],
+           progress: Progress) -> FitChoice:
+    """Return the choice with the least ``missed``: the first kernel on all charts, then each other
+    one on the best of those."""
+    first, *others = KERNELS_TRIED
+    asked = [FitChoice(*first, *chart) for chart in charts]
+    scores: dict[FitChoice, float] = {}
+    while asked:
+        for choice in asked:
+            progress(len(scores) / (len(charts) + _FINALISTS * len(others)),
+                     "choosing the interpolation")
+            scores[choice] = missed(choice)
+        best = sorted(scores, key=scores.__getitem__)
+        asked = [replace(chosen, kernel=kernel, shape=shape) for kernel, shape in others
+                 for chosen in best[:_FINALISTS]] if len(scores) == len(charts) else []
+    return best[0]
 
 
 def _tips_missed(samples: GraspSamples, choice: FitChoice, chart: Chart) -> np.ndarray:
