@@ -23,7 +23,7 @@ def followed(ridge, monkeypatch):
                       ridge.force(place[None])[0], 1.5 * place + [0.0, 0.0, 0.3], 0.95,
                       None if place.sum() < 0.2 else "torn", np.empty((0, 3)), np.zeros(3), 0.05,
                       place, 0.0, np.full((3, 6), np.nan), ridge.force(place[None])[0, 2],
-                      result.displacement)
+                      result.displacement, np.full((3, 1, 3), np.nan))
 
     monkeypatch.setattr(refining, "taken", solved)
     return SimpleNamespace(follow=lambda places, _start: [SimpleNamespace(displacement=places)])

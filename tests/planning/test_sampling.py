@@ -9,6 +9,7 @@ from tests.planning.conftest import small_grasp_model
 from limber.errors import Cancelled, WorkError
 from limber.mechanics import Grasp, solve_static
 from limber.planning.field.chart import Chart, pulled_back_size
+from limber.planning.field.crew import Crew
 from limber.planning.field.energy_field import fit_field
 from limber.planning.field.grasp_model import Reach
 from limber.planning.field.sampling import (
@@ -131,8 +132,8 @@ def test_cancel_ends_sampling(small_model, some, workers):
 
 def test_grasp_moves_on_a_sphere_by_itself(small_model):
     """States under forces across lie on the shell within 0.3 mm, those drawn outward beyond it."""
-    valley, states = walk_valley(small_model, 8, deflection=0.4)
-    away = np.array([np.linalg.norm(small_model.pose(state.displacement)[:3] - valley.pivot)
+    valley, states = walk_valley(Crew(small_model, 1), 8, deflection=0.4)
+    away = np.array([np.linalg.norm(state.pose[:3] - valley.pivot)
                      for state in states]) - valley.radius
     assert len(states) == 17 and np.abs(away[:8]).max() < 3e-4
     assert (away[9:] > away[:8]).all()

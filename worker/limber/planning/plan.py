@@ -93,7 +93,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     start = _start(field, goal, settings)
     limits = limits or Limits.of(settings)
     if limits.obstacles:
-        field = _among(field, grasp_model, limits, progress)
+        field = _among(field, grasp_model, limits, workers, progress)
     pace = pace or Pace(settings.speed, settings.acceleration)
     rounds: list[dict[str, Any]] = []
     pair = baseline = moving = None
@@ -166,8 +166,8 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         moving.pace if moving is not None else pace, pair.certificate.to_go)
 
 
-def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, progress: Progress,
-           ) -> EnergyField:
+def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, workers: int | None,
+           progress: Progress) -> EnergyField:
     """Return the field that knows how close the branch is to obstacles.
 
     Raises:
@@ -178,8 +178,8 @@ def _among(field: EnergyField, grasp_model: GraspModel, limits: Limits, progress
     if at_rest > 1.0:
         raise NoPathError("The branch meets an obstacle where it hangs.",
                           "No path begins there.", "Correct the obstacles in the cell file.")
-    displacements = displacements_at(grasp_model, field.samples.positions,
-                                     progress.part(0.0, 0.1))
+    displacements = displacements_at(grasp_model, field.samples.positions, workers=workers,
+                                     progress=progress.part(0.0, 0.1))
     return among_obstacles(field, limits.closeness_of(nodes, displacements))
 
 

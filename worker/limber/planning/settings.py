@@ -14,8 +14,9 @@ class EnergySettings(Settings):
         "samples": ("samples", "field_error", "deflection", "seed"),
         "material": ("gravity",),
     }
-    samples: int = Field(150, ge=30, description=(
-        "Grasp positions to solve; some more are, where neighbours do not agree."))
+    samples: int = Field(225, ge=30, description=(
+        "Grasp positions to solve: two thirds lie evenly, the others where neighbours do not "
+        "agree."))
     field_error: float | None = Field(None, gt=0, description=(
         "Percent that the energy may be off at samples left out of the fit (root mean square over "
         "theirs): more poses are solved where it is off most, up to four times --samples."))

@@ -1,81 +1,96 @@
 """Neighbouring samples that do not agree: what the branch does between them.
 
-Pushed together below its rest, a branch goes aside one way or the other, and with its grasp in one
-place it may stand in either of two shapes; which one is a matter of the way there. A field fitted
-to both says a mean that the branch never takes. So where the shapes of two neighbours differ by
-more than their slopes say, the branch is taken half-way between them, from each. If it arrives in
-one state, that is a sample more, where the shape changes fast. If it arrives in two, or not at all,
-no path may lead there: the place counts as refused.
+Pushed together below its rest, a branch goes aside one way or the other, within millimetres, and
+with its grasp in one place it may stand in either of two shapes; which one is a matter of the way
+there. A field fitted to both says a mean that the branch never takes. So where the shapes of two
+neighbours differ by more than their slopes say, the branch is taken half-way between them: first
+where it matters most, by how far the shapes are apart and how many poses lie about the two. If it
+arrives in one state, that is a sample more. If it arrives in two, or would have to snap, no path
+may lead there: the place counts as refused.
 """
 
-import heapq
 from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial import Delaunay
 
-from limber.jobs import run_tasks
 from limber.planning.field.chart import Chart
+from limber.planning.field.crew import Crew
 from limber.planning.field.grasp_model import GraspModel, refusal
 from limber.planning.field.solved import Solved, taken
 from limber.progress import SILENT, Progress
 
-_JUMP = 0.03  # of the branch's length, by which neighbours' slopes foretell differently
+_JUMP = 0.01  # of the branch's length, by which neighbours' slopes foretell differently
 _ONE = 0.003  # of it: nearer shapes are one
-_NEARER = 0.4  # of a jump is left half-way, at most, where the branch surely is the neighbour's
+_NEARER = 0.4  # of a jump is left half-way, at most, where the branch surely is the neighbours'
 _LEAST = 0.02  # of it: neighbours nearer than this are asked no more
-_SHARE_PAIRS = 20
+_ROUNDS = 4  # each knows what the ones before have found
+_SHARE_PAIRS = 6
 """Pairs of one task; must not depend on how many processes there are."""
+_CORNERS = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
 
 Pair = tuple[Solved, Solved]
 
 
-def ask_between(grasp_model: GraspModel, known: Sequence[Solved], chart: Chart, most: int, *,
-                workers: int | None = None, progress: Progress = SILENT,
-                ) -> tuple[list[Solved], np.ndarray]:
+def ask_between(crew: Crew, known: Sequence[Solved], chart: Chart, usual: np.ndarray, most: int, *,
+                progress: Progress = SILENT) -> tuple[list[Solved], np.ndarray]:
     """Return samples between neighbours that do not agree, and places [t, 3] of two shapes.
 
     Args:
         known: Accepted states.
         chart: In which the samples are neighbours; plain.
-        most: So many places are asked at most, those first that agree least.
+        usual: Places [n, 3] as densely as the field is asked: what is wrong near many of them
+            matters more.
+        most: So many places are asked at most.
     """
-    pairs = disagreeing(known, chart, grasp_model.reach.arc_length)[:most]
-    if not pairs:
-        return [], np.empty((0, 3))
-    # Slabs of space: what one finds spares it others near.
-    middles = [0.5 * (a.pose[0] + b.pose[0]) for a, b in pairs]
-    count = max(2, -(-len(pairs) // _SHARE_PAIRS))
-    shares = [[pairs[k] for k in sorted(share)]
-              for share in np.array_split(np.argsort(middles, kind="stable"), count) if len(share)]
-    positions = np.array([one.pose[:3] for one in known])
-    found = run_tasks(_ask, [(grasp_model, share, positions, chart, round(most / len(shares)))
-                             for share in shares],
-                      workers=workers, progress=progress, message="between neighbouring poses")
-    return ([one for added, _ in found for one in added],
-            np.concatenate([torn for _, torn in found]))
+    known, begun, asked = list(known), len(known), 0
+    torn = np.empty((0, 3))
+    for number in range(_ROUNDS):
+        wanted = round(most * (number + 1) / _ROUNDS) - asked
+        pairs = disagreeing(known, chart, usual, crew.grasp_model.reach.arc_length)
+        chosen = _apart(pairs, known, torn, chart)[:wanted]
+        if not chosen:
+            break
+        asked += len(chosen)
+        # In turn: hard places come first, and lie together.
+        count = max(2, -(-len(chosen) // _SHARE_PAIRS))
+        shares = [chosen[k::count] for k in range(count)]
+        found = crew.run(_ask, [(share,) for share in shares if share],
+                         progress=progress.part(number / _ROUNDS, (number + 1) / _ROUNDS),
+                         message="between neighbouring poses")
+        known += [one for added, _ in found for one in added]
+        torn = np.concatenate([torn, *(places for _, places in found)])
+    return known[begun:], torn
 
 
-def disagreeing(known: Sequence[Solved], chart: Chart, length: float) -> list[Pair]:
-    """Return the pairs of neighbours that do not agree, those first that agree least.
+def disagreeing(known: Sequence[Solved], chart: Chart, usual: np.ndarray, length: float,
+                ) -> list[tuple[int, int, np.ndarray]]:
+    """Return the pairs of neighbours that do not agree, those first where it matters most.
 
+    As numbers in ``known``, with those of the tetrahedra [k] that share them. Between two it
+    matters as much as their jump times how many of the ``usual`` places are in those.
     ``length`` [m] is the branch's.
     """
     flat = chart.map(np.array([one.pose[:3] for one in known]))
-    edges = neighbours(flat)
-    jumps = np.array([jump(known[a], known[b]) for a, b in edges])
+    tetrahedra = Delaunay(flat)
+    inside = tetrahedra.find_simplex(chart.map(usual))
+    crowd = np.bincount(inside[inside >= 0], minlength=len(tetrahedra.simplices))
+    sides = np.sort(tetrahedra.simplices[:, _CORNERS], axis=2)
+    edges, number = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True)
+    number = number.reshape(len(sides), 6)
+    weight = np.bincount(number.ravel(), np.repeat(crowd, 6), len(edges))
+    jumps = _jumps(known, edges)
     apart = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
-    wrong = (jumps > _JUMP * length) & (apart > _LEAST * length)
-    order = np.flatnonzero(wrong)[np.argsort(-jumps[wrong], kind="stable")]
-    return [(known[edges[k, 0]], known[edges[k, 1]]) for k in order]
+    worth = np.where((jumps > _JUMP * length) & (apart > _LEAST * length), jumps * weight, 0.0)
+    return [(int(edges[k, 0]), int(edges[k, 1]), np.flatnonzero((number == k).any(axis=1)))
+            for k in np.argsort(-worth, kind="stable")[:int((worth > 0.0).sum())]]
 
 
 def neighbours(flat: np.ndarray) -> np.ndarray:
     """Return the pairs of ``flat`` places [m, 3] that share an edge of the Delaunay tetrahedra,
     shape [e, 2]."""
-    corners = Delaunay(flat).simplices
-    return np.unique(np.sort(np.concatenate(
-        [corners[:, [a, b]] for a in range(4) for b in range(a + 1, 4)]), axis=1), axis=0)
+    sides = Delaunay(flat).simplices[:, _CORNERS].reshape(-1, 2)
+    return np.unique(np.sort(sides, axis=1), axis=0)
 
 
 def jump(first: Solved, second: Solved) -> float:
@@ -83,54 +98,91 @@ def jump(first: Solved, second: Solved) -> float:
 
     By the slopes of each; where one has none, by the other's alone.
     """
-    way = second.pose[:3] - first.pose[:3]
-    slopes = np.array([first.shape_slopes[:, 3:], second.shape_slopes[:, 3:]])
+    return float(_jumps([first, second], np.array([[0, 1]]))[0])
+
+
+def _jumps(known: Sequence[Solved], edges: np.ndarray) -> np.ndarray:
+    """Return those of pairs of numbers [e, 2] in ``known``, shape [e]."""
+    places = np.array([one.pose[:3] for one in known])
+    shapes = np.array([one.shape[3:] for one in known])
+    slopes = np.array([one.shape_slopes[:, 3:] for one in known])
     sure = np.isfinite(slopes).all(axis=(1, 2))
-    change = way @ slopes[sure].mean(axis=0) if sure.any() else 0.0
-    off = (second.shape[3:] - first.shape[3:] - change).reshape(-1, 3)
-    return float(np.linalg.norm(off, axis=1).max())
+    slopes[~sure] = 0.0
+    first, second = edges.T
+    count = np.maximum(sure[first].astype(int) + sure[second], 1)
+    change = np.einsum("ek,ekc->ec", places[second] - places[first],
+                       (slopes[first] + slopes[second]) / count[:, None, None])
+    off = (shapes[second] - shapes[first] - change).reshape(len(edges), -1, 3)
+    return np.linalg.norm(off, axis=2).max(axis=1)
 
 
-def _ask(grasp_model: GraspModel, pairs: list[Pair], positions: np.ndarray, chart: Chart,
-         most: int, progress: Progress = SILENT) -> tuple[list[Solved], np.ndarray]:
-    length = grasp_model.reach.arc_length
-    waiting = [(-jump(*pair), number, pair) for number, pair in enumerate(pairs)]
-    heapq.heapify(waiting)
-    asked, added, torn = 0, [], np.empty((0, 3))
-    while waiting and asked < most:
-        _, _, (first, second) = heapq.heappop(waiting)
-        middle = chart.curved(chart.map(np.array([first.pose[:3], second.pose[:3]]))
-                              .mean(axis=0)[None])
+def _apart(pairs: list[tuple[int, int, np.ndarray]], known: Sequence[Solved], torn: np.ndarray,
+           chart: Chart) -> list[tuple[Pair, np.ndarray]]:
+    """Return pairs and the places [1, 3] half-way, of each tetrahedron one pair alone; none where
+    a place of two shapes is nearer than any that is known."""
+    flat = chart.map(np.array([one.pose[:3] for one in known]))
+    positions, taken_up, chosen = np.array([one.pose[:3] for one in known]), set(), []
+    for first, second, about in pairs:
+        if not taken_up.isdisjoint(about.tolist()):
+            continue
+        middle = chart.curved(flat[[first, second]].mean(axis=0)[None])
         if len(torn) and _nearest(middle, torn) < _nearest(middle, positions):
             continue
-        asked += 1
-        progress(asked / most, "between neighbouring poses")
+        taken_up.update(about.tolist())
+        chosen.append(((known[first], known[second]), middle))
+    return chosen
+
+
+def _ask(grasp_model: GraspModel, places: list[tuple[Pair, np.ndarray]],
+         progress: Progress = SILENT) -> tuple[list[Solved], np.ndarray]:
+    added, torn = [], [np.empty((0, 3))]
+    for number, ((first, second), middle) in enumerate(places):
+        progress(number / len(places), "between neighbouring poses")
         found = _half_way(grasp_model, first, second, middle)
         if found is None:
-            torn = np.concatenate([torn, middle])
-            continue
-        added.append(found)
-        positions = np.concatenate([positions, middle])
-        for pair in ((first, found), (found, second)):
-            if (off := jump(*pair)) > _JUMP * length and np.linalg.norm(
-                    pair[1].pose[:3] - pair[0].pose[:3]) > _LEAST * length:
-                heapq.heappush(waiting, (-off, len(pairs) + 2 * asked + (pair[0] is found), pair))
-    return added, torn
+            torn.append(middle)
+        else:
+            added.append(found)
+    return added, np.concatenate(torn)
 
 
 def _half_way(grasp_model: GraspModel, first: Solved, second: Solved, middle: np.ndarray,
               ) -> Solved | None:
     """Return the state at ``middle`` [1, 3] that both neighbours come to, None if there is none."""
-    there = grasp_model.follow(middle, first.displacement)[0]
-    if refusal(there):
+    found, apart = None, jump(first, second)
+    if (guess := _hermite(first, second, middle[0])) is not None:
+        there = grasp_model.follow(middle, first.displacement, guess, snap=False)[0]
+        if not refusal(there):
+            found = taken(grasp_model, there)
+            if max(jump(first, found), jump(found, second)) < _NEARER * apart:
+                return found
+    back = grasp_model.follow(middle, second.displacement, second.foretold(middle[0]),
+                              snap=False)[0]
+    if refusal(back):
         return None
-    found = taken(grasp_model, there)
-    if jump(found, second) < _NEARER * jump(first, second):
+    back = taken(grasp_model, back)
+    if found is not None and _are_one(found, back, grasp_model):
         return found
-    back = grasp_model.follow(middle, second.displacement)[0]
-    apart = grasp_model.shape(back.displacement)[3:] - found.shape[3:]
-    same = not refusal(back) and np.abs(apart).max() <= _ONE * grasp_model.reach.arc_length
-    return found if same else None
+    there = grasp_model.follow(middle, first.displacement, first.foretold(middle[0]),
+                               snap=False)[0]
+    if refusal(there) or not _are_one(taken(grasp_model, there), back, grasp_model):
+        return None
+    return back
+
+
+def _are_one(first: Solved, second: Solved, grasp_model: GraspModel) -> bool:
+    off = np.abs(first.shape[3:] - second.shape[3:]).max()
+    return bool(off <= _ONE * grasp_model.reach.arc_length)
+
+
+def _hermite(first: Solved, second: Solved, place: np.ndarray) -> np.ndarray | None:
+    """Return the displacement near half-way by values and slopes at both, None without slopes."""
+    straight = 0.5 * (first.pose[:3] + second.pose[:3])
+    told = [(one.foretold(place), one.foretold(one.pose[:3] + place - straight))
+            for one in (first, second)]
+    if any(guess is None for pair in told for guess in pair):
+        return None
+    return 0.25 * sum(guess for pair in told for guess in pair)
 
 
 def _nearest(place: np.ndarray, others: np.ndarray) -> float:

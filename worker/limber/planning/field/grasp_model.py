@@ -21,15 +21,17 @@ from limber.mechanics import (
     StaticResult,
     StaticSettings,
     follow_poses,
+    solve_static,
 )
 from limber.mechanics.loaded import LoadedBranch
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.status import Status
-from limber.mechanics.strain import strain_state
+from limber.mechanics.strain import peak_load
 from limber.sparse import NotPositiveDefiniteError
 
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
-_SETTINGS = StaticSettings(min_step=1 / 64)
+_SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False)
+_STEADY = replace(_SETTINGS, snap=False)
 _DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differentiated
 
 
@@ -107,10 +109,25 @@ class GraspModel:
         """Where the grasp is at rest [m], shape [3]."""
         return self.pose(self.rest.displacement)[:3]
 
-    def follow(self, positions: np.ndarray, start: np.ndarray) -> list[StaticResult]:
-        """Take the grasp through ``positions`` [m, 3] slowly, from displacement ``start``."""
+    def follow(self, positions: np.ndarray, start: np.ndarray, guess: np.ndarray | None = None,
+               *, snap: bool = True) -> list[StaticResult]:
+        """Take the grasp through ``positions`` [m, 3] slowly, from displacement ``start``.
+
+        Args:
+            guess: What the displacement may be at the first of them, shape [node_count, 3].
+            snap: Whether the branch may snap on the way; else it ends there.
+        """
         poses = np.hstack([positions, np.zeros_like(positions)])
-        return follow_poses(self.model, self.grasp, poses, start=start, settings=_SETTINGS)
+        return follow_poses(self.model, self.grasp, poses, start=start, guess=guess,
+                            settings=_SETTINGS if snap else _STEADY)
+
+    def pulled(self, force: np.ndarray, start: np.ndarray) -> StaticResult:
+        """Return the state under a force [3] on the grasp, from displacement ``start``, held."""
+        loose = solve_static(self.model, grasp=self.grasp, grasp_force=force, start=start)
+        if refusal(loose):
+            return loose
+        place = self.pose(loose.displacement)[:3]
+        return self.follow(place[None], loose.displacement, loose.displacement)[0]
 
     def pose(self, displacement: np.ndarray) -> np.ndarray:
         """Return position and natural rotation of the grasped piece, shape [6]."""
@@ -135,38 +152,46 @@ class GraspModel:
 
     def peak_strain(self, displacement: np.ndarray) -> float:
         """Return the largest principal Green-Lagrange strain of any tetrahedron, by magnitude."""
-        return float(np.abs(strain_state(self.model, displacement).principal_strain).max())
+        return peak_load(self.model, displacement)[0]
 
     def peak_load(self, displacement: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Return the largest principal strain by magnitude, where it is [m] at rest, shape [3], and
         the largest principal Cauchy stress by magnitude [Pa]."""
-        state = strain_state(self.model, displacement)
-        size = np.abs(state.principal_strain).max(axis=1)
-        tet = int(size.argmax())
-        return (float(size[tet]), self.mesh.centroids[tet],
-                float(np.abs(state.principal_stress).max()))
+        strain, tet, stress = peak_load(self.model, displacement)
+        return strain, self.mesh.nodes[self.mesh.tets[tet, :4]].mean(axis=0), stress
 
     def shape(self, displacement: np.ndarray) -> np.ndarray:
         """Return natural rotation [rad], tip and named targets [m] in one row, [6 + 3 targets]."""
         return np.concatenate([self.pose(displacement)[3:], self.tip(displacement),
                                self.branch.target_positions(displacement).ravel()])
 
-    def shape_slopes(self, displacement: np.ndarray) -> np.ndarray:
-        """Return how :meth:`shape` changes with the grasp's position, [3, 6 + 3 targets].
+    def tangents(self, displacement: np.ndarray) -> np.ndarray:
+        """Return how a state changes with the grasp's position, shape [3, node_count, 3].
 
-        By the tangent stiffness with the pin moved; the tangent is not positive definite at a
-        snap, where these are not known: NaN.
+        By the tangent stiffness with the pin moved; it is not positive definite at a snap, where
+        these are not known: NaN.
         """
         equations = self.model.equations((self.grasp,))
-        at = self.shape(displacement)
         try:
-            tangent = equations.tangent(self.model, displacement)
+            tangent = equations.exact_tangent(self.model, displacement)
         except NotPositiveDefiniteError:
+            return np.full((3, *displacement.shape), np.nan)
+        if not tangent.is_positive_definite:
+            return np.full((3, *displacement.shape), np.nan)
+        return np.array(tangent.solve_all(3 * [np.zeros_like(displacement)], np.eye(3)))
+
+    def shape_slopes(self, displacement: np.ndarray, tangents: np.ndarray | None = None,
+                     ) -> np.ndarray:
+        """Return how :meth:`shape` changes with the grasp's position, [3, 6 + 3 targets].
+
+        ``tangents``: Of the state, where they are known already. NaN where they are.
+        """
+        tangents = self.tangents(displacement) if tangents is None else tangents
+        at = self.shape(displacement)
+        if not np.isfinite(tangents).all():
             return np.full((3, len(at)), np.nan)
-        nothing = np.zeros_like(displacement)
-        return np.stack([
-            (self.shape(displacement + _DIFFERENCE * tangent.solve(nothing, axis[None])) - at)
-            / _DIFFERENCE for axis in np.eye(3)])
+        return np.stack([(self.shape(displacement + _DIFFERENCE * moved) - at) / _DIFFERENCE
+                         for moved in tangents])
 
     @cached_property
     def _tip_node(self) -> int:

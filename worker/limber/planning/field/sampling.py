@@ -13,27 +13,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from limber.errors import WorkError
-from limber.jobs import run_tasks
-from limber.mechanics import StaticResult
+from limber.errors import ConvergenceError, WorkError
 from limber.planning.field.between import ask_between
 from limber.planning.field.chart import Chart
+from limber.planning.field.crew import Crew
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, Reach
+from limber.planning.field.guess import guess_of
 from limber.planning.field.solved import Solved, samples_of, taken
 from limber.planning.field.valley import Valley, walk_valley
 from limber.planning.settings import EnergySettings
 from limber.progress import SILENT, Progress
 
 _LAYER = 0.06  # share of the shell's radius
-_WALK = 1 / 8  # directions along the shell for each sample that is asked for
+_SPREAD = 2 / 3  # of the samples lie evenly, the others between those that do not agree
+_WALK = 1 / 8  # directions along the shell for each sample that lies evenly
 _FEWEST_DIRECTIONS = 8
+_USUAL = 2048  # poses that say where the field is asked how often
 _TAUT = 2.0  # times the median force
-_SHARE_POSES = 40
+_SHARE_POSES = 30
 """Poses of one tree. How many trees there are must not depend on how many processes work on
 them, nor what they find."""
 _SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
-_BETWEEN = 0.75  # places asked between neighbours that do not agree, for each sample, at most
 TWO_SHAPES = "two shapes"
 """Among the reasons for which poses are refused: which of two shapes it is depends on the way."""
 
@@ -59,26 +60,30 @@ class Sampled:
 
 def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: int | None = None,
                  progress: Progress = SILENT) -> Sampled:
-    """Solve the branch at ``settings.samples`` poses spread over where its grasp may be taken, and
-    between neighbours that do not agree (:mod:`limber.planning.field.between`).
+    """Solve the branch at ``settings.samples`` poses: two thirds of them spread over where its
+    grasp may be taken, the others between neighbours that do not agree
+    (:mod:`limber.planning.field.between`).
 
     Raises:
         WorkError: the grasp has hardly any room. ConvergenceError: the branch has no rest state.
     """
-    directions = max(_FEWEST_DIRECTIONS, round(settings.samples * _WALK))
-    valley, walked = walk_valley(grasp_model, directions, deflection=settings.deflection,
-                                 seed=settings.seed, progress=progress.part(0.0, 0.1))
-    targets = sample_positions(
-        grasp_model.reach, grasp_model.rest_position, max(settings.samples - len(walked), 1),
-        valley, deflection=settings.deflection, seed=settings.seed)
-    good, bad = solve_branch(grasp_model, targets, walked, workers=workers,
-                             progress=progress.part(0.1, 0.7))
-    drawn = max((float(np.linalg.norm(state.reaction_force)) for state in walked), default=0.0)
-    slack = _slack(np.array([np.linalg.norm(one.force) for one in good]), drawn)
-    good = [one for one, kept in zip(good, slack, strict=True) if kept]
-    chart = Chart.about(valley.pivot, valley.radius, grasp_model.rest_position)
-    added, torn = ask_between(grasp_model, good, chart, round(_BETWEEN * settings.samples),
-                              workers=workers, progress=progress.part(0.7, 1.0))
+    spread = round(settings.samples * _SPREAD)
+    directions = max(_FEWEST_DIRECTIONS, round(spread * _WALK))
+    with Crew(grasp_model, workers) as crew:
+        valley, walked = walk_valley(crew, directions, deflection=settings.deflection,
+                                     seed=settings.seed, progress=progress.part(0.0, 0.2))
+        count = max(spread - len(walked), 1)
+        usual = sample_positions(
+            grasp_model.reach, grasp_model.rest_position, max(_USUAL, count), valley,
+            deflection=settings.deflection, seed=settings.seed, fewest=count)
+        targets = usual[:count]
+        good, bad = solve_branch(crew, targets, walked, progress=progress.part(0.2, 0.6))
+        drawn = max((float(np.linalg.norm(state.force)) for state in walked), default=0.0)
+        slack = _slack(np.array([np.linalg.norm(one.force) for one in good]), drawn)
+        good = [one for one, kept in zip(good, slack, strict=True) if kept]
+        chart = Chart.about(valley.pivot, valley.radius, grasp_model.rest_position)
+        added, torn = ask_between(crew, good, chart, usual, settings.samples - spread,
+                                  progress=progress.part(0.6, 1.0))
     good += added
     reasons = _counted(bad) | ({TWO_SHAPES: len(torn)} if len(torn) else {})
     samples = samples_of(good, np.concatenate([_asked(bad, targets), torn]))
@@ -87,8 +92,10 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
 
 
 def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley, *,
-                     deflection: float, seed: int = 0) -> np.ndarray:
+                     deflection: float, seed: int = 0, fewest: int | None = None) -> np.ndarray:
     """Return ``count`` positions [m] to which the grasp may be taken, shape [count, 3].
+
+    Where there is little room fewer, but no fewer than ``fewest`` (by default all).
 
     They lie within ``deflection`` times the arc length of ``rest``, above the base, and inside the
     shell. Half of them lie in a layer just inside it: there the branch bends without being pushed
@@ -117,7 +124,9 @@ def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley,
         bulk, layer = points[::2][inside[::2]], points[1::2][inside[1::2]]
         found.append(_alternating(bulk, layer))
         if sum(map(len, found)) >= count:
-            return np.concatenate(found)[:count]
+            break
+    if sum(map(len, found)) >= (count if fewest is None else fewest):
+        return np.concatenate(found)[:count]
     raise WorkError("The grasp has nearly no room to move.",
                     f"Within {radius:.3f} m of rest the branch, held {reach.arc_length:.3f} m from "
                     "its base, reaches little above that.",
@@ -129,33 +138,30 @@ def _alternating(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.stack([first[:shared], second[:shared]], axis=1).reshape(-1, 3)
 
 
-def sample_branch(grasp_model: GraspModel, targets: np.ndarray,
-                  known: Sequence[StaticResult] = (), *, workers: int | None = None,
+def sample_branch(grasp_model: GraspModel, targets: np.ndarray, *, workers: int | None = None,
                   progress: Progress = SILENT) -> tuple[GraspSamples, dict[str, int]]:
     """Solve the branch with its grasp at each of ``targets`` [n, 3].
-
-    ``known`` are states that become samples as they are.
 
     Returns:
         The accepted samples, the rest pose first; and how many were rejected for which reason.
     """
-    good, bad = solve_branch(grasp_model, targets, known, workers=workers, progress=progress)
+    with Crew(grasp_model, workers) as crew:
+        good, bad = solve_branch(crew, targets, progress=progress)
     return samples_of(good, _asked(bad, targets)), _counted(bad)
 
 
-def solve_branch(grasp_model: GraspModel, targets: np.ndarray,
-                 known: Sequence[StaticResult] = (), *, workers: int | None = None,
+def solve_branch(crew: Crew, targets: np.ndarray, known: Sequence[Solved] = (), *,
                  progress: Progress = SILENT) -> tuple[list[Solved], list[Solved]]:
     """Return accepted solutions, the rest state first, then ``known`` ones, and refused ones."""
-    # Slabs of space: in each a tree of its own out of the rest state.
+    # Slabs of space: in each a tree of its own out of what is known.
     share_count = max(2, -(-len(targets) // _SHARE_POSES))
     shares = np.array_split(np.argsort(targets[:, 0], kind="stable"), share_count)
-    found = run_tasks(_solve_share, [(grasp_model, targets[share], share) for share in shares],
-                      workers=workers, progress=progress, message="solving grasp poses")
+    begin = [taken(crew.grasp_model, crew.grasp_model.rest), *known]
+    found = crew.run(_solve_share, [(targets[share], share, begin) for share in shares],
+                     progress=progress, message="solving grasp poses")
     solved = sorted((one for share in found for one in share), key=lambda s: s.target)
-    good = [taken(grasp_model, grasp_model.rest), *(taken(grasp_model, state) for state in known),
-            *(one for one in solved if not one.trouble)]
-    return good, [one for one in solved if one.trouble]
+    return ([*begin, *(one for one in solved if not one.trouble)],
+            [one for one in solved if one.trouble])
 
 
 def _asked(bad: list[Solved], targets: np.ndarray) -> np.ndarray:
@@ -168,21 +174,22 @@ def _counted(bad: list[Solved]) -> dict[str, int]:
 
 
 def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
-                report: Callable[[int], None]) -> list[Solved]:
+                known: Sequence[Solved], report: Callable[[int], None]) -> list[Solved]:
     """Solve ``targets``, each from the nearest solution so far; ``numbers`` are their names.
 
     A pose that cannot be reached from there is tried again at the end, from other sides.
     """
-    positions = [grasp_model.rest_position]
-    states = [grasp_model.rest.displacement]
+    states, positions = list(known), [one.pose[:3] for one in known]
     solved: list[Solved] = []
 
     def attempt(target: int, source: int) -> Solved:
-        result = grasp_model.follow(targets[target][None], states[source])[0]
+        place, begin = targets[target], states[source]
+        guess = guess_of(states, np.array(positions), place, grasp_model.reach.arc_length)
+        result = grasp_model.follow(place[None], begin.displacement, guess)[0]
         found = taken(grasp_model, result, int(numbers[target]))
         if not found.trouble:
-            positions.append(targets[target])
-            states.append(result.displacement)
+            positions.append(place)
+            states.append(found)
         return found
 
     waiting, failed = list(range(len(targets))), []
@@ -206,8 +213,8 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
     return solved
 
 
-def displacements_at(grasp_model: GraspModel, positions: np.ndarray,
-                     progress: Progress = SILENT) -> np.ndarray:
+def displacements_at(grasp_model: GraspModel, positions: np.ndarray, *,
+                     workers: int | None = None, progress: Progress = SILENT) -> np.ndarray:
     """Return the branch's states with its grasp at ``positions`` [m, 3] that could be solved once.
 
     Shape [m, node_count, 3]; each from the nearest one before.
@@ -215,26 +222,22 @@ def displacements_at(grasp_model: GraspModel, positions: np.ndarray,
     Raises:
         ConvergenceError: one cannot be solved again.
     """
-    known, states = [grasp_model.rest_position], [grasp_model.rest.displacement]
-    found = np.zeros((len(positions), *states[0].shape))
-    waiting = list(range(len(positions)))
-    while waiting:
-        gaps = np.linalg.norm(positions[waiting][:, None] - np.array(known)[None], axis=2)
-        place, source = np.unravel_index(np.argmin(gaps), gaps.shape)
-        target = waiting.pop(int(place))
-        result = grasp_model.follow(positions[target][None], states[int(source)])[0].require()
-        found[target] = result.displacement
-        known.append(positions[target])
-        states.append(result.displacement)
-        progress(1.0 - len(waiting) / len(positions), "the branch among obstacles")
-    return found
+    with Crew(grasp_model, workers) as crew:
+        good, bad = solve_branch(crew, positions, progress=progress)
+    if bad:
+        place = ", ".join(f"{x:.3f}" for x in positions[bad[0].target])
+        raise ConvergenceError(
+            f"No acceptable solution ({bad[0].trouble}) with the grasp at ({place}) m.",
+            "It is a sample of the energy field, which could be solved once.",
+            "Run `limber energy` again with --force.")
+    return np.array([one.displacement for one in good[1:]])
 
 
 def _solve_share(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarray,
-                 progress: Progress = SILENT) -> list[Solved]:
+                 known: Sequence[Solved], progress: Progress = SILENT) -> list[Solved]:
     def report(done: int) -> None:
         progress(done / len(targets), "solving grasp poses", solved=done)
-    return _solve_tree(grasp_model, targets, numbers, report)
+    return _solve_tree(grasp_model, targets, numbers, known, report)
 
 
 def without_taut(samples: GraspSamples, drawn: float = 0.0) -> tuple[GraspSamples, int]:

@@ -16,7 +16,8 @@ class Solved:
     """A solution; ``target`` is the number of the position that was asked, -1: none was.
 
     The others as in :class:`~.energy_field.GraspSamples`, of one sample; ``trouble`` is why it
-    cannot be believed, ``displacement`` [node_count, 3] that of all nodes [m].
+    cannot be believed, ``displacement`` [node_count, 3] that of all nodes [m], ``tangents``
+    [3, node_count, 3] how that changes with the grasp's position, in single precision.
     """
 
     target: int
@@ -34,24 +35,43 @@ class Solved:
     shape_slopes: np.ndarray
     axial_force: float
     displacement: np.ndarray
+    tangents: np.ndarray
 
     @property
     def shape(self) -> np.ndarray:
         """Natural rotation [rad], tip and targets [m] in one row, [6 + 3 targets]."""
         return np.concatenate([self.pose[3:], self.tip, self.targets.ravel()])
 
+    @property
+    def has_tangents(self) -> bool:
+        """Whether they are known, which they are not at a snap."""
+        return bool(np.isfinite(self.tangents[0, 0, 0]))
+
+    def foretold(self, place: np.ndarray) -> np.ndarray | None:
+        """Return the displacement with the grasp at ``place`` [3] by the tangents, if known."""
+        if not self.has_tangents:
+            return None
+        return self.displacement + self.moved(place - self.pose[:3])
+
+    def moved(self, way: np.ndarray) -> np.ndarray:
+        """Return what the tangents say of a ``way`` [3] of the grasp, shape [node_count, 3]."""
+        # Not by BLAS, whose last digit may differ between processes.
+        return way[0] * self.tangents[0] + way[1] * self.tangents[1] + way[2] * self.tangents[2]
+
 
 def taken(grasp_model: GraspModel, result: StaticResult, target: int = -1) -> Solved:
     """Return what a solution says."""
     moved, at_rest = result.displacement, result is grasp_model.rest
     strain, place, stress = grasp_model.peak_load(moved)
+    tangents = grasp_model.tangents(moved)
     force = np.zeros(3) if at_rest else result.reaction_force
     return Solved(
         target, grasp_model.pose(moved), 0.0 if at_rest else grasp_model.energy(result),
         force, grasp_model.tip(moved),
         float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
         np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
-        grasp_model.shape_slopes(moved), grasp_model.axial_force(moved, force), moved)
+        grasp_model.shape_slopes(moved, tangents), grasp_model.axial_force(moved, force), moved,
+        tangents.astype(np.float32))
 
 
 def samples_of(good: Sequence[Solved], rejected: np.ndarray) -> GraspSamples:

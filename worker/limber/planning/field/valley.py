@@ -13,14 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from limber.mechanics import StaticResult, solve_static
+from limber.mechanics import StaticResult
+from limber.planning.field.crew import Crew
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.solved import Solved, taken
 from limber.progress import SILENT, Progress
 
 _STEP = 1e-4  # [m] of the moves that measure the stiffness at rest
 _RIM = 1.1  # times the force that linear bending needs for the largest deflection
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 _WORST = 0.02  # share of the radius that the sphere may miss the states by, root mean square
+_SHARE_DIRECTIONS = 3
+"""Directions of one task; must not depend on how many processes there are."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +35,8 @@ class Valley:
     radius: float
 
 
-def walk_valley(grasp_model: GraspModel, count: int, *, deflection: float, seed: int = 0,
-                progress: Progress = SILENT) -> tuple[Valley, list[StaticResult]]:
+def walk_valley(crew: Crew, count: int, *, deflection: float, seed: int = 0,
+                progress: Progress = SILENT) -> tuple[Valley, list[Solved]]:
     """Return the shell, and states of the branch on it and a little beyond.
 
     Args:
@@ -43,25 +47,41 @@ def walk_valley(grasp_model: GraspModel, count: int, *, deflection: float, seed:
 
     A branch that is no cantilever (its states lie on no sphere) gets the sphere about its base.
     """
-    rest, reach = grasp_model.rest, grasp_model.reach
+    grasp_model = crew.grasp_model
+    reach = grasp_model.reach
     stiffness, axes = _stiffness(grasp_model)
     force = float(np.sqrt(max(stiffness[0] * stiffness[1], 0.0))) * deflection * reach.arc_length
-    outward = _unit(grasp_model.rest_position - reach.base)
     turn = float(np.random.default_rng([seed, 11]).uniform(0.0, 2.0 * np.pi))
-    slack, taut = [rest], [_under(grasp_model, force * outward, rest)]
-    for number in range(count):
-        progress(number / count, "how the grasp moves by itself")
-        angle = turn + _GOLDEN * number
-        across = _RIM * force * np.sqrt((number + 0.5) / count) * (
-            np.cos(angle) * axes[:, 0] + np.sin(angle) * axes[:, 1])
-        if (found := _under(grasp_model, across, rest)) is None:
-            continue
-        slack.append(found)
-        outward = _unit(grasp_model.pose(found.displacement)[:3] - reach.base)
-        taut.append(_under(grasp_model, across + force * outward, found))
-    places = np.array([grasp_model.pose(state.displacement)[:3] for state in slack])
+    angles = turn + _GOLDEN * np.arange(count)
+    across = _RIM * force * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * (
+        np.cos(angles)[:, None] * axes[:, 0] + np.sin(angles)[:, None] * axes[:, 1])
+    across = np.concatenate([np.zeros((1, 3)), across])
+    # In turn: the farther from rest, the longer it takes.
+    shares = max(2, -(-len(across) // _SHARE_DIRECTIONS))
+    found = crew.run(_walk, [(across[k::shares], force) for k in range(shares)],
+                     progress=progress, message="how the grasp moves by itself")
+    pairs = [found[k % shares][k // shares] for k in range(len(across))]
+    slack = [pair[0] for pair in pairs[1:] if pair[0] is not None]
+    places = np.array([grasp_model.rest_position, *(state.pose[:3] for state in slack)])
     return _sphere(places, reach.base, grasp_model.rest_position), [
-        *slack[1:], *(state for state in taut if state is not None)]
+        *slack, *(pair[1] for pair in pairs if pair[1] is not None)]
+
+
+def _walk(grasp_model: GraspModel, across: np.ndarray, outward: float,
+          progress: Progress = SILENT) -> list[tuple[Solved | None, Solved | None]]:
+    """Return the states under each force [n, 3], and drawn ``outward`` [N] besides."""
+    pairs = []
+    for number, force in enumerate(across):
+        progress(number / len(across), "how the grasp moves by itself")
+        slack = _under(grasp_model, force, grasp_model.rest) if force.any() else grasp_model.rest
+        if slack is None:
+            pairs.append((None, None))
+            continue
+        kept = taken(grasp_model, slack)
+        drawn = _under(grasp_model, force + outward * _unit(kept.pose[:3] - grasp_model.reach.base),
+                       slack)
+        pairs.append((kept, None if drawn is None else taken(grasp_model, drawn)))
+    return pairs
 
 
 def _stiffness(grasp_model: GraspModel) -> tuple[np.ndarray, np.ndarray]:
@@ -75,12 +95,7 @@ def _stiffness(grasp_model: GraspModel) -> tuple[np.ndarray, np.ndarray]:
 
 def _under(grasp_model: GraspModel, force: np.ndarray, start: StaticResult) -> StaticResult | None:
     """Return the state under a force [3] on the grasp, held there; None if there is none."""
-    loose = solve_static(grasp_model.model, grasp=grasp_model.grasp, grasp_force=force,
-                         start=start.displacement)
-    if refusal(loose):
-        return None
-    place = grasp_model.pose(loose.displacement)[:3]
-    held = grasp_model.follow(place[None], loose.displacement)[0]
+    held = grasp_model.pulled(force, start.displacement)
     return None if refusal(held) else held
 
 
