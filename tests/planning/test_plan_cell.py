@@ -13,7 +13,8 @@ from limber.stages.plan import plan as plan_paths
 from limber.stages.plan_cell import region_of, require_taken
 from limber.store import Branch
 
-SETTINGS = PlanSettings(iterations=300)
+# No plan made anew because a field of 60 samples is rough.
+SETTINGS = PlanSettings(iterations=300, field_error=20.0)
 
 
 @pytest.fixture
@@ -89,8 +90,8 @@ def test_a_branch_is_led_around_an_obstacle(copied):
             "pose": (*map(float, place), 0, 0, 0)},))
 
     # In motion: test_motion_check.
-    plan_paths(copied, PlanSettings(iterations=100, inertia=False, **ends), name="around",
-               cell_file=post(tip), workers=1)
+    plan_paths(copied, SETTINGS.model_copy(update={"iterations": 100, "inertia": False, **ends}),
+               name="around", cell_file=post(tip), workers=1)
     assert np.linalg.norm(read_plan(copied / "plans/around.json").motion.tips - tip,
                           axis=1).min() > 0.01
     with pytest.raises(NoPathError, match="where it hangs"):

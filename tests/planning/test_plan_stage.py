@@ -26,7 +26,8 @@ from limber.stages.plan import plan as plan_paths
 from limber.store import Branch
 
 ENERGY = EnergySettings(samples=60)
-QUICK = {"iterations": 500, "start_seed": 3}
+# No plan made anew because a field of 60 samples is rough.
+QUICK = {"iterations": 300, "start_seed": 3, "field_error": 20.0}
 
 
 @pytest.fixture
@@ -261,8 +262,8 @@ def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within the tolerance."""
     field = EnergyField.read(copied / "energy.npz")
     wanted = field.tip(np.array(default_goal(field, 0.01).position))[0]
-    done = plan_paths(copied, PlanSettings(tip_goal=tuple(wanted), iterations=500),
-                              name="tip", workers=1)
+    done = plan_paths(copied, PlanSettings(tip_goal=tuple(wanted), iterations=300,
+                                           field_error=20.0), name="tip", workers=1)
     assert np.linalg.norm(np.array(done["plan"]["tip_end_m"]) - wanted) <= 0.01 * 1.001
 
 
