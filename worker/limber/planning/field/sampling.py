@@ -79,7 +79,8 @@ def sample_field(grasp_model: GraspModel, settings: EnergySettings, *, workers: 
         targets = usual[:count]
         good, bad = solve_branch(crew, targets, walked, progress=progress.part(0.2, 0.6))
         drawn = max((float(np.linalg.norm(state.force)) for state in walked), default=0.0)
-        slack = _slack(np.array([np.linalg.norm(one.force) for one in good]), drawn)
+        forces = np.array([np.linalg.norm(one.force) for one in good])
+        slack = _slack(forces, forces[1 + len(walked):], drawn)
         good = [one for one, kept in zip(good, slack, strict=True) if kept]
         chart = Chart.about(valley.pivot, valley.radius, grasp_model.rest_position)
         added, torn = ask_between(crew, good, chart, usual, settings.samples - spread,
@@ -248,12 +249,15 @@ def without_taut(samples: GraspSamples, drawn: float = 0.0) -> tuple[GraspSample
     goes there: poses over twice the median force stay out, and so out of the trusted region; but
     none that takes no more than ``drawn`` [N], the force that the branch was drawn outward with.
     """
-    slack = _slack(np.linalg.norm(samples.forces, axis=1), drawn)
+    forces = np.linalg.norm(samples.forces, axis=1)
+    slack = _slack(forces, forces, drawn)
     return samples.take(np.flatnonzero(slack)), int((~slack).sum())
 
 
-def _slack(forces: np.ndarray, drawn: float) -> np.ndarray:
-    slack = forces <= max(_TAUT * np.median(forces), drawn * (1.0 + 1e-9))
+def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
+    """Return which of ``forces`` [m] are no wall; ``usual`` are those of poses that lie evenly."""
+    middle = np.median(usual) if len(usual) else 0.0
+    slack = forces <= max(_TAUT * middle, drawn * (1.0 + 1e-9))
     slack[0] = True
     return slack
 
