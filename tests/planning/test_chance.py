@@ -69,14 +69,13 @@ def test_the_log_of_a_force_is_linear_in_the_logs_of_the_moduli(small_model, ben
     assert np.abs(change).max() > 0.02
 
 
-def test_poses_are_asked_where_a_limit_may_break(small_model):
+def test_poses_are_asked_where_a_limit_may_break(bent):
     """Not on the way there, but about the peak of what each limit is on."""
-    way = np.concatenate([np.linspace(0.0, 1.0, 30), np.full(10, 1.0)])[:, None] * [0, 0.04, -0.002]
-    states = resolve_path(small_model, small_model.rest_position + way[::5],
-                          small_model.rest_position[None]).solved
+    order = np.argsort(bent.solved.force_sizes)
+    states = bent.solved.take(np.repeat(order[[0, -1]], [30, 20]))
+    assert bent.solved.force_sizes[order[0]] < 0.6 * bent.solved.force_sizes[order[-1]]
     chosen = _chosen(states, {"force": states.force_sizes.max()})
-    assert states.force_sizes[chosen].min() > 0.6 * states.force_sizes.max()
-    assert int(states.force_sizes.argmax()) in chosen and len(chosen) > 2
+    assert len(chosen) >= 10 and chosen.min() >= 30
 
 
 @pytest.mark.parametrize(("settings", "words"), [
