@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks.scan_cases import one_sided_case
+from benchmarks.scan_scores import main_axis_error, seen_part
 from limber.geometry.skeleton.bridges import filled, free_ends, hypotheses
 from limber.geometry.skeleton.contraction.pieces import join_pieces
+from limber.geometry.skeleton.skeletonise import skeletonise
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -57,7 +60,8 @@ def test_an_end_prefers_what_it_points_at() -> None:
     stem, twig = _line([0, 0, 0], [0, 0, 0.6], 40), _line([0.06, 0, 0.36], [0.2, 0, 0.5], 10)
     nodes, edges = _forest(stem, twig)
     label = np.repeat([0, 1], [40, 10])
-    found = hypotheses(nodes, edges, np.full(50, 0.005), label, np.array([800, 200]), 0.2)
+    found = hypotheses(nodes, edges, np.full(50, 0.005), label, np.array([800, 200]), 0.2,
+                       free_ends(nodes, edges, np.full(50, 0.005)))
     best = nodes[found.other[0]] if found.other[0] < 40 else nodes[found.one[0]]
     assert best[2] == pytest.approx(0.30, abs=0.03)
     assert np.all(np.diff(found.price) >= 0)
@@ -74,6 +78,27 @@ def test_stems_are_joined_before_twigs() -> None:
     joined = _joined(nodes, edges, np.repeat([0.01, 0.01, 0.002], 12))
     assert sorted(joined.bridges[0].tolist()) == [11, 12]
     assert joined.label.max() == 0
+
+
+def test_a_twig_at_a_stems_end_does_not_close_it() -> None:
+    """An end that a bridge joined from the side stays one, with its direction; the bridge has none.
+    """
+    stem, twig = _line([0, 0, 0.4], [0, 0, 0.8]), _line([0.02, 0, 0.42], [0.2, 0, 0.55])
+    nodes, edges = _forest(stem, twig)
+    edges, thickness = np.vstack([edges, [[12, 0]]]), np.repeat([0.008, 0.004], 12)
+    closed = free_ends(nodes, edges, thickness)
+    assert set(closed.node.tolist()) == {11, 23}
+    found = free_ends(nodes, edges, thickness, np.array([[12, 0]]))
+    assert set(found.node.tolist()) == {0, 11, 23}
+    assert found.direction[found.node == 0][0] == pytest.approx([0, 0, -1])
+
+
+def test_a_stem_goes_on_past_a_twig_at_its_end() -> None:
+    """One of the bench's cases, seen from one side: the main axis had gone 5 radii aside, up a twig
+    that came to the upper stem's end first."""
+    case = one_sided_case(1604433927020)
+    truth = seen_part(case.truth, case.points)
+    assert main_axis_error(truth, skeletonise(case.points).skeleton) < 1
 
 
 def test_a_tip_beyond_a_gap_is_reached_straight_on() -> None:

@@ -63,19 +63,27 @@ class Hypotheses:
     meets: np.ndarray
 
 
-def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> Ends:
+def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
+              joints: np.ndarray | None = None) -> Ends:
     """Find the ends of all pieces and where they point.
 
     Args:
         nodes: Positions [m], shape [n, 3].
         edges: Node pairs of a forest, shape [e, 2].
         thickness: First radii [m], shape [n].
+        joints: Those of the edges by which a bridge joined a side, the bridge's node first, shape
+            [j, 2]: a twig that came to a stem's end does not close that.
     """
     near: list[list[int]] = [[] for _ in nodes]
     for a, b in edges.tolist():
         near[a].append(b)
         near[b].append(a)
-    ends = [node for node, others in enumerate(near) if len(others) <= 1]
+    reaching = set()
+    for bridge, side in ([] if joints is None else joints.tolist()):
+        near[bridge].remove(side)
+        near[side].remove(bridge)
+        reaching.add(bridge)
+    ends = [node for node, others in enumerate(near) if len(others) <= 1 and node not in reaching]
     direction, radius = np.zeros((len(ends), 3)), np.empty(len(ends))
     for place, end in enumerate(ends):
         # Points are missing beside an end too, where it looks thinner than it is.
@@ -88,7 +96,7 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray) -> En
 
 
 def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, label: np.ndarray,
-               weight: np.ndarray, limit: float) -> Hypotheses:
+               weight: np.ndarray, limit: float, ends: Ends) -> Hypotheses:
     """Price the ways in which pieces can be joined.
 
     Args:
@@ -98,8 +106,8 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
         label: Which piece each node belongs to, shape [n].
         weight: Points of each piece, shape [pieces].
         limit: No bridge is longer [m], unless an end points straight at what it reaches.
+        ends: The pieces' free ends.
     """
-    ends = free_ends(nodes, edges, thickness)
     end_of = np.full(len(nodes), -1)
     end_of[ends.node] = np.arange(len(ends.node))
     axis = _axes(nodes, edges)

@@ -38,6 +38,8 @@ class Joined:
             another as thick, more the odder the bridge is, shape [b].
         plants: Node pairs between pieces that are plants of their own, shape [p, 2].
         label: Which piece each node belongs to now, shape [n].
+        joints: Edges by which bridges joined the side of a piece, the bridge's node first, shape
+            [j, 2].
     """
 
     nodes: np.ndarray
@@ -49,6 +51,11 @@ class Joined:
     prices: np.ndarray
     plants: np.ndarray
     label: np.ndarray
+    joints: np.ndarray
+
+    def ends(self) -> Ends:
+        """The free ends of the pieces."""
+        return free_ends(self.nodes, self.edges, self.thickness, self.joints)
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
@@ -73,22 +80,23 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
         join_plants: Join even what looks like two plants.
     """
     state = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
-                   np.empty(0), np.empty((0, 2), np.int64), _labels(len(nodes), edges))
+                   np.empty(0), np.empty((0, 2), np.int64), _labels(len(nodes), edges),
+                   np.empty((0, 2), np.int64))
     # One node or two tell no direction: unless an end goes straight on to them, they come last.
     alone = True
     while True:
         weight = np.bincount(state.label, state.support)
         if len(weight) == 1:
             break
+        ends = state.ends()
         found = hypotheses(state.nodes, state.edges, state.thickness, state.label, weight,
-                           bridge_limit)
+                           bridge_limit, ends)
         chosen = _mutual(found, state, weight, gap, bridge_limit, up, join_plants, alone)
         if not chosen and alone:
             alone = False
             continue
         if not chosen:
             break
-        ends = free_ends(state.nodes, state.edges, state.thickness)
         for place in chosen:
             _bridge(state, ends, found, place, gap / 3)
         state.label = _labels(len(state.nodes), state.edges)
@@ -144,12 +152,24 @@ def _bridge(state: Joined, ends: Ends, found: Hypotheses, place: int, step: floa
     curve, thick = filled(state.nodes, state.thickness, ends, one, other, step)
     chain = np.concatenate([[one], len(state.nodes) + np.arange(len(curve)), [other]])
     state.edges = np.vstack([state.edges, np.stack([chain[:-1], chain[1:]], axis=1)])
+    if not found.meets[place]:
+        own, met = (_pointing(ends, node) for node in (one, other))
+        if met > 0:
+            # Of two ends side by side the thicker one goes on.
+            joint = chain[[1, 0]] if own > met else chain[[-2, -1]]
+            state.joints = np.vstack([state.joints, joint])
     state.nodes = np.vstack([state.nodes, curve])
     state.thickness = np.concatenate([state.thickness, thick])
     state.support = np.concatenate([state.support, np.zeros(len(curve), state.support.dtype)])
     state.spread = np.concatenate([state.spread, np.zeros(len(curve))])
     state.bridges = np.vstack([state.bridges, [one, other]])
     state.prices = np.append(state.prices, found.price[place] / found.length[place])
+
+
+def _pointing(ends: Ends, node: int) -> float:
+    """Radius [m] of a node that is an end with a direction of its own, else 0."""
+    own = (ends.node == node) & ends.direction.any(axis=1)
+    return float(ends.radius[own].sum())
 
 
 def specks(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
