@@ -185,10 +185,11 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     if (graph.owner < 0).any():
         # What was left away must not draw the rest towards it.
         some = some[graph.owner[cKDTree(points[thin]).query(some)[1]] >= 0]
-    fitted, more = _fit(first, some, settings, diagonal, camera, progress.part(0.65, 0.95))
+    fitted, more, beside = _fit(first, some, settings, diagonal, camera, progress.part(0.65, 0.95))
     segment, residual = nearest_cylinders(fitted.skeleton, points)
     check_round(fitted.skeleton, points, segment, residual)
-    leafy = float(np.mean(residual > fitted.skeleton.radius[segment])) > LEAF_SHARE
+    leafy = max(beside, float(np.mean(
+        residual > fitted.skeleton.radius[segment]))) > LEAF_SHARE
     if leafy:
         base = graph.nodes[start]
         graph = level_graph(
@@ -330,9 +331,13 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
     ended = _ends_within(fit.skeleton, points)
-    ended = limited(filled_in(ended, points), low, high)
+    # Where leaves swell or starve the axes, what lies beside a blank tells nothing of it either.
+    beside = float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
+    if beside <= LEAF_SHARE:
+        ended = filled_in(ended, points)
+    ended = limited(ended, low, high)
     told = assessed(tapered(ended, point_counts(ended, points)), points, fit.noise)
-    return replace(fit, skeleton=without_kinks(told)[0]), pruned
+    return replace(fit, skeleton=without_kinks(told)[0]), pruned, beside
 
 
 def _through_leaves(skeleton: Skeleton, points: np.ndarray, fit: AxisFit,
