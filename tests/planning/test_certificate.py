@@ -192,6 +192,25 @@ def test_no_path_is_proven_where_a_limit_separates(well_field):
         plan_gentle(problem_on(walled, start=start, goal=goal))
 
 
+@pytest.mark.parametrize("wrong_grids", [1, 5])
+def test_a_grid_too_coarse_for_a_valley_proves_nothing(well_field, monkeypatch, wrong_grids):
+    """The next grid is asked; and a path that keeps the limits is a better proof than any."""
+    problem, spacings, bound = problem_on(well_field), [], certificate._bound
+
+    def blind(problem, grid, cell):
+        spacings.append(grid.spacing)
+        if len(spacings) <= wrong_grids:
+            raise NoPathError("No path exists", "Proven on a grid")
+        return bound(problem, grid, cell)
+
+    monkeypatch.setattr(certificate, "_bound", blind)
+    found = plan_gentle(problem)
+    assert found.cost == problem.cost(found.points) < np.inf
+    assert spacings[1] < 0.4 * spacings[0]
+    assert (found.certificate.lower > 0.0) == (wrong_grids == 1)
+    assert found.certificate.levels
+
+
 def _wall():
     """Refused poses in a layer across x = 0."""
     y, z = np.meshgrid(np.arange(-0.25, 0.26, 0.02), np.arange(-0.25, 0.26, 0.02))

@@ -123,9 +123,23 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
     try:
         for level in range(_LEVELS):
             progress(level / _LEVELS, "bounding the best path", lower=lower, upper=upper)
-            found = _bound(problem, grid, cell)
-            if level == 0:
+            try:
+                found = _bound(problem, grid, cell)
+            except NoPathError:
+                if level == 0:
+                    # Corners so far apart say too little of what lies in a narrow valley.
+                    grid, cell = _refined(grid, grid.open_cells, cell)
+                    upper = improve(None)
+                    continue
+                if upper < np.inf:
+                    # A path that keeps the limits is the better proof.
+                    levels.append({"spacing_m": grid.spacing, "open_cells": 0, "lower": lower,
+                                   "upper": upper, "seconds": perf_counter() - began})
+                    break
+                raise
+            if to_go is None:
                 to_go = found.to_go(grid)
+            if level == 0:
                 upper = improve(None)  # after the first bound, which may prove that there is none
             upper = min(upper, improve(found.rough_path))
             lower = max(lower, min(found.lower, upper))
