@@ -31,6 +31,9 @@ _NO_DAEMON = {"distributed.worker.daemon": False}
 """A worker's processes are its own: those of Dask are not allowed any otherwise."""
 _UNSERVED = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask's pages are not asked for."""
+_UNWATCHED = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s",
+              "distributed.admin.system-monitor.interval": "2s"}
+"""Nor how Dask's own processes spend their time, which takes some of the stages'."""
 _WAIT_SECONDS = 0.5
 _MEMORY_MB = 4000.0
 """What a job asks of a queue where neither the job file nor Dask's settings say."""
@@ -135,7 +138,7 @@ class Cluster:
                                 "Start `dask scheduler` and `dask worker --no-nanny`, with the "
                                 "same certificates in Dask's settings here and there.") from error
         # As long as the cluster is there: it may start a lost worker anew.
-        stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED))
+        stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _UNWATCHED))
         cluster = stack.enter_context(
             self._local(jobs) if kind == "local" else self._queue(kind, jobs))
         return Client(cluster, security=cluster.security, set_as_default=False)
