@@ -33,33 +33,31 @@ def _before_saving(path: str, *_) -> None:
         settings.reconstruct.cloud = _moved(settings.reconstruct.cloud, Path(path).parent)
 
 
-def _moved(value: str, folder: Path) -> str:
-    """Return a path as a file in ``folder`` has it: from where the file was before, if relative."""
-    return animation.relative_path(bpy.path.abspath(value), folder) if value else value
+def _moved(value: str, folder: Path | None, start: Path | None = None) -> str:
+    """Return a path as a file in ``folder`` has it, or absolute where that has no place yet.
+
+    Relative ones count from ``start``, by default from where the open file was before.
+    """
+    if not value:
+        return value
+    path = bpy.path.abspath(value, start=None if start is None else str(start))
+    return path if folder is None else animation.relative_path(path, folder)
 
 
 @persistent
 def _after_import(context: "bpy.types.BlendImportContext", *_) -> None:
+    here = Path(bpy.data.filepath).parent if bpy.data.filepath else None
     for item in context.import_items:
         thing, library = item.id, item.source_library
         if thing is None or thing.library is not None or library is None:
             continue
         there = Path(bpy.path.abspath(library.filepath)).parent
         if isinstance(thing, bpy.types.Collection) and FOLDER_KEY in thing:
-            thing[FOLDER_KEY] = _brought(thing[FOLDER_KEY], there)
+            thing[FOLDER_KEY] = _moved(thing[FOLDER_KEY], here, there)
         elif isinstance(thing, bpy.types.Scene):
             settings = thing.limber
-            settings.branch_folder = _brought(settings.branch_folder, there)
-            settings.reconstruct.cloud = _brought(settings.reconstruct.cloud, there)
-
-
-def _brought(value: str, there: Path) -> str:
-    """Return a path of a file in ``there`` as the open file has it."""
-    if not value:
-        return value
-    path = bpy.path.abspath(value, start=str(there))
-    here = bpy.data.filepath
-    return animation.relative_path(path, Path(here).parent) if here else path
+            settings.branch_folder = _moved(settings.branch_folder, here, there)
+            settings.reconstruct.cloud = _moved(settings.reconstruct.cloud, here, there)
 
 
 def register() -> None:

@@ -76,10 +76,11 @@ def matching(pattern: str) -> list[str]:
     Raises:
         InputError: it is refused. WorkError: its place cannot be read.
     """
-    system, path = _system(checked_address(pattern))
+    address = checked_address(pattern)
+    system, path = _system(address)
+    before = _before(system, address, path)
     with _explained(pattern, "listed"):
         system.invalidate_cache()
-        before = _before(system, checked_address(pattern), path)
         return sorted(f"{before}{found}".rstrip("/") for found in system.glob(path))
 
 
@@ -100,6 +101,7 @@ def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
         about = system.info(path)
         is_folder = about["type"] == "directory"
         found = system.find(path, detail=True) if is_folder else {path: about}
+    before = _before(system, address, path)
     target.parent.mkdir(parents=True, exist_ok=True)
     # Several branches may need it.
     with FileLock(target.with_name(f".{target.name}.lock")):
@@ -114,7 +116,7 @@ def fetch(address: str, target: Path, stop: Callable[[], None]) -> None:
             for place, one in found.items():
                 inner = made / _inside(path, place) if is_folder else made
                 inner.parent.mkdir(parents=True, exist_ok=True)
-                with _explained(f"{_before(system, address, path)}{place}", "read"):
+                with _explained(f"{before}{place}", "read"):
                     _copy(system, place, inner, one.get("size"), stop)
             if is_folder:
                 remove(target)
