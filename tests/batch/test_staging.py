@@ -48,7 +48,8 @@ def test_what_is_an_address():
     assert not is_address("C:/scans") and not is_address("/a/b") and not is_address("a")
     assert checked_address("s3://bucket/a/") == "s3://bucket/a"
     for wrong, told in (("zip://a.ply::s3://b/c.zip", "chain"), ("s3://bucket/../a", "upwards"),
-                        ("sftp://me:secret@host/a", "password")):
+                        ("sftp://me:secret@host/a", "password"),
+                        ("zip://a.ply::sftp://me:secret@host/a.zip", "password")):
         with pytest.raises(InputError, match=told) as caught:
             checked_address(wrong)
         assert "secret" not in str(caught.value)
@@ -262,3 +263,14 @@ def test_what_a_job_file_may_say_of_addresses(memory, tmp_path):
     told = str(caught.value)
     assert "line 2: work is a folder here" in told and "No file is 'memory://none/*.ply'" in told
     assert "goes to `out`" in told
+
+
+def test_a_password_in_a_job_file_is_never_shown(tmp_path):
+    """In none of the messages about the address that has it."""
+    jobs = tmp_path / "jobs.toml"
+    jobs.write_text('out = "here"\n[[job]]\nscans = ["sftp://me:secret@host/*.ply"]\n'
+                    '[[job]]\nfolders = ["sftp://me:secret@host/*"]\n[[job.stage]]\n'
+                    'run = "scene"\noutput = "sftp://me:secret@host/a.blend"\n')
+    with pytest.raises(InputError) as caught:
+        read_jobs(jobs)
+    assert "host has a password" in str(caught.value) and "secret" not in str(caught.value)

@@ -43,14 +43,18 @@ def checked_address(address: str) -> str:
     Raises:
         InputError: it is chained, holds a password, or leads upwards.
     """
-    _, rest = _ADDRESS.match(address).groups()
+    # First of all: the other messages show the address.
+    for part in address.split("::"):
+        host = part.partition("://")[2].partition("/")[0]
+        if ":" in host.rpartition("@")[0]:
+            raise InputError(f"The address at {host.rpartition('@')[2]} has a password in it.",
+                             "Job files, tables and logs would show it.",
+                             "Put it into fsspec's configuration (~/.config/fsspec) or "
+                             "environment.")
     if "::" in address:
         raise InputError(f"{address!r} is a chain of addresses.",
                          "Each file is fetched from one place.", "Name that place alone.")
-    if ":" in rest.partition("/")[0].rpartition("@")[0]:
-        raise InputError(f"The address at {rest.partition('/')[0].rpartition('@')[2]} has a "
-                         "password in it.", "Job files, tables and logs would show it.",
-                         "Put it into fsspec's configuration (~/.config/fsspec) or environment.")
+    _, rest = _ADDRESS.match(address).groups()
     if ".." in PurePosixPath(rest).parts:
         raise InputError(f"{address!r} leads upwards.", "", "Write where it leads to.")
     return address.rstrip("/")

@@ -33,14 +33,16 @@ class JobAddresses:
             self._problem(place, str(error))
             return ""
 
-    def folders(self, pattern: str, out: Path, place: Place) -> list[Path]:
-        """Return where the branch folders go that a pattern names."""
-        return [self._here(found.removesuffix(f"/{MANIFEST}"), out, place)
-                for found in self._listed(f"{pattern.rstrip('/')}/{MANIFEST}", place)]
+    def folders(self, pattern: str, out: Path, place: Place) -> list[Path] | None:
+        """Return where the branch folders go that a pattern names; None if it is refused."""
+        found = self._listed(f"{pattern.rstrip('/')}/{MANIFEST}", place)
+        return None if found is None else [
+            self._here(each.removesuffix(f"/{MANIFEST}"), out, place) for each in found]
 
-    def files(self, pattern: str, out: Path, place: Place) -> list[Path]:
-        """Return where the files go that a pattern names."""
-        return [self.file(found, out, place) for found in self._listed(pattern, place)]
+    def files(self, pattern: str, out: Path, place: Place) -> list[Path] | None:
+        """Return where the files go that a pattern names; None if it is refused."""
+        found = self._listed(pattern, place)
+        return None if found is None else [self.file(each, out, place) for each in found]
 
     def file(self, address: str, out: Path, place: Place) -> Path:
         """Return where one file, or folder, goes: beside what stands beside it there."""
@@ -53,12 +55,12 @@ class JobAddresses:
         return tuple((self._known[path], path) for path in dict.fromkeys(paths)
                      if path in self._known)
 
-    def _listed(self, pattern: str, place: Place) -> list[str]:
+    def _listed(self, pattern: str, place: Place) -> list[str] | None:
         try:
             return matching(pattern)
         except LimberError as error:
             self._problem(place, str(error))
-            return []
+            return None
 
     def _here(self, address: str, folder: Path, place: Place) -> Path:
         try:

@@ -273,23 +273,26 @@ class _Reader:
                 matches = self.folders(pattern, (*place, key))
             else:
                 matches = self.matches(pattern, (*place, key))
+            if matches is None:
+                continue
             if not matches:
                 what = "branch folder" if key == "folders" else "file"
                 self.problem((*place, key), f"No {what} is {pattern!r}.")
             found += [(path, key == "scans") for path in matches]
         return found
 
-    def matches(self, pattern: str, place: Place) -> list[Path]:
+    def matches(self, pattern: str, place: Place) -> list[Path] | None:
         """Return the paths that a pattern names, from the job file's folder, sorted.
 
-        What is at an address gets a path here, where it goes before it is read.
+        What is at an address gets a path here, where it goes before it is read; None where the
+        address is refused, which has been said then.
         """
         if is_address(pattern):
             return self.addresses.files(pattern, self.out, place)
         return [Path(self.path.parent, name) for name in sorted(
             glob.glob(pattern, root_dir=self.path.parent, recursive=True))]
 
-    def folders(self, pattern: str, place: Place) -> list[Path]:
+    def folders(self, pattern: str, place: Place) -> list[Path] | None:
         if is_address(pattern):
             return self.addresses.folders(pattern, self.out, place)
         return [path for path in self.matches(pattern, place) if (path / MANIFEST).is_file()]
@@ -420,9 +423,10 @@ class _TaskReader:
                 found = [each | {key: self.inside(value, (*place, key))} for each in found]
             elif glob.has_magic(value):
                 matches = self.reader.matches(value, (*place, key))
-                if not matches:
+                if matches == []:
                     self.reader.problem((*place, key), f"{key}: no file is {value!r}.")
-                found = [each | {key: path, "": path.stem} for each in found for path in matches]
+                found = [each | {key: path, "": path.stem}
+                         for each in found for path in matches or []]
             else:
                 path = self.literal(value, (*place, key))
                 found = [each | {key: path} for each in found]
@@ -439,7 +443,9 @@ class _TaskReader:
         """Return where a file goes: in the branch's own folder of files, never outside ``out``."""
         path = (self.reader.out / value).resolve()
         if is_address(value):
-            self.reader.problem(place, f"{value!r} is an address; what stages write goes to `out`.")
+            if self.reader.addresses.checked(value, place):
+                self.reader.problem(
+                    place, f"{value!r} is an address; what stages write goes to `out`.")
         elif not path.is_relative_to(self.reader.out.resolve()):
             self.reader.problem(place, f"{value!r} leads out of {self.reader.out}.")
         return path
