@@ -143,6 +143,8 @@ class Session:
             kind = event["event"]
             if kind == "hello":
                 self._begin(event)
+            elif kind == "compiling":
+                self.message = "compiling, this once: up to a minute"
             elif kind == "failed":
                 self.error = str(event.get("message", ""))
             elif kind == "progress":

@@ -42,3 +42,22 @@ def test_a_moved_type_is_compiled_anew(tmp_path):
     assert run("before") == ["3.0", "0"]
     assert run("after") == ["3.0", "0"]
     assert run("after") == ["3.0", "1"]
+
+
+def test_that_it_compiles_is_told_once(tmp_path):
+    """Before the first kernel is compiled; not where it is kept."""
+    (tmp_path / "kernel.py").write_text("""
+from limber.compiled import compiled, when_compiling
+
+@compiled
+def twice(value):
+    return value + value
+
+when_compiling(lambda: print("compiling"))
+print(twice(1.0), twice(2))
+""")
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    told = [subprocess.run([sys.executable, str(tmp_path / "kernel.py")], check=True, text=True,
+                           env=environment, capture_output=True).stdout.splitlines()
+            for _ in range(2)]
+    assert told == [["compiling", "2.0 4"], ["2.0 4"]]

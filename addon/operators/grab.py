@@ -354,7 +354,8 @@ class LIMBER_OT_grab(NeedsBranchInObjectMode, bpy.types.Operator):
 
     def _lines(self) -> tuple[list[str], tuple[float, float, float, float]]:
         if self._session is None or not self._session.hello:
-            return ["loading the branch ..."], _NORMAL
+            words = "" if self._session is None else self._session.message
+            return [f"{words or 'loading the branch'} ..."], _NORMAL
         if self._frame is None or self._hold is None:
             told = [] if self._frame is None or not self._loads.acts else live_loads.lines[:2]
             return [*told, "press on the branch and drag"], _NORMAL

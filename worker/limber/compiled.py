@@ -16,6 +16,7 @@ from typing import Any
 import numba
 import numpy as np
 import platformdirs
+from numba.core.event import Event, Listener, register
 
 
 def cache_folder() -> Path | None:
@@ -60,6 +61,26 @@ def compiled(function: Callable) -> Callable:
         return _forgetful(numba.njit(cache=True, **options)(function))
     finally:
         numba.config.CACHE_DIR = before
+
+
+def when_compiling(tell: Callable[[], None]) -> None:
+    """Call ``tell`` once, when the first kernel has to be compiled and is not just read again."""
+    register("numba:compile", _FirstStart(tell))
+
+
+class _FirstStart(Listener):
+    """Calls a function at the first start that it hears of."""
+
+    def __init__(self, tell: Callable[[], None]):
+        self._tell: Callable[[], None] | None = tell
+
+    def on_start(self, event: Event) -> None:
+        tell, self._tell = self._tell, None
+        if tell is not None:
+            tell()
+
+    def on_end(self, event: Event) -> None:
+        """Who was told of the start knows enough."""
 
 
 def _forgetful(kernel: Any) -> Any:

@@ -45,6 +45,8 @@ Events, one JSON object a line on standard output; a client may leave them unrea
 - ``{"event": "hello", "protocol": 2, "limber", "positions": PATH, "vertex_count", "control_count",
   "targets", "grasps", "rest_pose", "young_pa", "gravity_on", "extent_m"}``: frames are in the file
   PATH (limber.session.frames); the first shows the branch as it hangs.
+- ``{"event": "compiling"}``: before ``hello``, where what is fast later has to be compiled first:
+  once after an installation, for up to a minute.
 - ``{"event": "reply", "id", "command", ...}`` and ``{"event": "error", "id", "command",
   "message"}``: of a command. What is no command gets an error too, and nothing else happens.
 - ``{"event": "progress", "progress", "message"}``: a reduced model of what is held is being made.
@@ -76,6 +78,7 @@ from typing import Any
 
 import numpy as np
 
+from limber.compiled import when_compiling
 from limber.errors import InputError, LimberError
 from limber.mechanics.added import PointMass
 from limber.mechanics.outdoors import Outdoors
@@ -109,6 +112,7 @@ class Session:
     def __init__(self, folder: Path, settings: SessionSettings):
         self.inbox = Inbox()
         self.events = Events(self.inbox.close)
+        when_compiling(lambda: self.events.say(event="compiling"))
         self.held = load_held(folder, settings, Progress(
             on_warning=lambda message: self.events.say(event="warning", message=message)))
         self.answering = Answering(folder, settings, self.held, self.inbox.put, self.events.say)
