@@ -1,8 +1,8 @@
-"""Runs the worker that came with the extension's wheels, in Blender's own Python.
+"""Runs the worker that Blender's own Python has, mostly by the extension's wheels.
 
     python bundled.py FOLDER ARGUMENTS...
 
-FOLDER is where Blender has unpacked the wheels. What the worker starts finds them too.
+FOLDER is where it is: where Blender has unpacked the wheels. What the worker starts finds them too.
 """
 
 import os

@@ -5,14 +5,20 @@ import os
 
 import bpy
 
-IS_MODULE = bool(getattr(bpy.app, "module", False))
-"""Whether this is the ``bpy`` package in a plain Python, not Blender's program."""
+IS_MODULE = bool(getattr(bpy.app, "module", not bpy.app.binary_path))
+"""Whether this is the ``bpy`` package in a plain Python, not Blender's program; 4.2 tells it only
+by having no program."""
 
-PATH_OPTIONS: set[str] = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (5, 0, 0) else set()
+PATH_OPTIONS: set[str] = (
+    {"PATH_SUPPORTS_BLEND_RELATIVE"}
+    if "is_path_supports_blend_relative" in bpy.types.Property.bl_rna.properties else set())
 """Options of a property that holds a path: it may begin with ``//``, and Blender keeps it right."""
 
 POINT_SHADER = "POINT_UNIFORM_COLOR" if bpy.app.version >= (4, 5, 0) else "UNIFORM_COLOR"
 """Built-in shader of points that have a size in pixels."""
+
+COLOURED_POINT_SHADER = "POINT_FLAT_COLOR" if bpy.app.version >= (4, 5, 0) else "FLAT_COLOR"
+"""The same with a colour each; where it is there the other draws points of one pixel."""
 
 
 def can_denoise() -> bool:

@@ -12,8 +12,10 @@ import importlib.util
 import json
 import math
 import os
+import shutil
 import sys
 import threading
+import traceback
 from pathlib import Path
 
 import bpy
@@ -24,6 +26,8 @@ _PLAY_SECONDS = 4.0
 def _load_addon():
     """Import the folder of this file as a package, whatever it is called there."""
     folder = Path(__file__).resolve().parent
+    if "limber_addon" in sys.modules:
+        return
     spec = importlib.util.spec_from_file_location(
         "limber_addon", folder / "__init__.py", submodule_search_locations=[str(folder)])
     module = importlib.util.module_from_spec(spec)
@@ -164,7 +168,26 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-if __name__ == "__main__":
-    code = main(sys.argv[sys.argv.index("--") + 1:])
+def _end(code: int) -> None:
+    """End the process, without the end of Blender where that is a package of this Python.
+
+    There it hangs (4.5) or crashes (4.2) on the way out, after all has been written.
+    """
+    _load_addon()
+    if importlib.import_module("limber_addon.compat").IS_MODULE:
+        shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
     if code:
         sys.exit(code)
+
+
+if __name__ == "__main__":
+    try:
+        exit_code = main(sys.argv[sys.argv.index("--") + 1:])
+    except Exception:
+        # Told here: left to Python it would lead to Blender's own end.
+        traceback.print_exc()
+        exit_code = 3
+    _end(exit_code)

@@ -1,7 +1,6 @@
 """The add-on's preferences: which Python has the worker."""
 
 import json
-import sys
 import textwrap
 import time
 
@@ -54,8 +53,6 @@ def worker_command() -> list[str]:
     """Return how to start the worker; WorkerNotFound says what to do when there is none."""
     chosen = get()
     path = chosen.python_path if chosen else ""
-    if compat.IS_MODULE:
-        return worker.worker_command(path, sys.executable)
     return worker.worker_command(path, bundled=worker.bundled_command())
 
 

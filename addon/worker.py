@@ -21,7 +21,8 @@ class WorkerNotFound(Exception):
 
 
 def bundled_command() -> list[str]:
-    """Return how to start the worker of the extension's own wheels; nothing if it has none."""
+    """Return how to start the worker that this Python has, by the extension's own wheels or because
+    bpy is a package beside it; nothing if it has none."""
     found = importlib.util.find_spec("limber")
     if found is None or found.origin is None:
         return []
@@ -29,14 +30,12 @@ def bundled_command() -> list[str]:
     return [sys.executable, str(Path(__file__).with_name("bundled.py")), str(folder)]
 
 
-def worker_command(python_path: str = "", fallback: str = "",
-                   bundled: list[str] | None = None) -> list[str]:
+def worker_command(python_path: str = "", bundled: list[str] | None = None) -> list[str]:
     """Return how to start `limber`, to be followed by its arguments.
 
     Args:
         python_path: A Python that the user chose, or nothing.
-        bundled: How to start the worker that came with the extension, or nothing.
-        fallback: A Python to try last: that of the bpy package.
+        bundled: How to start the worker that this Python itself has, or nothing.
 
     Raises:
         WorkerNotFound: none is set, found on the PATH, or the one that is set does not exist.
@@ -54,8 +53,6 @@ def worker_command(python_path: str = "", fallback: str = "",
     program = shutil.which("limber")
     if program:
         return [program]
-    if fallback:
-        return [fallback, "-m", "limber"]
     raise WorkerNotFound("No worker was found.")
 
 

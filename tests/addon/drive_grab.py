@@ -191,4 +191,4 @@ def is_whole():
 
 drive([open_result, begin, is_loaded, hover, press, drag, is_bent, limit, is_over, picture("grab"),
        let_go, keep, is_kept, undo, begin, is_loaded, key("F", 0.3), key("C", 0.45), blow,
-       is_loaded_down, picture("loads"), escape, is_whole, is_left], longest=100)
+       is_loaded_down, picture("loads"), escape, is_whole, is_left], longest=180)

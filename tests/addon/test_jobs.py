@@ -178,17 +178,17 @@ def test_forget_ends_the_worker(jobs, tmp_path):
 
 
 def test_finding_the_worker(addon, tmp_path, monkeypatch):
-    """Preferences, LIMBER_PYTHON, the PATH, the fallback, in this order; else a helpful error."""
+    """Preferences, LIMBER_PYTHON, this Python, the PATH, in this order; else a helpful error."""
     worker = importlib.import_module("limber_addon.worker")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("LIMBER_PYTHON", raising=False)
     with pytest.raises(worker.WorkerNotFound, match="preferences"):
         worker.worker_command()
-    assert worker.worker_command("", sys.executable) == [sys.executable, "-m", "limber"]
     program = tmp_path / ("limber" if os.name == "posix" else "limber.exe")
     program.write_text("")
     program.chmod(0o755)
-    assert worker.worker_command("", sys.executable) == [str(program)]
+    assert worker.worker_command() == [str(program)]
+    assert worker.worker_command(bundled=["here"]) == ["here"]
     monkeypatch.setenv("LIMBER_PYTHON", sys.executable)
     assert worker.worker_command() == [sys.executable, "-m", "limber"]
     other = tmp_path / "python"

@@ -1,6 +1,8 @@
 """The extension as a user has it: the built zip, installed and enabled in a real Blender.
 
-A Blender is found by LIMBER_BLENDER or on the PATH; scripts/provision_blender brings one.
+A Blender is found by LIMBER_BLENDER or on the PATH; scripts/provision_blender brings one. With
+LIMBER_TEST_ZIP=limber-X-linux-x64-pyXY.zip (scripts/build_extension --wheels) all run on that zip,
+its wheels the only worker.
 """
 
 import json
@@ -9,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,10 +29,22 @@ FOLDER = Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
-def environment(tmp_path_factory, worker_python) -> dict[str, str]:
-    """An environment whose Blender keeps its settings in a folder of the test, with our worker."""
-    return os.environ | {"BLENDER_USER_RESOURCES": str(tmp_path_factory.mktemp("resources")),
-                         "LIMBER_PYTHON": worker_python}
+def has_worker(extension_zip) -> bool:
+    """Whether the zip brings the worker along, as wheels."""
+    with zipfile.ZipFile(extension_zip) as content:
+        return any(name.endswith(".whl") for name in content.namelist())
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory, worker_python, has_worker) -> dict[str, str]:
+    """An environment whose Blender keeps its settings in a folder of the test, with our worker or
+    with none but the zip's own."""
+    resources = {"BLENDER_USER_RESOURCES": str(tmp_path_factory.mktemp("resources"))}
+    if not has_worker:
+        return os.environ | resources | {"LIMBER_PYTHON": worker_python}
+    return {name: value for name, value in os.environ.items()
+            if name not in ("LIMBER_PYTHON", "PYTHONPATH")} | resources | {
+                "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
 
 
 @pytest.fixture(scope="module")
@@ -71,8 +86,10 @@ def test_command_is_the_workers(run, beam):
     assert "There is no folder" in json.loads(done.stdout.splitlines()[-1])["error"]
 
 
-def test_without_a_worker(run):
+def test_without_a_worker(run, has_worker):
     """No worker: exit code 3 and what to do about it."""
+    if has_worker:
+        pytest.skip("LIMBER_TEST_ZIP brings the worker along")
     done = run("-b", "--command", "limber", "doctor", LIMBER_PYTHON="")
     assert done.returncode == 3
     assert "LIMBER_PYTHON" in done.stderr
