@@ -5,7 +5,9 @@ import gpu
 import numpy as np
 from bpy.app.handlers import persistent
 from gpu_extras.batch import batch_for_shader
+from mathutils import Matrix
 
+from .. import compat
 from ..branches import SCAN_KEY
 from ..bridge import meshes
 
@@ -23,18 +25,33 @@ def _draw() -> None:
              and thing.visible_get()]
     if not scans:
         return
-    shader = gpu.shader.from_builtin("FLAT_COLOR")
+    shader = gpu.shader.from_builtin(compat.COLOURED_POINT_SHADER)
     gpu.state.depth_test_set("LESS_EQUAL")
     gpu.state.point_size_set(_SIZE)
-    for thing in scans:
-        key = (thing.data.name, len(thing.data.vertices))
-        if key not in _batches:
-            _batches[key] = batch_for_shader(shader, "POINTS", {
-                "pos": meshes.positions(thing.data), "color": colours_of(thing.data)})
-        with gpu.matrix.push_pop():
-            gpu.matrix.multiply_matrix(thing.matrix_world)
-            _batches[key].draw(shader)
+    with gpu.matrix.push_pop_projection():
+        gpu.matrix.load_projection_matrix(_before_loose_vertices(
+            gpu.matrix.get_projection_matrix(), bpy.context.region_data.view_distance))
+        for thing in scans:
+            key = (thing.data.name, len(thing.data.vertices))
+            if key not in _batches:
+                _batches[key] = batch_for_shader(shader, "POINTS", {
+                    "pos": meshes.positions(thing.data), "color": colours_of(thing.data)})
+            with gpu.matrix.push_pop():
+                gpu.matrix.multiply_matrix(thing.matrix_world)
+                _batches[key].draw(shader)
     gpu.state.depth_test_set("NONE")
+
+
+def _before_loose_vertices(projection: Matrix, view_distance: float) -> Matrix:
+    """Return a projection that draws a little nearer than Blender 5 draws its own loose vertices.
+
+    It brings those forward, by GPU_polygon_offset_calc, so that faces do not hide them.
+    """
+    is_perspective = projection[3][3] < 0.5
+    nearer = -0.0125 * projection[2][3] if is_perspective else 5e-5 * view_distance
+    shift = Matrix.Identity(4)
+    shift[2][3] = -nearer
+    return shift @ projection
 
 
 def colours_of(mesh: bpy.types.Mesh) -> np.ndarray:

@@ -100,7 +100,7 @@ def grab_loop(branch: Path, count: int) -> None:
     command = [*part("preferences").worker_command(), "session", "--no-grasp", str(branch)]
     held = sessions.Session(command, len(surface.data.vertices))
     try:
-        _until(lambda: held.poll() is not None and (held.hello or held.error), 60)
+        _until(lambda: held.poll() is not None and (held.hello or held.error), 240)
         if held.error:
             raise RuntimeError(held.error)
         place = tuple(surface[branches.GRASP_KEY][:3])
