@@ -1,7 +1,10 @@
 """How Young's modulus runs between the control points, as unknowns of a fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.interpolate import PchipInterpolator
 
 from limber.estimation.field_form import YoungField, open_field
 from limber.estimation.parameters import ParameterSpace, Values
@@ -56,3 +59,40 @@ def test_a_prior_is_a_row_of_its_own():
     assert rows.shape == (2, 5) and space.own_row_count == 2
     free = space.pack(Values(TRUTH, 0.4, 900.0))
     assert (rows @ free - offsets)[0] == pytest.approx(2.0)
+
+
+def test_other_forms_lie_within_what_is_expected_of_them(field, small_bench):
+    """A monotone cubic through moduli that differ severalfold is no rare form of the field; with
+    bumps as of a uniform branch it lay far outside."""
+    nodes = small_bench.branch.skeleton.nodes
+    along = np.linalg.norm(small_bench.mesh.centroids[:, None] - nodes[None], axis=2).argmin(
+        axis=1) / (len(nodes) - 1)
+    young = np.exp(np.log(2e9) - np.array([0.0, 2.0, 2.1, 3.4]))
+    course = PchipInterpolator(FRACTIONS, np.log(young))(np.clip(along, 0.2, 0.8))
+    # It runs on over a quarter of the way to the next control point, and levels off.
+    course += np.interp(along, [0.15, 0.2, 0.8, 0.85], [0.5, 0.0, 0.0, -0.33])
+
+    def farthest(chosen: YoungField) -> float:
+        values = Values(young, 0.35, 900.0, form=(0.0,) * len(chosen.names))
+        form = np.zeros(len(chosen.names))
+        for _ in range(3):
+            known = replace(values, form=tuple(form.tolist()))
+            slopes = chosen.shares(known, chosen.names)[len(young):].T / 0.05
+            missing = (course - np.log(chosen.young(known))) / 0.05
+            rows = np.vstack([slopes, np.eye(len(form))])
+            form += np.linalg.lstsq(rows, np.r_[missing, -form], rcond=None)[0]
+        return float(np.abs(form).max())
+
+    assert farthest(field) < 2.0
+    assert farthest(field.same_at_any_step()) > 3.0
+
+
+def test_bumps_are_small_where_the_modulus_does_not_change(field):
+    uniform, steep = (Values(np.array(young), 0.35, 900.0) for young in (
+        [1e9] * 4, [8e9, 1e9, 1e9, 1e9]))
+    assert field.deviations(uniform) == pytest.approx(field.widths)
+    growth = field.deviations(steep) / field.widths
+    # At the base and halfway to the second control point; elsewhere nothing steps.
+    assert growth[:2] == pytest.approx(np.hypot(1, np.log(8) * np.array([1.0, 1.5])))
+    assert growth[2:] == pytest.approx(1.0)
+    assert field.same_at_any_step().deviations(steep) == pytest.approx(field.widths)

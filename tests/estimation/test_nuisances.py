@@ -17,7 +17,7 @@ from limber.estimation.objective import Objective
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.preparation import is_watched
 from limber.estimation.settings import EstimateSettings
-from limber.estimation.start import FALL, standing_start
+from limber.estimation.start import FALL, led_start, standing_start
 from limber.recordings.alignment import frames_of
 from limber.recordings.calibration import EXACT, CalibrationEntry
 from limber.recordings.recording import Observations, PullEntry, read_entry, write_entry
@@ -153,6 +153,57 @@ def test_a_start_without_equilibrium_gives_way(small_bench, small_pull, monkeypa
     assert np.abs(tried[0] - read).max() > 1.0 * np.abs(read).max()
     # Of the reading at rest, the zero alone is taken off.
     assert np.ptp(tried[1] - read, axis=0) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_start_that_explains_the_pull_is_not_sought_elsewhere(small_bench, small_pull,
+                                                                monkeypatch):
+    """Too soft to stand it is stiffened, and the long way round by other moduli left out; one that
+    explains nothing comes after them."""
+    objective = objective_of(small_bench, small_pull)
+    evaluate, tried = Objective.evaluate, []
+
+    def refusing(self, free, **options):
+        tried.append(self.space.unpack(free).young)
+        return evaluate(self, free, **options) if len(tried) > 1 else None
+
+    monkeypatch.setattr(Objective, "evaluate", refusing)
+    uniform = objective.space.base
+    softer = replace(uniform, young=TRUTH / 1.6)
+    start, found = standing_start(objective, softer, uniform)
+    assert start.young == pytest.approx(TRUTH) and found.mean_square < 1.5 and len(tried) == 2
+    start, _ = standing_start(objective, softer, uniform, explains=False)
+    assert np.diff(np.log(start.young)) == pytest.approx(-FALL)
+
+
+def test_a_first_fit_that_explains_nothing_says_so(small_bench, small_pull):
+    """Its force is not followed either: under the moduli it ran off to a branch folds up."""
+    seen = small_pull.observations
+    swapped = replace(small_pull, observations=replace(seen, positions=seen.positions[:, ::-1]))
+    for pull, is_good in ((small_pull, True), (swapped, False)):
+        pull = replace(pull, entry=pull.entry.model_copy(update={"calibration": None}))
+        objective = objective_of(small_bench, pull)
+        uniform = replace(objective.space.base, young=np.full(4, np.exp(np.log(TRUTH).mean())))
+        _, explains = led_start(objective, uniform)
+        assert explains == is_good
+
+
+def test_a_force_that_misleads_a_first_fit_is_not_followed(small_bench, small_pull, monkeypatch):
+    """Where its linearisation overshoots, the branch stays under the force that was read."""
+    objective = objective_of(small_bench, small_pull)
+    forward = objective.forwards[0]
+
+    def overshooting(self, _evaluation):
+        forward._drives = [3 * drive for drive in forward._drives]
+        forward._values = None
+        self.forget()
+        return True
+
+    monkeypatch.setattr(Objective, "follow_forces", overshooting)
+    uniform = replace(objective.space.base, young=np.full(4, np.exp(np.log(TRUTH).mean())))
+    found, explains = led_start(objective, uniform)
+    assert explains and np.abs(np.log(found.young / TRUTH)).max() < 0.5
+    assert np.ptp(np.array(forward._drives) - forward._measured, axis=0) == pytest.approx(
+        0.0, abs=0.05 * np.abs(forward._measured).max())
 
 
 def test_calibration_survives_a_pull_file(tmp_path, small_pull):

@@ -17,47 +17,70 @@ CELL = CalibrationEntry()
 CALIBRATED = CalibrationEntry(pose_sigma_m=2e-4, pose_sigma_rad=3.5e-3)
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    """Measure everything; ``seed`` is the base of all that is drawn.
+def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
+         only: tuple[str, ...] = ()) -> list[Row]:
+    """Measure the parts named in ``only``, or all; ``seed`` is the base of all that is drawn.
 
     With ``out`` each trial is kept in ``truth-trials.jsonl`` and ``truth-scans.jsonl``: a run of
     the same seed that was stopped goes on there.
     """
+    table, chosen = [], only or tuple(PARTS)
+    for number, name in enumerate(chosen):
+        part = progress.part(number / len(chosen), (number + 1) / len(chosen))
+        table += PARTS[name](quick, part, out, seed)
+    return table
+
+
+def _one_pull(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
+    return _cell_rows("one pull; sensor noise, force gain 2 %, zero and drift 1 N, gripper 1 mm "
+                      "and 1 degree, camera 1 mm, density 10 %, nu 0.05, another form of the "
+                      "field", _trials(4 if quick else 60, progress, out, (seed, 1), CELL, 1),
+                      0.12, quick)
+
+
+def _three_pulls(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
+    return _cell_rows("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees", _trials(
+        2 if quick else 20, progress, out, (seed, 2), CALIBRATED, 3), 0.06, quick)
+
+
+def _scans(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
+    kept = out / "truth-scans.jsonl" if out else None
+    return [truth_scans.scan_row(2 if quick else 30, progress, kept, seed)]
+
+
+PARTS: dict[str, Callable[[bool, Progress, Path | None, int], list[Row]]] = {
+    "one-pull": _one_pull, "three-pulls": _three_pulls, "scans": _scans,
+    "bad-recordings": lambda quick, progress, out, seed: [bad_recordings_row(progress, seed)],
+    "beam": lambda quick, progress, out, seed: truth_beam.rows(progress, seed),
+    "sag": lambda quick, progress, out, seed: [
+        truth_beam.sag_row(4 if quick else 20, progress, seed)],
+    "swing": lambda quick, progress, out, seed: [
+        truth_states.swing_row(quick, progress, np.random.default_rng([seed, 11]))],
+    "reduced": lambda quick, progress, out, seed: truth_states.doubt_rows(
+        quick, progress, np.random.default_rng([seed, 12])),
+    "second-pull": lambda quick, progress, out, seed: truth_states.quick_rows(
+        np.random.default_rng([seed, 13]))}
+"""What ``--only`` knows."""
+
+
+def _trials(count: int, progress: Progress, out: Path | None, seed: tuple[int, ...],
+            cell: CalibrationEntry, pull_count: int) -> list[Trial]:
     kept = out / "truth-trials.jsonl" if out else None
-    scans = out / "truth-scans.jsonl" if out else None
     source = source_digest(("estimation", "mechanics"), __file__, truth_trials.__file__,
                            truth_branch.__file__)
-    singles = _trials(4 if quick else 60, progress.part(0.0, 0.4), kept, source, (seed, 1),
-                      lambda each: trial(each, CELL, 1, source=source))
-    threes = _trials(2 if quick else 20, progress.part(0.4, 0.6), kept, source, (seed, 2),
-                     lambda each: trial(each, CALIBRATED, 3, source=source))
-    return [*cell_rows("one pull; sensor noise, force gain 2 %, zero and drift 1 N, gripper 1 mm "
-                       "and 1 degree, camera 1 mm, density 10 %, nu 0.05, another form of the "
-                       "field", singles, 0.12, quick),
-            *cell_rows("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees", threes, 0.06,
-                       quick),
-            truth_scans.scan_row(2 if quick else 30, progress.part(0.6, 0.9), scans, seed),
-            bad_recordings_row(progress.part(0.9, 0.92), seed),
-            *truth_beam.rows(progress.part(0.92, 0.94), seed),
-            truth_beam.sag_row(4 if quick else 20, progress.part(0.94, 0.95), seed),
-            *truth_states.rows(quick, progress.part(0.95, 1.0), seed)]
-
-
-def _trials(count: int, progress: Progress, kept: Path | None, source: str,
-            seed: tuple[int, ...], run: Callable[[tuple[int, ...]], Trial]) -> list[Trial]:
     known = {each.seed: each for each in read_trials(Trial, kept) if each.source == source}
     found = []
     for number in range(count):
         progress(number / count, f"trial {number + 1} of {count}")
         each = known.get((*seed, number))
         if each is None:
-            each = run((*seed, number))
+            each = trial((*seed, number), cell, pull_count, source=source)
             keep(each, kept)
         found.append(each)
     return found
 
 
-def cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> list[Row]:
+def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> list[Row]:
     """Error, coverage and width of a kind of trial."""
     fitted = [each for each in trials if not each.message]
     if not fitted:

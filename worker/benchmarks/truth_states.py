@@ -29,13 +29,6 @@ _STEPS = 1000
 _YOUNG = 1e7
 
 
-def rows(quick: bool, progress: Progress, seed: int) -> list[Row]:
-    """Measure everything; ``seed`` is the base of all that is drawn."""
-    return [swing_row(quick, progress.part(0.0, 0.2), np.random.default_rng([seed, 11])),
-            *doubt_rows(quick, progress.part(0.2, 0.8), np.random.default_rng([seed, 12])),
-            *quick_rows(np.random.default_rng([seed, 13]))]
-
-
 def swing_row(quick: bool, progress: Progress, rng: np.random.Generator) -> Row:
     """An undamped beam let go from aside, in the default step of 1/60 s."""
     mesh, tip = short_beam()

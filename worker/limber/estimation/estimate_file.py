@@ -94,6 +94,7 @@ class _Estimate(_Told):
     is_weightless: bool = False
     recording_spread: float = 0.0
     field_form: list[float] | None = None
+    field_form_deviations: list[_Positive] | None = None
     causes: list[_Cause] | None = None
     held_out: dict[str, _Score] | None = None
     warnings: list[str] = []

@@ -4,11 +4,12 @@ The paper takes inverse-distance weights of the moduli. A modulus that runs stra
 control points, falls monotonically, or differs in side branches explains a pull as well, with
 other moduli at the control points: by tens of percent where neighbours differ severalfold. So the
 field is a mixture of the paper's and of one straight in its logarithm, with bumps between the
-control points and beyond the outer ones; mixture and bumps are unknowns beside the moduli, small
-ones, that the pull tells or that widen the intervals.
+control points and beyond the outer ones; mixture and bumps are unknowns beside the moduli, that
+the pull tells or that widen the intervals. Bumps are the larger the more the moduli beside them
+differ.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -21,7 +22,14 @@ MIXTURE = (0.5, 0.5)
 """Mean and deviation of the part of the straight field in the mixture."""
 BUMP_BETWEEN, BUMP_BEYOND, BUMP_OF_ORDER = 0.1, 0.3, 0.3
 """Deviations of log E from the mixture: halfway between control points, at base and tip beyond
-the outer ones, and of side branches from the place they grow from."""
+the outer ones, and of side branches from the place they grow from. Of a branch along which log E
+does not change."""
+STEP_BETWEEN, STEP_BEYOND = 0.15, 0.3
+"""The same as a part of the step of log E beside, which comes to those. A cubic between two control
+points lies off the straight line halfway by an eighth of the difference of its slopes at both;
+slopes of 0 to 3 times the straight one's keep it monotone (Fritsch and Carlson 1980), and any of
+them alike have that deviation: 3/8 sqrt(2/12) = 0.153. Beyond the outer control points it may stop
+at once or run on for as long as a step: the uniform deviation, sqrt(1/12) = 0.29."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +40,17 @@ class YoungField:
         weights: The paper's inverse-distance weights, shape [tet_count, K].
         straight: Weights of the logarithms in the straight field, shape [tet_count, K]; None: the
             field is the paper's, there is nothing else to know.
-        bumps: Change of log E by each further unknown of unit deviation, shape [tet_count, B].
+        bumps: Where each further unknown changes log E, 1 at most, shape [tet_count, B].
+        widths: Deviations of these changes where all moduli are the same, shape [B].
+        steps: What a change of log E at the control points adds to them, shape [B, K].
         names: Of the mixture and the bumps, B + 1; empty without ``straight``.
     """
 
     weights: np.ndarray
     straight: np.ndarray | None = None
     bumps: np.ndarray | None = None
+    widths: np.ndarray | None = None
+    steps: np.ndarray | None = None
     names: tuple[str, ...] = ()
 
     def young(self, values: Values) -> np.ndarray:
@@ -48,8 +60,9 @@ class YoungField:
             return plain
         form = self._form(values)
         part = self._part(form)
+        sizes, _ = self._sizes(values)
         return np.exp((1 - part) * np.log(plain) + part * (self.straight @ np.log(values.young))
-                      + self.bumps @ form[1:])
+                      + self.bumps @ (sizes * form[1:]))
 
     def shares(self, values: Values, extra: tuple[str, ...]) -> np.ndarray:
         """Derivative of log E of the tetrahedra to log E at the control points and, where they
@@ -59,12 +72,30 @@ class YoungField:
         shares = (self.weights * values.young).T / plain
         if self.straight is None:
             return shares
-        part = self._part(self._form(values))
-        shares = (1 - part) * shares + part * self.straight.T
+        form = self._form(values)
+        part = self._part(form)
+        sizes, by_young = self._sizes(values)
+        shares = ((1 - part) * shares + part * self.straight.T
+                  + (self.bumps @ (form[1:, None] * by_young)).T)
         if self.names[0] not in extra:
             return shares
         apart = self.straight @ np.log(values.young) - np.log(plain)
-        return np.vstack([shares, MIXTURE[1] * apart, self.bumps.T])
+        return np.vstack([shares, MIXTURE[1] * apart, (self.bumps * sizes).T])
+
+    def deviations(self, values: Values) -> np.ndarray:
+        """Of log E by each bump, with these moduli, shape [B]."""
+        return np.zeros(0) if self.straight is None else self._sizes(values)[0]
+
+    def same_at_any_step(self) -> "YoungField":
+        """Return the field whose bumps are those of a uniform branch, as estimates once took it."""
+        return self if self.straight is None else replace(self, steps=np.zeros_like(self.steps))
+
+    def _sizes(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
+        """Deviations of the bumps [B], and their derivative to log E at the control points [B, K].
+        """
+        step = self.steps @ np.log(values.young)
+        sizes = np.hypot(self.widths, step)
+        return sizes, (step / sizes)[:, None] * self.steps
 
     def _form(self, values: Values) -> np.ndarray:
         return np.array(values.form) if len(values.form) else np.zeros(len(self.names))
@@ -89,17 +120,24 @@ def open_field(mesh: TetMesh, skeleton: Skeleton, weights: np.ndarray,
     stations = np.sort(np.r_[places, halfway, *([0.0] if places[0] > 0 else []),
                              *([1.0] if places[-1] < 1 else [])])
     hats = _hats(along, stations)
-    names, bumps = ["form"], []
+    names, bumps, widths, steps = ["form"], [], [], []
     for number, station in enumerate(stations):
         if np.any(np.isclose(station, places)):
             continue
         inside = places[0] < station < places[-1]
         names.append(f"form at {station:.2g}")
-        bumps.append(hats[:, number] * (BUMP_BETWEEN if inside else BUMP_BEYOND))
+        bumps.append(hats[:, number])
+        widths.append(BUMP_BETWEEN if inside else BUMP_BEYOND)
+        beside = int(np.clip(np.searchsorted(places, station), 1, len(places) - 1))
+        steps.append((STEP_BETWEEN if inside else STEP_BEYOND) * (
+            np.eye(len(places))[beside] - np.eye(len(places))[beside - 1]))
     if is_side.any():
         names.append("form of side branches")
-        bumps.append(is_side * BUMP_OF_ORDER)
-    return YoungField(weights, straight, np.column_stack(bumps), tuple(names))
+        bumps.append(is_side.astype(float))
+        widths.append(BUMP_OF_ORDER)
+        steps.append(np.zeros(len(places)))
+    return YoungField(weights, straight, np.column_stack(bumps), np.array(widths),
+                      np.array(steps), tuple(names))
 
 
 def _places(mesh: TetMesh, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:

@@ -248,10 +248,10 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
             suspicion = force_unit_suspicion(float(np.mean(start.young)))
             if suspicion:
                 progress.warn(suspicion)
-    uniform = start
+    uniform, explains = start, True
     if settings.method == "gauss-newton" and reduction is None:
-        start = led_start(judged_on, uniform)
-    standing = standing_start(judged_on, start, uniform)
+        start, explains = led_start(judged_on, uniform)
+    standing = standing_start(judged_on, start, uniform, explains=explains)
     if standing is None:
         raise _without_equilibrium(judged_on)
     start, first = standing

@@ -56,6 +56,12 @@ class Evaluation:
         return 0.5 * float(self.residual @ self.residual)
 
     @property
+    def mean_square(self) -> float:
+        """Mean squared residual: about 1 where the model fits and the noise is as stated."""
+        freedom = len(self.residual) - len(self.free) - self.unknown_count
+        return 2 * self.objective / max(freedom, 1)
+
+    @property
     def deviations(self) -> np.ndarray:
         """Standard deviation that each free value has by these derivatives, shape [p]."""
         _, values, rows = np.linalg.svd(self.jacobian, full_matrices=False)

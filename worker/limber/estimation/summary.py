@@ -52,6 +52,8 @@ def details(found: Estimate, subject: Subject, pulls: list[Pull]) -> dict[str, A
     told: dict[str, Any] = {
         "control_points_m": subject.control_points,
         "fractions": _fractions(subject), "parameters": objective.space.names,
+        "field_form_deviations": ([] if subject.field is None
+                                  else subject.field.deviations(found.values)),
         "groups": objective.space.groups, "links": objective.space.links,
         "covariance": found.uncertainty.covariance,
         "correlation": found.uncertainty.correlation,

@@ -241,6 +241,21 @@ def load_subject(branch: Branch, settings: EstimateSettings) -> Subject:
                       branch.gravity, settings)
 
 
+def load_estimated_subject(branch: Branch, known: dict[str, Any], *, gravity: bool) -> Subject:
+    """Return the branch as an estimate took it, so that the numbers it found mean the same.
+
+    Args:
+        known: Content of ``estimate.json``.
+        gravity: Whether the branch's weight acts, if the estimate did not have to leave it out.
+    """
+    subject = load_subject(branch, EstimateSettings(
+        fractions=tuple(known["fractions"]), gravity=gravity and not known.get("is_weightless"),
+        field="open" if known.get("field_form") else "inverse_distance"))
+    if subject.field is not None and known.get("field_form_deviations") is None:
+        return replace(subject, field=subject.field.same_at_any_step())
+    return subject
+
+
 def known_pulls(branch: Branch) -> list[str]:
     """Return the names of the branch's pulls, sorted."""
     return [name for name in branch.names("pulls") if branch.has(f"pulls/{name}/pull.toml")]

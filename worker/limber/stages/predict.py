@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from limber.errors import InputError
-from limber.estimation.settings import EstimateSettings, PredictSettings
+from limber.estimation.settings import PredictSettings
 from limber.plain import plain
 from limber.progress import SILENT, Progress
 from limber.stages.inputs import BranchInputs, NoOptions
@@ -32,17 +32,13 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
     """
     from limber.estimation.estimate_file import read_estimate
     from limber.estimation.predict import predict_rest, require_one_load
-    from limber.stages.loading import load_subject
+    from limber.stages.loading import load_estimated_subject
 
     require_one_load(settings)
     branch = Branch.open(branch_folder)
     known = read_estimate(branch.require("estimate.json", "estimate"))
     entry = _entry(branch, settings.pull)
-    subject = load_subject(branch, EstimateSettings(
-        fractions=tuple(known["fractions"]),
-        # A branch that could not carry its weight was estimated without it.
-        gravity=settings.gravity and not known.get("is_weightless"),
-        field="open" if known.get("field_form") else "inverse_distance"))
+    subject = load_estimated_subject(branch, known, gravity=settings.gravity)
     down = np.array(branch.gravity) / np.linalg.norm(branch.gravity)
     return plain(predict_rest(known, subject, entry, down, settings, progress))
 

@@ -113,16 +113,13 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
 
     from limber.estimation.estimate_file import read_estimate
     from limber.estimation.next_pull import Known
-    from limber.stages.loading import load_subject
+    from limber.stages.loading import load_estimated_subject, load_subject
 
     if not branch.has("estimate.json"):
         subject = load_subject(branch, EstimateSettings(gravity=settings.gravity))
         return subject, subject.start, Known.nothing(len(subject.control_points))
     found = read_estimate(branch.path("estimate.json"))
-    subject = load_subject(branch, EstimateSettings(
-        fractions=tuple(found["fractions"]),
-        gravity=settings.gravity and not found.get("is_weightless"),
-        field="open" if found.get("field_form") else "inverse_distance"))
+    subject = load_estimated_subject(branch, found, gravity=settings.gravity)
     values = replace(
         subject.start, young=np.array(found.get("young_mesh_pa") or found["young_pa"], float),
         poisson=found["poisson"], density=found.get("density") or subject.start.density,
