@@ -49,6 +49,19 @@ def test_flying_pixels_are_found_and_the_branch_stays() -> None:
     assert found[~truth].mean() < 0.01
 
 
+def test_a_thinned_image_says_how_many_of_its_pixels_are_left() -> None:
+    """Of half of the pixels no more of the branch flies: 13 % did."""
+    _, camera, depth, flies = seen(61, 0.05)
+    points, truth = in_camera_axes(camera, depth), flies[depth > 0]
+    assert find_sight(points).fill > 0.97
+    half = np.random.default_rng(2).uniform(size=len(points)) < 0.5
+    sight = find_sight(points[half])
+    assert sight.fill == pytest.approx(0.5, abs=0.03)
+    found = flying_pixels(sight, 78.0, 20)
+    assert found[truth[half]].mean() > 0.9
+    assert found[~truth[half]].mean() < 0.01
+
+
 def test_the_image_is_found_in_turned_axes_and_beside_nothing_else() -> None:
     """An image stays one when its frame is turned; a scan from all around is none."""
     branch, camera, depth, _ = seen(62, 0.0)

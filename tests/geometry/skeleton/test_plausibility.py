@@ -1,18 +1,31 @@
 """What is refused as no plant, and what is not."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from limber.errors import InputError
 from limber.geometry.cloud.files import read_points
+from limber.geometry.skeleton.plausibility import shows_round
+from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+def test_rods_that_leaves_became_show_nothing_round() -> None:
+    """Points that fill rods are told from points on them, however many are explained by either."""
+    axis = np.stack([np.zeros(40), np.zeros(40), np.linspace(0, 0.5, 40)], axis=1)
+    skeleton = Skeleton.from_edges(axis, np.arange(40) - 1, np.full(40, 0.01))
+    result = SimpleNamespace(skeleton=skeleton, node_of_point=np.arange(40), noise=0.002)
+    assert shows_round(result)
+    result.noise = 0.004
+    assert not shows_round(result)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_a_leafy_plant_is_told_not_refused(seed: int) -> None:
     """Few points of a seedling whose leaves outweigh its stem make a skeleton and a warning."""
     path = DATA / "tomato_maize" / "tomato_03-05.xyz"

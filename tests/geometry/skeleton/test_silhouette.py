@@ -64,6 +64,10 @@ def test_no_branch_is_thicker_than_its_silhouette():
     told, _ = within_silhouette(hidden, points, view)
     assert abs(np.median(told.radius / truth.radius) - 1) < 0.15
     assert np.mean(np.abs(told.radius - truth.radius) < 1.96 * told.radius_sigma) > 0.8
+    # Of half of the pixels too: there are as many places for them.
+    few = points[np.random.default_rng(3).uniform(size=len(points)) < 0.5]
+    thin, _ = within_silhouette(hidden, few, View(camera.origin, 1 / camera.fx, 0.5))
+    assert abs(np.median(thin.radius / told.radius) - 1) < 0.03
     assert (told.radius_state == UNRESOLVED).all()
 
 

@@ -170,16 +170,32 @@ def test_the_order_of_the_points_changes_nothing() -> None:
     np.testing.assert_array_equal(again.node_of_point, first.node_of_point[order])
 
 
+def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
+    """Of thin branches in as much noise, where each choice leads to others, down to rounding."""
+    rng = np.random.default_rng(5)
+    points = generate_branch(12, length=0.4, fork_count=2, point_spacing=0.003).cloud.points
+    points = points + rng.normal(0, 0.004, points.shape)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    up, away = np.array([0.0, 0.0, 1.0]), np.array([30.0, -20.0, 7.0])
+    first = skeletonise(points).skeleton
+    again = skeletonise(points @ turn.T + away, up=turn @ up).skeleton
+    assert again.node_count == first.node_count
+    np.testing.assert_allclose((again.nodes - away) @ turn, first.nodes, atol=1e-9)
+    np.testing.assert_allclose(again.radius, first.radius, atol=1e-9)
+
+
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
     from limber.geometry.skeleton.radii.axis_fit import AxisFit
+    from limber.geometry.skeleton.radii.noisy_rings import SCATTERED_ALONG_SIGHT
     from limber.geometry.skeleton.skeletonise import _with_full_tips
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)
     z = np.concatenate([[-0.03, -0.001], np.linspace(0.01, 0.29, 29)])
     axis = Skeleton.from_edges(np.stack([0 * z, 0 * z, z], axis=1), np.arange(31) - 1,
                                np.full(31, 0.01))
-    fit = AxisFit(axis, np.zeros(0), np.zeros(0), 0.001)
+    fit = AxisFit(axis, np.zeros(0), np.zeros(0), 0.001, SCATTERED_ALONG_SIGHT)
     assert abs(_with_full_tips(axis, points, fit).nodes[0, 2]) < 0.008
 
 

@@ -13,11 +13,12 @@ from limber.geometry.skeleton.skeleton import Skeleton
 _LEAST = 0.05  # of the points, that leaves must be to be cut off
 
 
-def without_leaves(prepared: Prepared) -> tuple[Prepared, list[Leaf]]:
-    """Cut the leaves off a prepared scan; all of it and no leaf where there are hardly any."""
+def without_leaves(prepared: Prepared, least: float = _LEAST) -> tuple[Prepared, list[Leaf]]:
+    """Cut the leaves off a prepared scan; all of it and no leaf where they are less than ``least``.
+    """
     leaves = find_leaves(prepared.cloud.points)
     wood = ~leaf_mask(leaves, len(prepared.cloud))
-    if (~wood).mean() < _LEAST or wood.sum() < POINT_MINIMUM:
+    if (~wood).mean() < least or wood.sum() < POINT_MINIMUM:
         return prepared, []
     return replace(prepared, cloud=prepared.cloud.subset(wood)), leaves
 

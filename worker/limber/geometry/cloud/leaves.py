@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from limber.geometry.cloud.own_frame import own_axes, own_order
+from limber.geometry.cloud.own_frame import OwnFrame
 from limber.geometry.cloud.preparation import voxel_thinned
 
 _CELL = 0.25  # of a scale: as finely is the cloud looked at there
@@ -53,9 +53,8 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
     Args:
         points: [m], shape [n, 3].
     """
-    order = own_order(points)
-    points = points[order]
-    return [Leaf(order[leaf.points], leaf.area) for leaf in _found(points @ own_axes(points))]
+    own = OwnFrame.of(points)
+    return [Leaf(own.order[leaf.points], leaf.area) for leaf in _found(own.places)]
 
 
 def _found(points: np.ndarray) -> list[Leaf]:

@@ -4,7 +4,51 @@ What is chosen point by point, or in cells of a grid, must not depend on how a f
 turned: the same plant is to give the same result.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+
+_STEP = 1e-6  # of the cloud's size: far finer than any scanner tells, far coarser than rounding
+
+
+@dataclass(frozen=True)
+class OwnFrame:
+    """A cloud's points in its own order and axes, from its middle, the same wherever it lies.
+
+    Moved, turned or in another unit, a file's numbers are rounded otherwise. What is chosen by
+    comparing two of them may then be chosen otherwise, and each choice leads to others: places
+    here are those of a grid so coarse that rounding does not show.
+
+    Attributes:
+        places: Points in this frame [m], shape [n, 3].
+        order: Index of each in the cloud, shape [n].
+        middle: The frame's origin [m], shape [3].
+        axes: The frame's axes as columns, shape [3, 3].
+    """
+
+    places: np.ndarray
+    order: np.ndarray
+    middle: np.ndarray
+    axes: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> "OwnFrame":
+        """The frame of points [m], shape [n, 3]."""
+        order = own_order(points)
+        middle = points[order].mean(axis=0)
+        offset = points[order] - middle
+        axes = own_axes(offset)
+        places = offset @ axes
+        step = 2.0**np.floor(np.log2(max(_STEP * np.linalg.norm(np.ptp(places, axis=0)), 1e-300)))
+        return cls(np.round(places / step) * step, order, middle, axes)
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Return places in this frame of points, shape [..., 3]."""
+        return (points - self.middle) @ self.axes
+
+    def outside(self, places: np.ndarray) -> np.ndarray:
+        """Return points of places in this frame, shape [..., 3]."""
+        return places @ self.axes.T + self.middle
 
 
 def own_order(points: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """From a file's points to a cloud that can be worked on: unit, origin, crop, outliers, thinning."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -88,7 +88,7 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         cloud = cloud.subset(chosen)
     _enough(cloud, "After cropping and cleaning the cloud")
     if view is not None:
-        view = View(view.eye - origin, view.pitch)
+        view = replace(view, eye=view.eye - origin)
     return Prepared(cloud, origin, counts, _plausible(cloud.points, counts), view)
 
 
@@ -162,7 +162,7 @@ def _without_flying(cloud: Cloud, scale: float, settings: PreparationSettings,
         sight = find_sight(cloud.points * scale, place)
     if sight is None:
         return cloud, None
-    view = View(place, sight.pitch)
+    view = View(place, sight.pitch, sight.fill)
     if settings.flying_angle == 0:
         return cloud, view
     flying = flying_pixels(sight, settings.flying_angle, settings.flying_speck)

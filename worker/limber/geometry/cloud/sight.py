@@ -6,6 +6,7 @@ beside it by more than a surface can fall within a pixel.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -16,6 +17,8 @@ _BESIDE = 1.6  # pixels up to which pixels are neighbours: the eight around
 _REGULAR = 0.6  # 5 % quantile over median of the distances to the nearest pixel; 0.27 for chance
 _AXIS = np.cos(np.radians(35.0))  # a camera frame's own axis is taken if it points so near
 _WIDEST = np.radians(75.0)  # off the middle of the view: no image is wider
+_TWO, _THERE = (1.8, 2.2), 0.4  # pixels between next but one; around a pixel's place
+_LEAST_FILL = 0.1
 _NOISE = 3.0  # standard deviations that neighbours may differ by
 _LEAST = 200  # readings under which nothing is told of an image
 
@@ -27,10 +30,12 @@ class View:
     Attributes:
         eye: The camera's place [m], shape [3].
         pitch: Width of a pixel at distance 1.
+        fill: Share of the pixels on what was seen that are in the cloud.
     """
 
     eye: np.ndarray
     pitch: float
+    fill: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,21 @@ class Sight:
     pixels: np.ndarray
     depth: np.ndarray
     pitch: float
+
+    @cached_property
+    def fill(self) -> float:
+        """Share of the pixels on what was seen that are in the cloud: thinned images lack some.
+
+        Of the places in the middle between two pixels that are two apart, as many as have one.
+        """
+        tree = cKDTree(self.pixels)
+        pairs = tree.query_pairs(_TWO[1], output_type="ndarray")
+        pairs = pairs[np.linalg.norm(np.subtract(*self.pixels[pairs.T]), axis=1) > _TWO[0]]
+        if len(pairs) < _LEAST:
+            return 1.0
+        between = self.pixels[pairs].mean(axis=1)
+        there = tree.query(between, distance_upper_bound=_THERE)[0] < np.inf
+        return max(float(there.mean()), _LEAST_FILL)
 
 
 def find_sight(points: np.ndarray, eye: np.ndarray | None = None,
@@ -92,13 +112,14 @@ def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
     Args:
         sight: The image.
         grazing: Steepest surface that counts, between its normal and the line of sight [deg].
-        speck: Groups of fewer pixels than that fly.
+        speck: Groups of fewer pixels than that fly, or what is left of so many in a thinned image.
 
     Returns:
         True where a pixel flies, shape [n].
     """
     depth, count = sight.depth, len(sight.depth)
-    pairs = cKDTree(sight.pixels).query_pairs(_BESIDE, output_type="ndarray")
+    # Where pixels are missing those beside are farther.
+    pairs = cKDTree(sight.pixels).query_pairs(_BESIDE / np.sqrt(sight.fill), output_type="ndarray")
     one, other = pairs[:, 0], pairs[:, 1]
     mean = (depth[one] + depth[other]) / 2
     step = np.linalg.norm(sight.pixels[one] - sight.pixels[other], axis=1) * sight.pitch * mean
@@ -107,7 +128,7 @@ def flying_pixels(sight: Sight, grazing: float, speck: int) -> np.ndarray:
     held = np.abs(depth[one] - depth[other]) <= allowed
     graph = sparse.coo_matrix((np.ones(held.sum()), (one[held], other[held])), (count, count))
     group = connected_components(graph, directed=False)[1]
-    return np.bincount(group)[group] < speck
+    return np.bincount(group)[group] < speck * sight.fill
 
 
 def _noise(depth: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
@@ -119,7 +140,8 @@ def _noise(depth: np.ndarray, one: np.ndarray, other: np.ndarray) -> float:
     if inside.sum() < _LEAST // 4:
         return 0.0
     off = (depth - total / np.maximum(around, 1))[inside] / depth[inside]**2
-    return float(1.4826 * np.median(np.abs(off - np.median(off))) * np.sqrt(8 / 9))
+    off *= np.sqrt(around[inside] / (around[inside] + 1))
+    return float(1.4826 * np.median(np.abs(off - np.median(off))))
 
 
 def _forward(ray: np.ndarray) -> np.ndarray | None:

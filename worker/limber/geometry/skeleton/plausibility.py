@@ -6,17 +6,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
+from limber.geometry.cloud.own_frame import OwnFrame
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
 from limber.geometry.skeleton.contraction.laplacian_contraction import ContractionStatus
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
+_ROUND = 0.3  # of the radius, up to which points may scatter and show what is round
 _NAMED = 3  # gaps and loops that are named one by one
 _FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--skeleton)."
 
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
-                    axes: np.ndarray) -> None:
+                    own: OwnFrame) -> None:
     """Refuse a ball, and two plants unless ``plants`` says which to take.
 
     Args:
@@ -24,7 +26,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
         count: Number of points that it was made of.
         diagonal: Size of the cloud [m].
         plants: ``refuse``, ``largest`` or ``joined``.
-        axes: Columns in which the graph's places are told, shape [3, 3].
+        own: The frame that the graph's places are in.
 
     Raises:
         InputError: one of these.
@@ -44,8 +46,8 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
     for plant in graph.plants:
         raise InputError(
             f"There are two plants, {plant['distance']:.3g} m apart at "
-            f"{_place(axes @ plant['at'])}: {100 * plant['points'] / count:.0f} % of the points "
-            "stand on a base of their own.",
+            f"{_place(own.outside(plant['at']))}: {100 * plant['points'] / count:.0f} % of the "
+            "points stand on a base of their own.",
             "A branch is one plant, and which of them is meant the scan does not say.",
             f"{_FIX} Or take the larger one (--plants largest), or join them (--plants joined).")
     for piece in graph.split_off:
@@ -131,7 +133,19 @@ def warnings(result: Any) -> list[str]:
     if misfit > 0.15:
         texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "
                      "pixels or a second plant? Radii there mean little.")
+    elif not shows_round(result):
+        texts.append(f"Points scatter by {1000 * result.noise:.2g} mm, over {_ROUND:.0%} of their "
+                     "axes' radius: leaves among them, which lie on no round axis, would not show.")
     return texts
+
+
+def shows_round(result: Any) -> bool:
+    """Whether points lie near enough to their axes' surface for their sections to show round.
+
+    A leaf's points do not: it becomes a rod that they fill.
+    """
+    radius = result.skeleton.radius[result.node_of_point]
+    return bool(result.noise <= _ROUND * float(np.median(radius)))
 
 
 def unexplained_share(result: Any) -> float:

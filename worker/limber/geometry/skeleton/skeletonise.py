@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from limber.geometry.cloud.own_frame import own_axes, own_order
+from limber.geometry.cloud.own_frame import OwnFrame, own_axes
 from limber.geometry.settings import SkeletonSettings
 from limber.geometry.skeleton.confidence import assessed, doubted, likely, shares
 from limber.geometry.skeleton.contraction.curve_graph import (
@@ -143,23 +143,22 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     Raises:
         InputError: the cloud is not branch-like.
     """
-    # In the cloud's own order and axes: boxes around it, and the triangles of its Laplacian, would
-    # be others for a turned one.
-    order = own_order(points)
-    axes = own_axes(points[order])
+    # In the cloud's own frame: boxes around it, and the triangles of its Laplacian, would be others
+    # for a turned one.
+    own = OwnFrame.of(points)
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
-    found = _of_ordered(points[order] @ axes, settings or SkeletonSettings(),
-                        None if root is None else root @ axes, up @ axes, camera, axes, progress)
-    place, drawn = np.argsort(order), found.contraction
-    return replace(found.moved(lambda turned: turned @ axes.T), contraction=replace(
-        drawn, points=drawn.points @ axes.T, drawn=drawn.drawn @ axes.T),
+    found = _of_ordered(own, settings or SkeletonSettings(),
+                        None if root is None else own.inside(root), up @ own.axes, camera, progress)
+    place, drawn = np.argsort(own.order), found.contraction
+    return replace(found.moved(own.outside), contraction=replace(
+        drawn, points=own.outside(drawn.points), drawn=own.outside(drawn.drawn)),
         node_of_point=found.node_of_point[place], residual=found.residual[place])
 
 
-def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray | None,
-                up: np.ndarray, camera: bool, axes: np.ndarray, progress: Progress,
-                ) -> SkeletonResult:
-    """The skeleton of points in the cloud's own order and ``axes``."""
+def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
+                up: np.ndarray, camera: bool, progress: Progress) -> SkeletonResult:
+    """The skeleton of points in the cloud's own frame; ``root`` and ``up`` are in that too."""
+    points = own.places
     thin = thinned(points, settings.contraction_points)
     check_no_sheet(points[thin])
     contraction = contract(points[thin], attraction=settings.attraction,
@@ -171,7 +170,7 @@ def _of_ordered(points: np.ndarray, settings: SkeletonSettings, root: np.ndarray
     graph = curve_graph(points[thin], contraction.drawn, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal, up=up,
                         join_plants=settings.plants == "joined")
-    check_one_plant(graph, len(thin), diagonal, settings.plants, axes)
+    check_one_plant(graph, len(thin), diagonal, settings.plants, own)
     start, other_root = _root_node(graph, points[thin], root, up, settings.prune)
     if is_sparse(points[thin], contraction.drawn):
         thin, loops, base = thinned(points, POINT_LIMIT), graph.loops, graph.nodes[start]
@@ -327,7 +326,7 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     # Noise leaves little information a round.
     noisy = fit.noise > _NOISY * float(np.median(skeleton.radius))
     rounds = 18 if noisy else 6 if late else 0
-    fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late,
+    fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late, seen=fit.seen,
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
     ended = _ends_within(fit.skeleton, points)

@@ -49,18 +49,19 @@ class AxisFit:
         segment: The node whose cylinder (to its parent) each point belongs to, shape [m].
         residual: Distance of each point from that cylinder [m], positive outside, shape [m].
         noise: Robust standard deviation of the residuals [m].
+        seen: From which side the branches were seen.
     """
 
     skeleton: Skeleton
     segment: np.ndarray
     residual: np.ndarray
     noise: float
+    seen: SeenSides
 
 
 def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
              settled: bool = False, along_sight: bool = False, uncertainty: bool = True,
-             progress: Progress = SILENT,
-             ) -> AxisFit:
+             seen: SeenSides | None = None, progress: Progress = SILENT) -> AxisFit:
     """Fit axes and radii of a skeleton's runs to points.
 
     Args:
@@ -71,6 +72,9 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         along_sight: The points are a depth camera's: they scatter along its sight alone.
         uncertainty: Find each radius's standard deviation too; without, it and the states stay
             as they were.
+        seen: What an earlier fit found was seen; None: told anew in each round. Where noise hides
+            the rings, a side that is told anew follows what the axes made of the last one, and
+            radii shrink from round to round.
         progress: Called each round.
     """
     nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
@@ -78,7 +82,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     floor = 0.05 * float(np.median(radius))
     near, found_at = None, nodes
     # Once a fit is too thin, scatter along the sight no longer shows as such: what is known counts.
-    known = SCATTERED_ALONG_SIGHT if along_sight else None
+    known = SCATTERED_ALONG_SIGHT if along_sight else seen
     for number in range(rounds):
         # The cylinders around a point are looked up anew once axes have moved.
         moved = np.linalg.norm(nodes - found_at, axis=1)
@@ -86,14 +90,14 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
             near, found_at = cylinders_around(skeleton.parent, nodes, points), nodes
         match = match_cylinders(skeleton.parent, skeleton.order, nodes, radius, points, near)
         # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
-        noise = max(_robust_sigma(match.residual, radius[match.segment]), 1e-4 * floor)
+        noise = max(_robust_sigma(match.residual, match.thick), 1e-4 * floor)
         spread = noise if settled else max(noise, 0.6 * spread)
-        weight = _tukey(match.residual, _limit(spread, noise, radius[match.segment]))
+        weight = _tukey(match.residual, _limit(spread, noise, match.thick))
         # While axes are still far off, the misfit is no noise that smoothing could help against.
         trusted = noise if settled or number > rounds // 2 else 0.0
         place = match.normal
         if trusted:
-            place, _ = _places(skeleton.parent, nodes, match, weight, noise, known)
+            place = _places(skeleton.parent, nodes, match, weight, noise, known)
         system = _system(skeleton, nodes, radius, match, weight, trusted, place)
         step = system.solve()
         limit = 0.5 * radius
@@ -106,17 +110,17 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         if number > rounds // 2 + 1 and size.max() < 1e-3 * floor and spread <= 1.01 * noise:
             break
     match = match_cylinders(skeleton.parent, skeleton.order, nodes, radius, points)
-    noise = _robust_sigma(match.residual, radius[match.segment])
+    noise = _robust_sigma(match.residual, match.thick)
+    weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
+    seen, *_ = _sides(skeleton.parent, nodes, match, weight, noise, known)
     sigma, state = skeleton.radius_sigma, skeleton.radius_state
     if uncertainty:
-        weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
         sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
-        _, seen = _places(skeleton.parent, nodes, match, weight, noise, known)
         sigma = np.hypot(sigma, side_doubt(seen, radius, noise))
         state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     fitted = replace(skeleton, nodes=nodes, radius=np.maximum(radius, 0.1 * floor),
                      radius_sigma=sigma, radius_state=state)
-    return AxisFit(fitted, match.segment, match.residual, noise)
+    return AxisFit(fitted, match.segment, match.residual, noise, seen)
 
 
 def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
@@ -124,16 +128,22 @@ def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
     return np.minimum(_TUKEY * spread, 0.9 * radius + 3 * np.minimum(noise, radius))
 
 
-def _places(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
-            noise: float, known: SeenSides | None) -> tuple[np.ndarray, SeenSides]:
-    """Mean direction to where on its cylinder each point comes from, shape [m, 3]; what was seen.
-    """
+def _sides(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray, noise: float,
+           known: SeenSides | None) -> tuple[SeenSides, np.ndarray, np.ndarray, np.ndarray]:
+    """What was seen, and of each point the axis [m, 3], how sharp its place is and how stout."""
     axis = nodes[match.segment] - nodes[parent[match.segment]]
     axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
     sharpness = match.thick * (match.residual + match.thick) / max(noise, 1e-12)**2
     stout = (match.thick / max(noise, 1e-12))**2
     seen = known or seen_sides(match.normal, axis, match.residual, sharpness, stout, weight)
-    return mean_places(match.normal, axis, sharpness, stout, seen), seen
+    return seen, axis, sharpness, stout
+
+
+def _places(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
+            noise: float, known: SeenSides | None) -> np.ndarray:
+    """Mean direction to where on its cylinder each point comes from, shape [m, 3]."""
+    seen, axis, sharpness, stout = _sides(parent, nodes, match, weight, noise, known)
+    return mean_places(match.normal, axis, sharpness, stout, seen)
 
 
 def _near_start(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray,
@@ -261,7 +271,7 @@ def fit_precision(skeleton: Skeleton, points: np.ndarray) -> tuple[sparse.csc_ma
     """
     match = match_cylinders(skeleton.parent, skeleton.order, skeleton.nodes, skeleton.radius,
                             points)
-    noise = max(_robust_sigma(match.residual, skeleton.radius[match.segment]), 1e-12)
+    noise = max(_robust_sigma(match.residual, match.thick), 1e-12)
     weight = _tukey(match.residual, np.full(len(points), _TUKEY * noise))
     return _system(skeleton, skeleton.nodes, skeleton.radius, match, weight, noise).matrix, noise
 
@@ -354,7 +364,10 @@ def _smoothness(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, per_n
         mean = (before + after) / 2
         # The first radii, since a radius that grows by mistake must not blur its own axis.
         thick = skeleton.radius[chain[1:-1]]
-        band = thick * np.clip(_BAND + 8.0 * noise / thick, _BAND, _BAND_LIMIT)
+        # Thinner than the noise, it bends no finer than if it were as thick as that: free to, its
+        # axis would follow single points, until nothing is left of its radius.
+        band = np.clip(_BAND * thick + 8.0 * noise, _BAND * thick,
+                       _BAND_LIMIT * np.maximum(thick, noise))
         # Axes kink at forks: a branch's leader gives way to a strong twig.
         band *= np.where(forks[chain[1:-1]], 0.6, 1.0) * _straightness(skeleton.nodes[chain])
         index = count + np.arange(len(chain) - 2)

@@ -14,8 +14,10 @@ import numpy as np
 
 from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle
 
-_PLACES = 48  # on the circle, of which each is weighed
-_SHARP = 150.0  # square of radius over noise from which places are known to within 5 degrees
+_PLACES = 180  # on the circle, of which each is weighed
+# Square of radius over noise from which places are known to within 5 degrees; and where one side
+# alone was seen, and its edges tell the radius, to within one.
+_SHARP, _SHARP_SIDE = 150.0, 2500.0
 _CLEAR = 12.0  # concentration from which a point tells which sides were seen
 _ONE_SIDED = 0.3  # length of the mean normal, from which one side may be all that was seen
 _BEHIND = np.deg2rad(115.0)  # angle to the viewer from which a side was not seen
@@ -174,7 +176,7 @@ def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout:
         # Scatter along the sight widens no silhouette: what it adds to the radius is bounded.
         return out * np.clip(1 - 0.5 / np.maximum(sharpness, 1e-9), _SIGHT_LEAST, 1.0)[:, None]
     # By the radius alone: chosen by their distance too, near points would count otherwise than far.
-    blurred = np.flatnonzero(stout < _SHARP)
+    blurred = np.flatnonzero(stout < (_SHARP if seen.share.min() == 1.0 else _SHARP_SIDE))
     side, cross = _sides(axis[blurred], seen.view)
     cosine, sine = (np.einsum("mj,mj->m", out[blurred], way) for way in (side, cross))
     size = np.maximum(np.hypot(cosine, sine), 1e-300)

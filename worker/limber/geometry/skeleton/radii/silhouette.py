@@ -62,7 +62,7 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
 
     Args:
         skeleton: Fitted to the cloud.
-        points: The cloud [m], shape [n, 3], a point a pixel.
+        points: The cloud [m], shape [n, 3], a point a pixel of those that it has.
         view: Where it was seen from.
 
     Returns:
@@ -70,7 +70,7 @@ def within_silhouette(skeleton: Skeleton, points: np.ndarray, view: View,
     """
     segment, _ = nearest_cylinders(skeleton, points)
     pixel = view.pitch * np.linalg.norm(points - view.eye, axis=1)
-    area = np.bincount(segment, pixel**2, skeleton.node_count)
+    area = np.bincount(segment, pixel**2, skeleton.node_count) / view.fill
     count = np.bincount(segment, minlength=skeleton.node_count)
     width = np.bincount(segment, pixel, skeleton.node_count) / np.maximum(count, 1)
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
