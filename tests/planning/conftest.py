@@ -10,6 +10,7 @@ from limber.geometry.tets.cylinder_mesh import curved_beam
 from limber.geometry.tets.marks import mark
 from limber.mechanics import BranchModel
 from limber.mechanics.loaded import hang
+from limber.planning.bound import certificate
 from limber.planning.compare import PlanSettings
 from limber.planning.field.energy_field import GraspSamples, fit_field
 from limber.planning.field.grasp_model import grasp_model_of
@@ -119,3 +120,9 @@ def planned_branch(tmp_path_factory, small_mesh, small_skeleton):
     sample_energy_field(folder, EnergySettings(samples=60), workers=1)
     plan_paths(folder, PlanSettings(iterations=800, start_seed=3), name="there", workers=1)
     return folder
+
+
+@pytest.fixture
+def coarse_bound(monkeypatch):
+    """The bound without its last, finest grid, where something else is tested: half a minute."""
+    monkeypatch.setattr(certificate, "_MOST_CELLS", 60_000)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from limber.errors import InputError
-from limber.planning.chance import Exposure, YoungDoubt, _chosen
+from limber.planning.chance import Exposure, Surface, YoungDoubt, _chosen, _design
 from limber.planning.limits import Limits
 from limber.planning.resolve import resolve_path
 from limber.planning.settings import PlanSettings
@@ -29,6 +29,13 @@ def doubt_of(small_model, deviations, correlation=0.0):
     count = len(deviations)
     return YoungDoubt(shares / shares.sum(axis=1, keepdims=True), np.array(deviations),
                       np.eye(count) + correlation * (1 - np.eye(count)))
+
+
+def laid(axes, law, degree=1.0):
+    """A surface through values of ``law`` of the logs [m, K], [m, n, parts]."""
+    axes = np.array(axes, float)
+    places, pairs = _design(axes.shape[1], 2.0)
+    return Surface.through(axes, pairs, places, law(places @ axes.T), degree)
 
 
 def test_a_branch_that_is_stiffer_everywhere(small_model, bent):
@@ -58,15 +65,32 @@ def test_what_is_left_to_a_motion_is_what_the_moduli_leave(small_model, bent):
     assert peak < left.force < limits.force and left.strain == limits.strain
 
 
-def test_the_log_of_a_force_is_linear_in_the_logs_of_the_moduli(small_model, bent):
-    """What the slopes say of moduli that change against each other, against the full model."""
-    doubt = doubt_of(small_model, [0.1, 0.15], -0.5)
-    logs = np.array([0.1, -0.15])
-    slopes = doubt._slopes(small_model, bent.solved, {"force": 1.0}, lambda *_: None)["force"]
-    solved = doubt.solved(small_model, logs, bent.solved)
-    change = np.log(solved.force_sizes / bent.solved.force_sizes)
-    assert np.allclose(slopes @ [1.0, -1.0], change, atol=0.015)
-    assert np.abs(change).max() > 0.02
+def test_forces_under_other_moduli_are_those_of_the_full_model(small_model, bent):
+    """Also where the moduli change against each other and the force turns with them."""
+    doubt = doubt_of(small_model, [0.2, 0.3], -0.5)
+    exposure = doubt.exposure(small_model, bent, Limits(force=bent.solved.force_sizes.max()))
+    surface = exposure.surfaces["force"]
+    for logs in np.array([[0.35, -0.45], [-0.3, 0.4], [0.25, 0.1]]):
+        truth = doubt.solved(small_model, logs, bent.solved).force_sizes
+        found = surface.sizes(logs[None])[0]
+        size = np.abs(truth - truth.max()) <= 0.5 * truth.max()
+        assert len(found) == size.sum()
+        assert np.allclose(found, truth[size], rtol=4e-3)
+
+
+def test_a_force_that_turns_is_told_by_its_parts():
+    """Pull and weight nearly cancel on the estimate: the log of what is left has no slope that
+    tells it, its parts have."""
+    def law(logs):
+        return np.stack([np.exp(logs), np.zeros_like(logs)], axis=-1) - [1.02, 0.1]
+
+    exposure = Exposure({"force": 1.0}, {"force": laid([[0.2]], law)})
+    found = exposure.risk(np.full((1, 1), 0.04), 0.95)
+    draws = 0.2 * norm.ppf((np.arange(20000) + 0.5) / 20000)
+    truth = np.hypot(np.exp(draws) - 1.02, 0.1)
+    likely = float(np.quantile(truth, 0.95))
+    assert found.excess["force"] == pytest.approx(likely, rel=5e-3)
+    assert found.factors["force"] > 3.0
 
 
 def test_poses_are_asked_where_a_limit_may_break(bent):
@@ -91,15 +115,15 @@ def test_poses_that_break_under_other_moduli_share_the_chance():
     """Two poses, each below its limit with 0.95 under a modulus of its own: both with 0.95 squared;
     a force that bends upwards with its modulus is kept less often, in closed form."""
     z = norm.ppf(0.95)
-    both = Exposure({"force": 1.0}, {"force": np.exp([-0.1 * z, -0.1 * z])}, {"force": np.eye(2)})
+    both = Exposure({"force": 1.0}, {"force": laid(
+        0.1 * np.eye(2), lambda logs: np.exp(logs - 0.1 * z)[..., None])})
     found = both.risk(0.01 * np.eye(2), 0.95)
     assert found.kept == pytest.approx(0.95**2, abs=2e-3)
     assert found.excess["force"] == pytest.approx(
         np.exp(0.1 * (norm.ppf(np.sqrt(0.95)) - z)), rel=2e-3)
-    straight = Exposure({"force": 1.0}, {"force": np.exp([-0.2])}, {"force": np.ones((1, 1))})
-    bent = replace(straight, bends={"force": np.array([0.8])}, farthest={"force": np.array([9.0])})
+    bent = Exposure({"force": 1.0}, {"force": laid(
+        [[0.15]], lambda logs: (0.8 + logs + 0.8 * logs**2)[..., None], 0.0)})
     most = (np.sqrt(1.0 + 4 * 0.8 * 0.2) - 1.0) / (2 * 0.8)  # p + 0.8 p^2 = 0.2
     least = (-np.sqrt(1.0 + 4 * 0.8 * 0.2) - 1.0) / (2 * 0.8)
     kept = norm.cdf(most / 0.15) - norm.cdf(least / 0.15)
     assert bent.risk(np.full((1, 1), 0.15**2), 0.95).kept == pytest.approx(kept, abs=2e-3)
-    assert straight.risk(np.full((1, 1), 0.15**2), 0.95).kept > kept + 0.02

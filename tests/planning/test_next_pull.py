@@ -18,7 +18,7 @@ from limber.estimation.next_pull import (
     suggest,
 )
 from limber.estimation.settings import EstimateSettings
-from limber.planning.chance import Exposure
+from limber.planning.chance import Exposure, Surface
 from limber.stages.loading import load_subject
 from limber.stages.suggest_pull import SuggestPullSettings, suggest_pull, verdict
 from limber.store import Branch
@@ -67,8 +67,11 @@ def test_no_pull_within_the_strain_is_said(subject, monkeypatch):
 
 
 def exposed(slope, value=0.8):
-    return Exposure({"force": 1.0}, {"force": np.array([value])},
-                    {"force": np.array([[slope, 0.0]])})
+    """A force that grows with the first of two moduli alone."""
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    pairs, axes = np.array([[0, 0], [1, 1]]), np.diag([0.2, 1.0])
+    law = value * np.exp(slope * (places @ axes.T)[:, :1])[..., None]
+    return Exposure({"force": 1.0}, {"force": Surface.through(axes, pairs, places, law, 0.0)})
 
 
 @pytest.mark.parametrize(("value", "now", "after", "worth", "words"), [

@@ -258,6 +258,7 @@ def test_a_field_too_coarse_for_the_asked_bound_is_told():
     assert _doubts(summary, 6.0) == []
 
 
+@pytest.mark.usefixtures("coarse_bound")
 def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within the tolerance."""
     field = EnergyField.read(copied / "energy.npz")

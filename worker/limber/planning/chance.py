@@ -1,15 +1,18 @@
 """What an uncertain Young's modulus does to the limits of a plan.
 
 A pose of the gripper is kept whatever the modulus is; energy, force and stress there are not. The
-moduli are log-normal. The log of each value is taken as linear in the log moduli, its slopes from
-the full model with each control point's modulus raised by one standard deviation in turn, and bent
-along the way on which the worst pose comes to its limit first: there the branch is solved once more
-(a design point: Ditlevsen and Madsen, Structural Reliability Methods, 1996, 5). What the values of
-all poses are together is drawn from these: other poses break their limit under other moduli, and
-the motion is to keep it at each. Several limits share the probability that is left (Bonferroni).
+moduli are log-normal. Of what a limit is on, with its sign or its direction, a quadratic response
+surface in the logs is laid through the full model's values at two standard deviations along each
+axis of the posterior and between the axes (Box and Wilson 1951; for reliability Bucher and Bourgund
+1990). Not of a magnitude or its log: a force is a difference of what bends the branch and what it
+weighs, may be small or turn, and its log bends without end. Forces, energies and stresses grow
+with the moduli if all grow and weight is little: the surface is of what they are over the mean
+growth. What the values of all poses are together is drawn from the surfaces: other poses break
+their limit under other moduli, and the motion is to keep it at each. Several limits share the
+probability that is left (Bonferroni).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import norm, qmc
@@ -23,8 +26,9 @@ from limber.progress import SILENT, Progress
 _POSES = 10  # along the motion where a limit is near, besides those where one is nearest
 _NEAR = 0.3  # of a limit: what is farther below is taken to keep it
 _HIGH = 0.6  # of the peak of what a limit is on: poses of less are not the first to break it
-_FAR = 2.0  # standard deviations off, where the branch is solved once more
-_FARTHEST = 1.5  # times as far the bend that was found there is believed
+_FAR = (2.0, 1.0)  # standard deviations off, where the branch is solved; the next if it is not
+_CROSSED = 6  # axes of the posterior, those of most variance, whose products count
+_DEGREES = {"strain": 0.0}  # how a value grows with all moduli; 1 where not told
 _DRAWS_LOG2 = 14  # quasi-random draws: the chance of 0.95 is off by some 0.0005
 
 
@@ -64,45 +68,72 @@ class Risk:
 
 
 @dataclass(frozen=True)
+class Surface:
+    """A value at poses over changes of log E: quadratic, times the mean growth of the moduli.
+
+    Attributes:
+        whitening: From changes of log E [K] to standard deviations along the axes, shape [r, K].
+        pairs: Axes whose products count, shape [p, 2].
+        weights: Of 1, the axes and the products, shape [1 + r + p, n, parts]; a size is that of
+            the parts together.
+        degree: Power of the mean growth.
+    """
+
+    whitening: np.ndarray
+    pairs: np.ndarray
+    weights: np.ndarray
+    degree: float
+
+    @classmethod
+    def through(cls, axes: np.ndarray, pairs: np.ndarray, places: np.ndarray, values: np.ndarray,
+                degree: float) -> "Surface":
+        """Lay it through ``values`` [m, n, parts] at ``places`` [m, r] in standard deviations along
+        ``axes`` [K, r]; as many places as there are weights."""
+        grown = _growth(places @ axes.T, degree)
+        right = (values / grown[:, None, None]).reshape(len(places), -1)
+        weights = np.linalg.solve(_features(places, pairs), right)
+        return cls(np.linalg.pinv(axes), pairs, weights.reshape(values.shape), degree)
+
+    def sizes(self, logs: np.ndarray) -> np.ndarray:
+        """Return sizes under changes of log E [m, K], shape [m, n]."""
+        features = _features(logs @ self.whitening.T, self.pairs)
+        parts = np.tensordot(features, self.weights, axes=1)
+        return _growth(logs, self.degree)[:, None] * np.linalg.norm(parts, axis=2)
+
+
+def _growth(logs: np.ndarray, degree: float) -> np.ndarray:
+    return np.exp(degree * logs.mean(axis=1))
+
+
+def _features(places: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    return np.column_stack([np.ones(len(places)), places,
+                            places[:, pairs[:, 0]] * places[:, pairs[:, 1]]])
+
+
+@dataclass(frozen=True)
 class Exposure:
     """What limits are on, at poses of a motion that come near to them.
 
     Attributes:
         asked: The limits, by name.
-        values: On the estimate, shape [n] each.
-        slopes: Of their logs to log E at the control points, shape [n, K] each.
-        bends: What the log of a value is above its slope's times that squared, shape [n] each.
-        farthest: Up to which change of the log by the slope that is believed, shape [n] each.
+        surfaces: What each is on; none where no pose comes near.
     """
 
     asked: dict[str, float]
-    values: dict[str, np.ndarray]
-    slopes: dict[str, np.ndarray]
-    bends: dict[str, np.ndarray] = field(default_factory=dict)
-    farthest: dict[str, np.ndarray] = field(default_factory=dict)
+    surfaces: dict[str, Surface]
 
     def risk(self, covariance: np.ndarray, confidence: float) -> Risk:
         """Return how the motion keeps its limits where log E has this covariance [K, K]."""
         logs = _draws(covariance)
         kept, factors, excess = np.ones(len(logs), bool), {}, {}
         share = 1.0 - (1.0 - confidence) / max(len(self.asked), 1)
-        for name, limit in self.asked.items():
-            if not len(self.values[name]):
-                continue
-            peaks = (self.values[name] * np.exp(self._changes(name, logs))).max(axis=1)
+        for name, surface in self.surfaces.items():
+            peaks, limit = surface.sizes(logs).max(axis=1), self.asked[name]
             kept &= peaks <= limit
             likely = float(np.quantile(peaks, share))
-            factors[name] = likely / float(self.values[name].max())
+            factors[name] = likely / float(surface.sizes(np.zeros((1, logs.shape[1]))).max())
             excess[name] = likely / limit
         return Risk(float(kept.mean()), factors, excess)
-
-    def _changes(self, name: str, logs: np.ndarray) -> np.ndarray:
-        """Return changes of the log values under draws of log E [m, K], shape [m, n]."""
-        change = logs @ self.slopes[name].T
-        if name not in self.bends:
-            return change
-        far = self.farthest[name]
-        return change + self.bends[name] * np.clip(change, -far, far)**2
 
 
 def _draws(covariance: np.ndarray) -> np.ndarray:
@@ -163,56 +194,26 @@ class YoungDoubt:
         asked = {name: limit for name, limit in limits.asked().items() if name != "closeness"}
         whole = path.approach.joined(path.solved)
         chosen = whole.take(_chosen(whole, asked))
-        known = sizes(chosen)
-        slopes = self._slopes(grasp_model, chosen, asked, progress)
-        per_log = np.divide(1.0, self.deviations, out=np.zeros(len(self.deviations)),
-                            where=self.deviations > 0.0)
-        near = {name: np.flatnonzero(known[name] > _NEAR * limit) for name, limit in asked.items()}
-        straight = Exposure(asked, {name: known[name][near[name]] for name in asked},
-                            {name: slopes[name][near[name]] * per_log for name in asked})
-        bends, farthest = {}, {}
-        for name in asked:
-            if len(near[name]):
-                bends[name], farthest[name] = self._bends(grasp_model, chosen.take(near[name]),
-                                                          straight, name)
-        return replace(straight, bends=bends, farthest=farthest)
-
-    def _bends(self, grasp_model: GraspModel, states: SolvedPoses, straight: Exposure, name: str,
-               ) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the log of a value bends, and how far that is believed, shape [n] each.
-
-        By solving the states under the moduli that take the worst of them up the most.
-        """
-        slopes = straight.slopes[name]
-        spread = np.sqrt(np.maximum(np.einsum(
-            "ik,kl,il->i", slopes, self.covariance, slopes), 0.0))
-        worst = int(np.argmax(straight.values[name] * np.exp(_FAR * spread)))
-        if not spread[worst] > 0.0:
-            return np.zeros(len(spread)), np.zeros(len(spread))
-        logs = _FAR / spread[worst] * self.covariance @ slopes[worst]
-        moved = sizes(self.solved(grasp_model, logs, states))[name]
-        expected = slopes @ logs
-        sure = np.abs(expected) > 0.5 * _FAR * spread
-        off = np.log(np.maximum(moved, 1e-12) / np.maximum(straight.values[name], 1e-12)) - expected
-        bends = np.divide(off, expected**2, out=np.zeros(len(off)), where=sure & (expected != 0.0))
-        return bends, _FARTHEST * np.abs(expected)
-
-    def _slopes(self, grasp_model: GraspModel, states: SolvedPoses, asked: dict[str, float],
-                progress: Progress) -> dict[str, np.ndarray]:
-        """Return changes of log values by a standard deviation of each modulus, [n, K] each."""
-        known = sizes(states)
-        found = {name: np.zeros((len(states.poses), len(self.deviations))) for name in asked}
-        for k, deviation in enumerate(self.deviations):
-            progress(k / len(self.deviations), "limits under other moduli")
-            if deviation <= 0.0:
-                continue
-            logs = np.zeros(len(self.deviations))
-            logs[k] = deviation
-            moved = sizes(self.solved(grasp_model, logs, states))
-            for name in asked:
-                found[name][:, k] = np.log(np.maximum(moved[name], 1e-12)
-                                           / np.maximum(known[name], 1e-12))
-        return found
+        axes = _axes(self.covariance)
+        for number, far in enumerate(_FAR):
+            places, pairs = _design(axes.shape[1], far)
+            try:
+                found = [chosen]
+                for place in places[1:]:
+                    progress(len(found) / len(places), "limits under other moduli")
+                    found.append(self.solved(grasp_model, axes @ place, chosen))
+                break
+            except ConvergenceError:
+                if number == len(_FAR) - 1:
+                    raise
+        known, surfaces = sizes(chosen), {}
+        for name, limit in asked.items():
+            near = np.flatnonzero(known[name] > _NEAR * limit)
+            if len(near):
+                values = np.array([_parts(states, name)[near] for states in found])
+                surfaces[name] = Surface.through(axes, pairs, places, values,
+                                                 _DEGREES.get(name, 1.0))
+        return Exposure(asked, surfaces)
 
     def solved(self, grasp_model: GraspModel, logs: np.ndarray, states: SolvedPoses,
                ) -> SolvedPoses:
@@ -233,6 +234,33 @@ class YoungDoubt:
                     "Choose a gentler goal, or leave --confidence away.")
             results.append(result)
         return SolvedPoses.of(other, results)
+
+
+def _axes(covariance: np.ndarray) -> np.ndarray:
+    """Return changes of log E by one standard deviation along the axes of the posterior that is
+    open at all, that of most variance first, shape [K, r]."""
+    variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    order = np.argsort(-variances, kind="stable")
+    order = order[variances[order] > 1e-12 * max(float(variances.max()), 1e-300)]
+    return axes[:, order] * np.sqrt(variances[order])
+
+
+def _design(count: int, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return places [m, r] along and between axes, the middle first, and the axes [p, 2] whose
+    products can be told from them."""
+    crossed = [(k, other) for k in range(min(count, _CROSSED)) for other in range(k)]
+    unit = far * np.eye(count)
+    between = [(unit[k] + unit[other]) / np.sqrt(2.0) for k, other in crossed]
+    pairs = np.array([*((k, k) for k in range(count)), *crossed], int).reshape(-1, 2)
+    return np.vstack([np.zeros((1, count)), unit, -unit, *between]), pairs
+
+
+def _parts(states: SolvedPoses, name: str) -> np.ndarray:
+    """Return what a limit is on with its sign or direction, shape [n, parts]."""
+    vectors = {"force": states.forces, "torque": states.torques}
+    if name in vectors:
+        return vectors[name]
+    return (states.energies if name == "energy" else states.loads[name])[:, None]
 
 
 def _chosen(states: SolvedPoses, asked: dict[str, float]) -> np.ndarray:
