@@ -127,7 +127,7 @@ def test_a_limit_along_the_branch_binds_path_and_bound(ridge_field, across):
     cap = 1.05 * max(load[0], load[-1])
     assert load.max() > 1.1 * cap
     problem = problem_on(ridge_field, axial_force=cap)
-    found = plan_gentle(problem)
+    found = plan_gentle(problem, enough=0.1)
     kept = np.abs(ridge_field.load(resample(found.points, 0.001), "axial_force"))
     assert kept.max() <= cap * (1 + 1e-9)
     assert found.cost > free.cost and found.certificate.lower <= found.cost
@@ -143,7 +143,7 @@ def test_a_path_is_led_around_an_obstacle(ridge_field, across):
 
     field = among_obstacles(ridge_field, closeness(ridge_field.samples.positions))
     assert np.abs(field.load(free.points, "closeness") - closeness(free.points)).max() < 0.2
-    found = plan_gentle(problem_on(field, closeness=0.9))
+    found = plan_gentle(problem_on(field, closeness=0.9), enough=0.1)
     fine = resample(found.points, 0.001)
     assert field.load(fine, "closeness").max() <= 0.9 * (1 + 1e-9)
     assert np.linalg.norm(fine - centre, axis=1).min() > 0.04
@@ -166,7 +166,7 @@ def test_from_the_rest_pose_and_for_the_tip(ridge_field):
     wanted = ridge_field.tip(np.array([GOAL.position]))[0]
     problem = problem_on(ridge_field, start=ridge_field.rest.copy(),
                          goal=TargetGoal(Ball(tuple(wanted), 0.015)))
-    found = plan_gentle(problem)
+    found = plan_gentle(problem, enough=0.05)
     best = min(refine(path, problem)[1] for path in bulges(problem, 4))
     assert found.certificate.lower <= min(best, found.cost) * (1 + 1e-9)
     assert found.cost <= 1.01 * best

@@ -66,8 +66,8 @@ def test_left_out_errors_are_those_of_fits_without_the_sample(ridge):
 
 
 def test_region_along_a_shell():
-    """Flattened and bent back it is the same point; heights' slopes are those of differences;
-    nothing within reach lies lower than promised; the outline's box holds the region."""
+    """Flattened and bent back it is the same point; heights' slopes are those of differences; the
+    outline's box holds the region."""
     generator = np.random.default_rng(3)
     pivot, radius = np.array([0.01, -0.02, 0.1]), 0.3
     chart = Chart.about(pivot, radius, pivot + [0.02, 0.01, 0.3])
@@ -83,13 +83,47 @@ def test_region_along_a_shell():
         there, back = (region.height(points[1:] + 1e-3 + side * step * np.eye(3)[axis])
                        for side in (1, -1))
         assert np.allclose((there - back) / (2 * step), slope[:, axis], atol=1e-5)
-    off = generator.normal(size=points.shape)
-    off *= 0.02 / np.linalg.norm(off, axis=1, keepdims=True)
-    assert (region.height(points + off) >= region.least_height(points, 0.02) - 1e-12).all()
     inside = region.draw(2000, generator)
     assert (inside > region.low).all() and (inside < region.high).all()
     on_top = chart.curved(np.array([[0.03, 0.02, 0.0], [0.0, 0.05, -0.0005]]))
     assert region.contains(on_top).all(), "facets of points themselves would cut them off"
+
+
+def test_boxes_surely_outside_hold_nothing_that_is_trusted():
+    """And nearly all that hold nothing are told: those of which the highest plane, or a refused
+    pose, may speak for all."""
+    generator = np.random.default_rng(8)
+    pivot, radius = np.array([0.01, -0.02, 0.1]), 0.3
+    chart = Chart.about(pivot, radius, pivot + [0.02, 0.01, 0.3])
+    accepted = chart.curved(generator.uniform([-0.2, -0.2, -0.06], [0.2, 0.2, 0.001], (150, 3)))
+    region = TrustRegion.of(accepted, accepted[:5] + 0.01, pivot, radius)
+    axes = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    corners = np.stack(np.meshgrid(*3 * [np.linspace(-1.0, 1.0, 9)]), axis=-1).reshape(-1, 3)
+    for half in (0.004, 0.0005):
+        centres = generator.uniform(region.low, region.high, (4000, 3))
+        told = region.surely_outside(centres, half * axes)
+        inside = region.contains((centres[:, None] + half * corners @ axes).reshape(-1, 3))
+        holds = inside.reshape(len(centres), -1).any(axis=1)
+        assert not (told & holds).any()
+        assert told.sum() > 0.95 * (~holds).sum() > 1000
+
+
+def test_bend_of_the_chart_is_the_most_within_reach():
+    """Second differences along random lines never pass it, and come near to it."""
+    generator = np.random.default_rng(9)
+    chart = Chart.about(np.array([0.01, -0.02, 0.1]), 0.3, np.array([0.03, -0.01, 0.4]))
+    centres = chart.curved(generator.uniform([-0.5, -0.5, -0.15], [0.5, 0.5, 0.1], (300, 3)))
+    most, step = chart.bend(centres, 0.02), 2e-4
+    share = 0.0
+    for _ in range(200):
+        way, off = generator.normal(size=(2, 300, 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        at = centres + 0.0199 * off / np.linalg.norm(off, axis=1, keepdims=True)
+        before, here, after = (chart.map(at + side * step * way) for side in (-1, 0, 1))
+        found = np.linalg.norm(after - 2.0 * here + before, axis=1) / step**2
+        assert (found <= most).all()
+        share = max(share, float((found / most).max()))
+    assert 0.6 < share
 
 
 def test_energy_below_that_of_the_hanging_state_is_clamped(well):

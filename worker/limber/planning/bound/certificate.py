@@ -21,6 +21,7 @@ from scipy.ndimage import binary_dilation, label, maximum_filter
 from limber.errors import Cancelled, NoPathError
 from limber.planning.bound.subsolution import (
     CURVATURE_FACTOR,
+    RIM,
     Terrain,
     corner_values,
     corners_of,
@@ -43,6 +44,7 @@ _CUT = 3  # of a cell's edge from one grid to the next
 _CHILDREN = _CUT**3
 ENOUGH = 0.015  # gap below which no further refinement is worth its time
 _NEAR = np.ones((3, 3, 3))
+_PAD = RIM + 1  # closed cells about the grid, for the coefficients and second differences there
 _BEYOND = 1.2  # on the steepest measured growth of the goal's distance
 
 
@@ -188,8 +190,8 @@ class _Bounds:
 
 def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
     # One corner more than the active cells': for the second differences there.
-    corners = np.argwhere(binary_dilation(corners_of(binary_dilation(grid.open_cells, _NEAR)),
-                                          _NEAR))
+    corners = np.argwhere(binary_dilation(corners_of(binary_dilation(
+        grid.open_cells, _NEAR, iterations=RIM)), _NEAR))
     points = grid.points(corners)
     open_cells = grid.open_cells & ~_surely_closed(problem, grid, corners, points)
     if not open_cells[tuple(cell)]:
@@ -281,16 +283,11 @@ def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
 def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, points: np.ndarray,
                    ) -> np.ndarray:
     """Return the cells in which no point is allowed."""
-    limits, region = problem.limits, problem.energy_field.region
-    far = grid.spacing * np.sqrt(3.0)  # from a corner to any point of the cell
-    # One corner speaks for its cell, if all within reach of it is above the same hull.
-    closed = _corners_of(grid, nodes, region.least_height(points, far)).max(axis=0) > 0.0
-    if len(region.rejected):
-        from scipy.spatial import cKDTree
-
-        beyond = (cKDTree(region.accepted).query(points)[0]
-                  - cKDTree(region.rejected).query(points)[0])
-        closed |= _corners_of(grid, nodes, beyond - 2.0 * far).max(axis=0) > 0.0
+    limits, closed = problem.limits, np.zeros(grid.open_cells.shape, bool)
+    cells = np.argwhere(grid.open_cells)
+    halves = 0.5 * grid.spacing * grid.axes
+    outside = problem.energy_field.region.surely_outside(grid.points(cells + 0.5), halves)
+    closed[tuple(cells[outside].T)] = True
     if limits.max_energy < np.inf:
         energy = grid.spread(nodes, problem.energy_field.energy(points))
         closed |= _all_above(energy, limits.max_energy + problem.field_error)
@@ -298,8 +295,10 @@ def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, point
         if limit < np.inf:
             load = grid.spread(nodes, problem.energy_field.load(points, name)**2)
             closed |= _all_above(load, limit**2)
-    beyond = np.maximum(limits.low - points, points - limits.high).max(axis=1)
-    closed |= _corners_of(grid, nodes, beyond - far).max(axis=0) > 0.0
+    if np.isfinite([limits.low, limits.high]).any():
+        centres, reach = grid.points(cells + 0.5), np.abs(halves).sum(axis=0)
+        beyond = np.maximum(limits.low - centres, centres - limits.high) > reach
+        closed[tuple(cells[beyond.any(axis=1)].T)] = True
     if limits.max_force < np.inf:
         force = grid.spread(nodes, (problem.energy_field.force(points)**2).sum(axis=1))
         closed |= _all_above(force, limits.max_force**2)
@@ -323,9 +322,9 @@ def _first_grid(problem: GentleProblem) -> tuple[_Grid, np.ndarray]:
     low = np.minimum(corners.min(axis=0), 0.0)
     high = np.maximum(corners.max(axis=0), 0.0)
     spacing = float(np.cbrt(np.prod(high - low) / _FIRST_CELLS))
-    before = np.ceil(-low / spacing - 0.5).astype(int) + 2
-    after = np.ceil(high / spacing - 0.5).astype(int) + 3
-    open_cells = np.pad(np.ones(tuple(before + after - 4), bool), 2)
+    before = np.ceil(-low / spacing - 0.5).astype(int) + _PAD
+    after = np.ceil(high / spacing - 0.5).astype(int) + _PAD + 1
+    open_cells = np.pad(np.ones(tuple(before + after - 2 * _PAD), bool), _PAD)
     return _Grid(start - ((before + 0.5) * spacing) @ axes, axes, spacing, open_cells), before
 
 
@@ -351,11 +350,10 @@ def _refined(grid: _Grid, keep: np.ndarray, cell: np.ndarray) -> tuple[_Grid, np
     box = keep[low[0]:high[0], low[1]:high[1], low[2]:high[2]]
     for axis in range(3):
         box = np.repeat(box, _CUT, axis=axis)
-    # Closed cells all around, for the coefficients and second differences next to the tube.
     spacing = grid.spacing / _CUT
-    origin = grid.points(low[None].astype(float))[0] - 2.0 * spacing * grid.axes.sum(axis=0)
-    return (_Grid(origin, grid.axes, spacing, np.pad(box, 2)),
-            _CUT * (cell - low) + _CUT // 2 + 2)
+    origin = grid.points(low[None].astype(float))[0] - _PAD * spacing * grid.axes.sum(axis=0)
+    return (_Grid(origin, grid.axes, spacing, np.pad(box, _PAD)),
+            _CUT * (cell - low) + _CUT // 2 + _PAD)
 
 
 def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:

@@ -12,15 +12,18 @@ coefficient a cell. In a cell
   point grad u is a mean of the 27 Bernstein coefficients with the basis as weights, so |grad u| is
   at most the same mean of their magnitudes;
 - c is at least the trilinear interpolation of its values at the corners, less
-  ``h^2 / 8 sum_i max |d^2 c / dx_i^2|``; and the Bernstein coefficients of that interpolation are
-  its values at the 27 points.
+  ``sum_i M_i x_i (h - x_i) / 2`` with ``M_i`` the most that d^2 c / dx_i^2 is there. The Bernstein
+  coefficients of the one are its values at the 27 points, those of the other ``M_i h^2 / 4`` where
+  the point lies half-way along axis i, else 0.
 
-So |g_m| <= c(x_m) - allowance at the 27 points of every open cell is enough. (With the squares of
-both the allowance would count the slope of c as well: four times as much about a narrow valley.)
-The second derivatives are the one thing that is not proven: they are taken as at most
-``CURVATURE_FACTOR`` times the largest second difference of c at the cell's corners. Where c has a
-kink inside a cell (the energy is cut off at zero), or the allowance would eat up c, the least c
-there is anywhere counts instead: the cost of length alone.
+So |g_m| at most the difference of the two at the 27 points of an open cell is enough; or at most
+the first less all that the second ever is, ``sum_i M_i h^2 / 8``; or at most the least that c is
+anywhere, the cost of length alone. (With the squares of both the slope of c would count as well:
+four times as much about a narrow valley.) The second derivatives are the one thing that is not
+proven: they are taken as at most the largest second difference of c at the cell's corners and the
+next ones along the axis, and as much more as these differ; or as ``CURVATURE_FACTOR`` times the
+largest size of those at its corners, if that is less; never as less than 0. Where c has a kink
+inside a cell (the energy is cut off at zero) the cost of length counts.
 """
 
 from typing import NamedTuple
@@ -34,6 +37,9 @@ from limber.planning.bound.marching import march
 CURVATURE_FACTOR = 2.0
 """What second differences at a cell's corners are multiplied by to bound derivatives inside."""
 
+RIM = 2
+"""Closed cells about the open ones that have coefficients as well."""
+
 _ROUNDS = 8  # of local reweighting; stops before when nothing is over by more than _CLOSE
 _CLOSE = 1.0005
 _NEAR = np.ones((3, 3, 3))
@@ -46,22 +52,26 @@ class Terrain(NamedTuple):
         spacing: Edge of a cell [m].
         open_cells: Cells that a path may enter, bool [nx, ny, nz]; none at the grid's border.
         rate: c at the corners [1/m], shape [nx + 1, ny + 1, nz + 1].
-        allowance: What is subtracted from it in each cell, shape of ``open_cells``.
-        level: Cells where the floor counts instead, shape of ``open_cells``.
+        bends: What is subtracted from it half-way along each axis, [3, *shape of open_cells].
+        level: Cells where the floor alone counts, shape of ``open_cells``.
         floor: What c never falls below [1/m].
     """
 
     spacing: float
     open_cells: np.ndarray
     rate: np.ndarray
-    allowance: np.ndarray
+    bends: np.ndarray
     level: np.ndarray
     floor: float
 
     @property
     def active(self) -> np.ndarray:
-        """Cells whose coefficients open cells need: they and all around them."""
-        return binary_dilation(self.open_cells, _NEAR)
+        """Cells that have coefficients: open cells and those about them, ``RIM`` deep.
+
+        Open cells need those of their neighbours. The others let a cost arrive along a slanting
+        border as if there were none: about each of its steps it would bend, and be too steep.
+        """
+        return binary_dilation(self.open_cells, _NEAR, iterations=RIM)
 
 
 def terrain(rate: np.ndarray, positive: np.ndarray, open_cells: np.ndarray, spacing: float,
@@ -71,12 +81,50 @@ def terrain(rate: np.ndarray, positive: np.ndarray, open_cells: np.ndarray, spac
     ``positive`` says at which corners the energy is not cut off; corners that were not evaluated
     hold nan in ``rate`` and are no neighbours of an open cell's.
     """
-    allowance = np.nan_to_num(curvature_allowance(rate))
+    bends = _bends(rate, open_cells)
     above = corner_values(positive.astype(float))
     level = (above.min(axis=0) < 0.5) & (above.max(axis=0) > 0.5)
-    least = np.nan_to_num(corner_values(rate).min(axis=0))
-    level |= least - allowance < floor
-    return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), allowance, level, floor)
+    return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
+
+
+@compiled
+def _bends(values, cells):
+    """Return ``M_i h^2 / 4`` of the module's text in ``cells``, shape [3, *shape of cells].
+
+    ``values`` at the corners; a second difference with one that is not known (nan) counts as 0.
+    """
+    out = np.zeros((3,) + cells.shape)
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    at, step = np.empty(3, np.int64), np.empty(3, np.int64)
+    for i in range(cells.shape[0]):
+        for j in range(cells.shape[1]):
+            for k in range(cells.shape[2]):
+                if not cells[i, j, k]:
+                    continue
+                for axis in range(3):
+                    first[0], first[1], first[2] = i, j, k
+                    last[:] = first + 1
+                    step[:] = 0
+                    step[axis] = 1
+                    most, least, size = -np.inf, np.inf, 0.0
+                    first[axis] = max(first[axis] - 1, 1)
+                    last[axis] = min(last[axis] + 1, values.shape[axis] - 2)
+                    for p in range(first[0], last[0] + 1):
+                        for q in range(first[1], last[1] + 1):
+                            for r in range(first[2], last[2] + 1):
+                                at[0], at[1], at[2] = p, q, r
+                                second = (values[p - step[0], q - step[1], r - step[2]]
+                                          - 2.0 * values[p, q, r]
+                                          + values[p + step[0], q + step[1], r + step[2]])
+                                if np.isnan(second):
+                                    second = 0.0
+                                most, least = max(most, second), min(least, second)
+                                place = i if axis == 0 else (j if axis == 1 else k)
+                                if place <= at[axis] <= place + 1:
+                                    size = max(size, abs(second))
+                    bend = min(2.0 * most - least, CURVATURE_FACTOR * size)
+                    out[axis, i, j, k] = 0.25 * max(bend, 0.0)
+    return out
 
 
 def curvature_allowance(values: np.ndarray) -> np.ndarray:
@@ -205,7 +253,7 @@ def _bernstein(source, out, axis, slope):
 
 
 @compiled
-def _excess(u, spacing, open_cells, rate, allowance, level, floor, asked):
+def _excess(u, spacing, open_cells, rate, bends, level, floor, asked):
     """Return for each asked cell the largest |grad u| over what is allowed there, else 0."""
     over = np.zeros(u.shape)
     block, one, two = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
@@ -224,16 +272,31 @@ def _excess(u, spacing, open_cells, rate, allowance, level, floor, asked):
                     _bernstein(one, two, 1, component == 1)
                     _bernstein(two, one, 2, component == 2)
                     size += one * one
-                worst = 0.0
+                worst, uneven, even = 0.0, 0.0, 0.0
+                whole = 0.5 * bends[:, i, j, k].sum()
                 for p in range(3):
                     for q in range(3):
                         for r in range(3):
-                            allowed = floor
-                            if not level[i, j, k]:
-                                allowed = _between(rate, i, j, k, p, q, r) - allowance[i, j, k]
-                            worst = max(worst, np.sqrt(size[p, q, r]) / (spacing * allowed))
-                over[i, j, k] = worst
+                            steep = np.sqrt(size[p, q, r]) / spacing
+                            worst = max(worst, steep / floor)
+                            if level[i, j, k]:
+                                continue
+                            allowed = _between(rate, i, j, k, p, q, r)
+                            even = max(even, _over(steep, allowed - whole))
+                            if p == 1:
+                                allowed -= bends[0, i, j, k]
+                            if q == 1:
+                                allowed -= bends[1, i, j, k]
+                            if r == 1:
+                                allowed -= bends[2, i, j, k]
+                            uneven = max(uneven, _over(steep, allowed))
+                over[i, j, k] = worst if level[i, j, k] else min(worst, even, uneven)
     return over
+
+
+@compiled
+def _over(steep, allowed):
+    return steep / allowed if allowed > 0.0 else np.inf
 
 
 @compiled

@@ -109,15 +109,43 @@ class Chart:
         """
         if self.radius == 0.0:
             return np.ones(len(points))
+        least, angle = self._within(points, reach)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            most = self.radius / least * np.where(angle > 1e-6, angle / np.sin(angle), 1.0)
+        return np.where(np.isnan(angle), np.inf, np.maximum(most, 1.0))
+
+    def bend(self, points: np.ndarray, reach: float) -> np.ndarray:
+        """Return the most that the second derivative of plain coordinates along a line is within
+        ``reach`` [m], [1/m], shape [n]; infinite as :meth:`growth`.
+
+        Of ``R t e`` along a straight line with the parts ``a, b, c`` outward, along the meridian
+        and the parallel (``a^2 + b^2 + c^2 = 1``) it is ``R / r^2`` times
+
+            along e:   -2 a b - (t - sin t cos t) / sin^2 t  c^2
+            across e:   2 b c (1 - t cot t) / sin t - 2 a c t / sin t,
+
+        whose factors grow with ``t``; of ``r`` it is ``(b^2 + c^2) / r``. Each product of two parts
+        is at most a half.
+        """
+        if self.radius == 0.0:
+            return np.zeros(len(points))
+        least, angle = self._within(points, reach)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.maximum(angle, 1e-4)
+            along = 1.0 + (t - np.sin(t) * np.cos(t)) / np.sin(t)**2
+            across = (1.0 - t / np.tan(t)) / np.sin(t) + t / np.sin(t)
+            most = np.hypot(self.radius / least**2 * np.hypot(along, across), 1.0 / least)
+        return np.where(np.isnan(angle), np.inf, most)
+
+    def _within(self, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least distance from the pivot [m] and the largest angle from the outward axis
+        [rad] within ``reach`` [m]; no angle (NaN) where the pivot or the point opposite is near."""
         local = (points - self.pivot) @ self.axes.T
         least = np.linalg.norm(local, axis=1) - reach
-        angle = np.arctan2(np.linalg.norm(local[:, :2], axis=1), local[:, 2])
         safe = np.maximum(least, 1e-9)
+        angle = np.arctan2(np.linalg.norm(local[:, :2], axis=1), local[:, 2])
         angle = np.minimum(angle + np.arcsin(np.minimum(reach / (safe + reach), 1.0)), np.pi)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            most = self.radius / safe * np.where(angle > 1e-6, angle / np.sin(angle), 1.0)
-        near = (least <= 0.0) | (angle > 0.95 * np.pi)
-        return np.where(near, np.inf, np.maximum(most, 1.0))
+        return safe, np.where((least <= 0.0) | (angle > 0.95 * np.pi), np.nan, angle)
 
 
 @compiled

@@ -76,18 +76,27 @@ class TrustRegion:
 
         In flattened coordinates, negative inside.
         """
-        return _heights(self.chart.map(points), self.planes)
+        return _heights(self.chart.map(points), self.planes)[0]
 
-    def least_height(self, points: np.ndarray, reach: float) -> np.ndarray:
-        """Return what the height is at least anywhere within ``reach`` [m] of ``points``, [n]."""
-        return self.height(points) - reach * self.chart.growth(points, reach)
+    def surely_outside(self, centres: np.ndarray, halves: np.ndarray) -> np.ndarray:
+        """Return which boxes about ``centres`` [n, 3] hold no trusted point, bool [n].
+
+        ``halves`` [3, 3] are their half edges as rows. A box is outside if it lies above the plane
+        that is highest at its centre, to second order in its size; or if all of it is nearer to one
+        refused pose than to any accepted one (the sides between are flat: nothing is left out).
+        """
+        reach = float(np.linalg.norm(halves))
+        heights, slopes = self.height_and_slope(centres)
+        least = heights - np.abs(slopes @ halves.T).sum(axis=1)
+        outside = least - 0.5 * reach**2 * self.chart.bend(centres, reach) > _EDGE
+        if len(self.rejected):
+            outside |= _surely_refused(centres, halves, self.accepted, self.rejected)
+        return outside
 
     def height_and_slope(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return heights [m], shape [n], and their gradients to the point, [n, 3]."""
-        heights = self.chart.map(points) @ self.planes[:, :3].T + self.planes[:, 3]
-        top = heights.argmax(axis=1)
-        return (heights[np.arange(len(points)), top],
-                self.chart.pull_back(points, self.planes[top, :3]))
+        heights, top = _heights(self.chart.map(_rows(points)), self.planes)
+        return heights, self.chart.pull_back(points, self.planes[top, :3])
 
     def is_face(self) -> np.ndarray:
         """Return which accepted samples lie on the hull's face, bool [m]."""
@@ -115,7 +124,7 @@ def _outline(flat: np.ndarray, planes: np.ndarray, chart: Chart) -> np.ndarray:
     ticks = [np.linspace(a, b, _OUTLINE) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     half = 0.5 * float(np.linalg.norm((high - low) / (_OUTLINE - 1)))
-    near = grid[_heights(grid, planes) <= half]
+    near = grid[_heights(grid, planes)[0] <= half]
     # Bent back, a length grows by r / R at most.
     reach = half * max(1.0, 1.0 + (high[2] + half) / chart.radius)
     sides = reach * np.concatenate([np.eye(3), -np.eye(3)]) * np.sqrt(3.0)
@@ -146,26 +155,61 @@ def trusted_at(point, region):
 
 @compiled
 def _nearest(point, others):
-    best = np.inf
+    return np.sum((point - others[_nearest_number(point, others)]) ** 2)
+
+
+@compiled
+def _surely_refused(centres, halves, accepted, rejected):
+    """Return which boxes are nearer to one refused pose than to any accepted one."""
+    found = np.zeros(len(centres), np.bool_)
+    for n in range(len(centres)):
+        refused = _nearest_number(centres[n], rejected)
+        whole = True
+        for i in range(len(accepted)):
+            # |x - a|^2 - |x - r|^2 is linear in x: least at a corner.
+            ahead = 0.0
+            for axis in range(3):
+                along = 0.0
+                for k in range(3):
+                    apart = 2.0 * (rejected[refused, k] - accepted[i, k])
+                    along += apart * halves[axis, k]
+                ahead -= np.abs(along)
+                middle = 0.5 * (rejected[refused, axis] + accepted[i, axis])
+                ahead += 2.0 * (rejected[refused, axis] - accepted[i, axis]) * (
+                    centres[n, axis] - middle)
+            if ahead <= 0.0:
+                whole = False
+                break
+        found[n] = whole
+    return found
+
+
+@compiled
+def _nearest_number(point, others):
+    best, number = np.inf, 0
     for i in range(len(others)):
         squared = 0.0
         for k in range(len(point)):
             squared += (point[k] - others[i, k]) ** 2
-        best = min(best, squared)
-    return best
+        if squared < best:
+            best, number = squared, i
+    return number
 
 
 @compiled
 def _heights(points, planes):
+    """Return how far ``points`` are above the plane that is highest there, and which that is."""
     dimension = points.shape[1]
     out = np.full(len(points), -np.inf)
+    top = np.zeros(len(points), np.int64)
     for n in range(len(points)):
         for i in range(len(planes)):
             height = planes[i, dimension]
             for k in range(dimension):
                 height += planes[i, k] * points[n, k]
-            out[n] = max(out[n], height)
-    return out
+            if height > out[n]:
+                out[n], top[n] = height, i
+    return out, top
 
 
 @compiled
