@@ -42,6 +42,7 @@ _STOP_DECELERATION = 8.0  # rad/s^2 of the joints
 _START_TOLERANCE = 0.005  # m
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
+_LONG_STEP_SECONDS = 0.004
 _NOTHING = np.full(6, np.nan)
 _UPPER = np.triu_indices(3)
 
@@ -298,11 +299,7 @@ class Driver:
             self._sensor.connections = ()
             self._judge(self.guard.event(str(error)))
             return
-        decision = self.guard.feel(self._chain.between(sample, reading))
-        if decision.verdict == Verdict.STOP and self._following is not None:
-            # ur-rtde hands a command over with the controller's next step, 8 ms of a CB3's.
-            self._stop_by_dashboard(f"it does not wait for a step: {decision.reason}")
-        self._judge(decision)
+        self._judge(self.guard.feel(self._chain.between(sample, reading)), is_between=True)
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
                   pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -317,9 +314,14 @@ class Driver:
         turn = self._base[:3, :3]
         return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
 
-    def _judge(self, decision: Decision, sample: Sample | None = None) -> None:
+    def _judge(self, decision: Decision, sample: Sample | None = None, *,
+               is_between: bool = False) -> None:
         if decision.verdict == Verdict.STOP and self._stopped_at is None:
             if self._following is not None:
+                # ur-rtde hands a command over with the controller's next step, 8 ms of a CB3's.
+                is_slow = sample is not None and 1.0 / self._stream.rate > _LONG_STEP_SECONDS
+                if is_between or is_slow:
+                    self._stop_by_dashboard(f"it does not wait for a step: {decision.reason}")
                 self._stop(decision, sample)
             else:
                 self._stopped_at = time.monotonic()
