@@ -105,6 +105,24 @@ def test_pause_at_the_soft_limit_then_resume(moving_robot):
         assert link.resume()["event"] == "reached"
 
 
+def test_a_cb3_is_stopped_without_waiting_for_its_step(worker_address):
+    """By the dashboard, whatever the force came with; then it goes back the way it came."""
+    with new_robot(worker_address, "ur5", 3) as robot, RobotLink(
+            cell_for(worker_address, "ur5")) as link:
+        begin = np.array(robot.state["pose"])
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(robot, (0.0, 0.2, 0.0)))
+        time.sleep(0.8)
+        robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
+        assert "force" in link.wait("stopped", seconds=5)["reason"]
+        assert any("wait for a step" in each for each in link.warnings)
+        robot.ask("added_wrench", wrench=[0] * 6)
+        time.sleep(0.3)
+        assert link.retreat()["event"] == "reached"
+        assert np.allclose(robot.state["pose"][:3], begin[:3], atol=1e-4)
+
+
 def test_after_a_stop_only_a_choice_moves_it(moving_robot):
     with RobotLink(cell_for(moving_robot.address)) as link:
         line = straight(moving_robot, (0.0, 0.1, 0.0))

@@ -147,6 +147,9 @@ class Server:
             except (ConnectionError, asyncio.IncompleteReadError):
                 # The client is gone; that is its right.
                 self.controller.say("a connection was closed")
+            except asyncio.CancelledError:
+                # The robot ends. Passed on, asyncio's streams would print it as a fault of ours.
+                return
             finally:
                 self._writers.discard(writer)
                 writer.transport.abort()
