@@ -19,6 +19,7 @@ from limber.robot.virtual.server import SCRIPT_PORT
 
 STILL_M_S = 1e-4
 _BEFORE_FAULT_SECONDS = 0.8
+_START_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
         time.sleep(_BEFORE_FAULT_SECONDS)
         before, waited = robot.state, time.monotonic()
         # A machine with much else to do begins the motion later.
-        while abs(before["tool_speed"][1]) < 0.02 and time.monotonic() - waited < 1.5:
+        while abs(before["tool_speed"][1]) < 0.02 and time.monotonic() - waited < _START_SECONDS:
             time.sleep(0.05)
             before = robot.state
         assert abs(before["tool_speed"][1]) > 0.02, "it did not move before the fault"
