@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scan_cases import one_sided_case
-from benchmarks.scan_scores import main_axis_error, seen_part
+from benchmarks.scan_scores import fork_matches, main_axis_error, seen_part
 from limber.geometry.skeleton.bridges import filled, free_ends, hypotheses
 from limber.geometry.skeleton.contraction.pieces import join_pieces
 from limber.geometry.skeleton.skeletonise import skeletonise
@@ -109,6 +109,39 @@ def test_a_tip_beyond_a_gap_is_reached_straight_on() -> None:
     assert _joined(nodes, edges, thickness, 0.012, 0.15).label.max() == 0
     aside = nodes + np.outer(np.arange(13) == 12, [0.08, 0, -0.03])
     assert _joined(aside, edges, thickness, 0.012, 0.15).label.max() == 1
+
+
+def _stem_with_a_knob():
+    """A stem, a knob on its side that points past a twig's foot, and that twig."""
+    stem, knob = _line([0, 0, 0], [0, 0, 0.6], 61), _line([0.004, 0, 0.2], [0.008, 0, 0.21], 2)
+    twig = _line([0.045, 0, 0.31], [0.185, 0, 0.45], 15)
+    nodes, edges = _forest(stem, knob, twig)
+    return nodes, np.vstack([edges, [[20, 61]]]), np.repeat([0.008, 0.006, 0.001], [61, 2, 15])
+
+
+def test_what_hangs_beside_a_longer_axis_has_neither_its_thickness_nor_its_direction() -> None:
+    """A knob of two nodes tells no direction; the stem's ends, and a leader past a twig, do."""
+    nodes, edges, thickness = _stem_with_a_knob()
+    ends = free_ends(nodes, edges, thickness)
+    knob = ends.node == 62
+    assert not ends.direction[knob].any() and ends.radius[knob][0] == pytest.approx(0.006)
+    assert ends.radius[ends.node == 60][0] == pytest.approx(0.008)
+    assert ends.direction[ends.node == 60][0] == pytest.approx([0, 0, 1])
+    # A twig that leaves just under the end of a stem does not make that a knob.
+    edges[-1] = [58, 61]
+    nodes[61:63] = nodes[58] + [[0.01, 0, 0.01], [0.1, 0, 0.1]]
+    ends = free_ends(nodes, edges, thickness)
+    assert ends.direction[ends.node == 60][0] == pytest.approx([0, 0, 1], abs=0.05)
+
+
+def test_a_knob_of_the_stem_is_no_foot_of_a_twig() -> None:
+    """Seen from one side: a twig had been led to a knob at the next fork, since the stem is thick,
+    and not to where its own line meets the stem, at half the price: two forks were false."""
+    case = one_sided_case(1409822584023)
+    truth = seen_part(case.truth, case.points)
+    found = skeletonise(case.points).skeleton
+    hits, right = fork_matches(truth, found)
+    assert hits == len(truth.forks()) and right.all()
 
 
 def test_a_bridge_bends_as_its_ends_do() -> None:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 _CHAIN = 6.0  # radii of an end that tell its direction
 _CHAIN_NODES = 4  # and so many nodes at least
 _UNSURE = 2  # nodes of a piece that tell none
+_BEYOND, _LONG = 3, 0.9  # nodes past a fork that tell how its axis comes; of a length as long
 _TURN = np.deg2rad(35.0)  # a turn that doubles the price
 _SIDE = 0.25  # what a fork costs against going on
 _STAND = np.deg2rad(45.0), np.deg2rad(60.0)  # angle that twigs stand at, and what doubles the price
@@ -53,6 +54,7 @@ class Hypotheses:
         turn: Angle between the end's direction and the bridge [rad], pi where it has none,
             shape [h].
         meets: 1 where the other node is an end that comes towards this one, else 0, shape [h].
+        thick: How thick the end that reaches out is [m]; of a blind one the thinner, shape [h].
     """
 
     one: np.ndarray
@@ -61,6 +63,7 @@ class Hypotheses:
     price: np.ndarray
     turn: np.ndarray
     meets: np.ndarray
+    thick: np.ndarray
 
 
 def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
@@ -89,6 +92,8 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
         # Points are missing beside an end too, where it looks thinner than it is.
         chain = _straight_chain(nodes, near, end, _CHAIN * thickness[end])
         chain = _straight_chain(nodes, near, end, _CHAIN * float(thickness[chain].max()))
+        # What hangs beside a longer axis has neither its thickness nor its direction.
+        chain = chain[:_beside(nodes, near, thickness, chain)]
         radius[place] = float(np.median(thickness[chain]))
         if len(chain) > _UNSURE:
             direction[place] = _direction(nodes[chain])
@@ -130,8 +135,9 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
     thick[ends.node] = ends.radius
     thick = np.where(columns[4] == np.pi, np.minimum(thick[columns[0]], thick[columns[1]]),
                      thick[columns[0]])
-    order = np.argsort(columns[3] / np.maximum(thick, 1e-12), kind="stable")
-    return Hypotheses(*(column[order] for column in columns))
+    thick = np.maximum(thick, 1e-12)
+    order = np.argsort(columns[3] / thick, kind="stable")
+    return Hypotheses(*(column[order] for column in (*columns, thick)))
 
 
 def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other: int,
@@ -164,9 +170,13 @@ def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other
     return curve, thick
 
 
-def _straight_chain(nodes: np.ndarray, near: list[list[int]], end: int, reach: float) -> list[int]:
-    """Nodes inwards from an end, straight on at forks, as far as ``reach`` [m]."""
-    chain, before, length = [end], -1, 0.0
+def _straight_chain(nodes: np.ndarray, near: list[list[int]], end: int, reach: float,
+                    before: int = -1) -> list[int]:
+    """Nodes inwards from an end, straight on at forks, as far as ``reach`` [m].
+
+    With ``before`` the chain starts at a node within a piece and goes away from that neighbour.
+    """
+    chain, length = [end], 0.0
     while length < reach or len(chain) < _CHAIN_NODES:
         ahead = [node for node in near[chain[-1]] if node != before]
         if not ahead:
@@ -180,6 +190,35 @@ def _straight_chain(nodes: np.ndarray, near: list[list[int]], end: int, reach: f
         length += float(np.linalg.norm(nodes[ahead[0]] - nodes[before]))
         chain.append(ahead[0])
     return chain
+
+
+def _beside(nodes: np.ndarray, near: list[list[int]], thickness: np.ndarray, chain: list[int],
+            ) -> int:
+    """How many of an end's nodes belong to a stub beside a longer axis; all if it is none.
+
+    At a fork that the chain passes, that axis goes on along another arm, which is longer than the
+    stub and turns less.
+    """
+    length = 0.0
+    for place in range(1, len(chain) - 1):
+        fork, ahead = chain[place], chain[place + 1]
+        stub = nodes[chain[0]] - nodes[fork]
+        length += float(np.linalg.norm(nodes[fork] - nodes[chain[place - 1]]))
+        inwards = nodes[chain[min(place + _BEYOND, len(chain) - 1)]] - nodes[fork]
+        for other in near[fork]:
+            if other in (chain[place - 1], ahead):
+                continue
+            reach = max(length, _CHAIN * float(thickness[fork]))
+            arm = _straight_chain(nodes, near, other, reach, before=fork)
+            goes_on = nodes[arm[-1]] - nodes[fork]
+            if float(np.linalg.norm(goes_on)) > _LONG * reach and (
+                    _cosine(inwards, goes_on) < _cosine(inwards, stub)):
+                return place
+    return len(chain)
+
+
+def _cosine(one: np.ndarray, other: np.ndarray) -> float:
+    return float(one @ other) / max(float(np.linalg.norm(one) * np.linalg.norm(other)), 1e-300)
 
 
 def _direction(chain: np.ndarray) -> np.ndarray:

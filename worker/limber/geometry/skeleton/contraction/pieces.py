@@ -107,30 +107,41 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
 
 def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, limit: float,
             up: np.ndarray, join_plants: bool, alone: bool) -> list[int]:
-    """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first."""
+    """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
+
+    Stems are joined before twigs; where two pieces belong together, a price counts more than how
+    thick the end is that names it: a knob of the stem that points past a twig is no foot of it.
+    """
+    pairs = np.sort(state.label[np.stack([found.one, found.other])], axis=0)
+    own_price = found.price / np.sqrt(found.thick)
     best: dict[int, int] = {}
     first: list[tuple[int, int, int]] = []
     single = np.bincount(state.label) <= _SINGLE
+
+    def able(place: int, a: int, b: int) -> bool:
+        odd = found.price[place] > _STRAIGHT_ON * found.length[place]
+        return not (alone and odd and (single[a] or single[b])) and _allowed(
+            found, place, state, weight, gap, limit, up, join_plants)
+
     for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
         a, b = int(state.label[one]), int(state.label[other])
-        if a in best and b in best:
-            continue
-        if alone and (single[a] or single[b]) and (
-                found.price[place] > _STRAIGHT_ON * found.length[place]):
-            continue
-        if not _allowed(state, weight, (int(one), int(other)), float(found.length[place]),
-                        float(found.price[place]), gap, limit, up, join_plants):
+        if (a in best and b in best) or not able(place, a, b):
             continue
         if a not in best and b not in best:
+            same = np.flatnonzero((pairs[0] == min(a, b)) & (pairs[1] == max(a, b)))
+            place = next(other for other in same[np.argsort(own_price[same], kind="stable")]
+                         if able(other, a, b))
             first.append((place, a, b))
         best.setdefault(a, place)
         best.setdefault(b, place)
     return [place for place, a, b in first if best[a] == best[b] == place]
 
 
-def _allowed(state: Joined, weight: np.ndarray, pair: tuple[int, int], length: float, price: float,
+def _allowed(found: Hypotheses, place: int, state: Joined, weight: np.ndarray,
              gap: float, limit: float, up: np.ndarray, join_plants: bool) -> bool:
     """Whether the smaller piece is large enough for the bridge, and no plant of its own."""
+    pair = int(found.one[place]), int(found.other[place])
+    length, price = float(found.length[place]), float(found.price[place])
     a, b = state.label[list(pair)]
     small, end = (a, pair[0]) if weight[a] <= weight[b] else (b, pair[1])
     own = state.label == small
