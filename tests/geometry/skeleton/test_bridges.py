@@ -111,6 +111,18 @@ def test_a_tip_beyond_a_gap_is_reached_straight_on() -> None:
     assert _joined(aside, edges, thickness, 0.012, 0.15).label.max() == 1
 
 
+def test_a_few_points_at_a_tip_are_reached_by_an_end_as_long_as_the_gap() -> None:
+    """Of a patch of skin contraction tells no thickness, and a stray one lies on no end's line."""
+    stem, tip = _line([0, 0, 0], [0, 0, 0.5]), np.array([[0.0, 0.0, 0.62]])
+    nodes, edges = np.vstack([stem, tip]), np.stack([np.arange(11), np.arange(1, 12)], axis=1)
+    thickness = np.repeat([0.008, 0.0005], [12, 1])
+    assert _joined(nodes, edges, thickness, 0.001, 0.15).label.max() == 0
+    aside = nodes + np.outer(np.arange(13) == 12, [0.04, 0, 0])
+    assert _joined(aside, edges, thickness, 0.001, 0.15).label.max() == 1
+    short = nodes[9:]
+    assert _joined(short - short[0], edges[:2], thickness[9:], 0.001, 0.15).label.max() == 1
+
+
 def _stem_with_a_knob():
     """A stem, a knob on its side that points past a twig's foot, and that twig."""
     stem, knob = _line([0, 0, 0], [0, 0, 0.6], 61), _line([0.004, 0, 0.2], [0.008, 0, 0.21], 2)

@@ -116,6 +116,7 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
     end_of = np.full(len(nodes), -1)
     end_of[ends.node] = np.arange(len(ends.node))
     axis = _axes(nodes, edges)
+    single = np.bincount(label)[label] <= _UNSURE
     largest = int(np.argmax(weight))
     rest = np.flatnonzero(label != largest)
     trees = {True: (cKDTree(nodes[rest]), rest), False: (cKDTree(nodes), np.arange(len(nodes)))}
@@ -128,7 +129,8 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
         others = index[tree.query_ball_point(nodes[end], _FARTHER * limit)]
         others = others[label[others] != label[end]]
         if len(others):
-            parts.append(_priced(nodes, thickness, axis, ends, end_of, place, others, limit))
+            parts.append(_priced(
+                nodes, thickness, axis, single, ends, end_of, place, others, limit))
     parts.append(_blind(nodes, label, largest, limit))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     thick = thickness.copy()
@@ -246,8 +248,8 @@ def _turned(direction: np.ndarray, way: np.ndarray, radius: float) -> np.ndarray
     return np.arctan2(np.maximum(aside - radius, 0.0), along)
 
 
-def _priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, ends: Ends,
-            end_of: np.ndarray, place: int, others: np.ndarray, limit: float,
+def _priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: np.ndarray,
+            ends: Ends, end_of: np.ndarray, place: int, others: np.ndarray, limit: float,
             ) -> tuple[np.ndarray, ...]:
     """What it costs to join one end to each of ``others``: columns of :class:`Hypotheses`."""
     own, direction, radius = ends.node[place], ends.direction[place], ends.radius[place]
@@ -256,7 +258,8 @@ def _priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, ends: En
     turn = _turned(direction, way, radius)
     stand = np.arccos(np.clip(np.abs(np.einsum("kj,kj->k", way, axis[others])) / length, 0, 1))
     stand = np.where(axis[others].any(axis=1), stand, _STAND[0])
-    thicker = np.log(radius / np.maximum(thickness[others], 1e-12))
+    # Of a single patch of skin the contraction tells no thickness.
+    thicker = np.where(single[others], 0.0, np.log(radius / np.maximum(thickness[others], 1e-12)))
     side = _SIDE + ((stand - _STAND[0]) / _STAND[1])**2 + _RATIO * np.maximum(thicker, 0)
     other_end = end_of[others]
     comes = np.full(len(others), np.inf)

@@ -13,6 +13,9 @@ from limber.geometry.skeleton.skeleton import Skeleton
 _SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any size
 # The longest bridge beyond, in what the smaller piece reaches; and where it goes straight on.
 _REACH, _REACH_STRAIGHT, _STRAIGHT_ON = 5.0, 10.0, 1.5
+# A turn up to which an end points at what it reaches, and within which its piece is straight behind
+# it: an end that is so long reaches as far.
+_AHEAD, _BEHIND = np.deg2rad(10.0), np.deg2rad(15.0)
 # Length in thicknesses, under which a piece tells no direction; and if it has few points.
 _SPECK, _SPECK_FEW, _FEW = 5.0, 10.0, 30
 _SINGLE = 2  # nodes of a piece that tells no direction
@@ -91,7 +94,7 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
         ends = state.ends()
         found = hypotheses(state.nodes, state.edges, state.thickness, state.label, weight,
                            bridge_limit, ends)
-        chosen = _mutual(found, state, weight, gap, bridge_limit, up, join_plants, alone)
+        chosen = _mutual(found, state, ends, weight, gap, bridge_limit, up, join_plants, alone)
         if not chosen and alone:
             alone = False
             continue
@@ -105,8 +108,8 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
     return state
 
 
-def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, limit: float,
-            up: np.ndarray, join_plants: bool, alone: bool) -> list[int]:
+def _mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, gap: float,
+            limit: float, up: np.ndarray, join_plants: bool, alone: bool) -> list[int]:
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
 
     Stems are joined before twigs; where two pieces belong together, a price counts more than how
@@ -121,7 +124,7 @@ def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, li
     def able(place: int, a: int, b: int) -> bool:
         odd = found.price[place] > _STRAIGHT_ON * found.length[place]
         return not (alone and odd and (single[a] or single[b])) and _allowed(
-            found, place, state, weight, gap, limit, up, join_plants)
+            found, place, state, ends, weight, gap, limit, up, join_plants)
 
     for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
         a, b = int(state.label[one]), int(state.label[other])
@@ -137,7 +140,7 @@ def _mutual(found: Hypotheses, state: Joined, weight: np.ndarray, gap: float, li
     return [place for place, a, b in first if best[a] == best[b] == place]
 
 
-def _allowed(found: Hypotheses, place: int, state: Joined, weight: np.ndarray,
+def _allowed(found: Hypotheses, place: int, state: Joined, ends: Ends, weight: np.ndarray,
              gap: float, limit: float, up: np.ndarray, join_plants: bool) -> bool:
     """Whether the smaller piece is large enough for the bridge, and no plant of its own."""
     pair = int(found.one[place]), int(found.other[place])
@@ -149,12 +152,23 @@ def _allowed(found: Hypotheses, place: int, state: Joined, weight: np.ndarray,
                    + np.maximum(state.spread, state.thickness)[own]).max())
     # An end may go far straight on to what is left of its tip; that itself points anywhere.
     straight = price < _STRAIGHT_ON * length and a != small
-    farthest = (_REACH_STRAIGHT if straight else _REACH) * reach
-    if length > max(farthest, _SHORT * limit):
+    farthest = max((_REACH_STRAIGHT if straight else _REACH) * reach, _SHORT * limit)
+    if length > farthest and not (
+            straight and found.turn[place] < _AHEAD
+            and length <= min(_straight_behind(state, ends, pair[0]), limit)):
         return False
     large = min(weight[a], weight[b]) > _PLANT_SHARE * state.support.sum()
     return not (large and length > gap and not join_plants
                 and _are_plants(state.nodes, state.thickness, state.label, pair, up))
+
+
+def _straight_behind(state: Joined, ends: Ends, end: int) -> float:
+    """How far an end's piece lies straight behind it [m]."""
+    direction = ends.direction[int(np.flatnonzero(ends.node == end)[0])]
+    offset = state.nodes[state.label == state.label[end]] - state.nodes[end]
+    behind = -(offset @ direction)
+    aside = np.linalg.norm(offset + behind[:, None] * direction, axis=1)
+    return float(behind[aside <= np.tan(_BEHIND) * behind].max(initial=0.0))
 
 
 def _bridge(state: Joined, ends: Ends, found: Hypotheses, place: int, step: float) -> None:
