@@ -60,7 +60,7 @@ def test_a_fast_pull_gives_young_and_swings_on(truth, bench, drive, tmp_path):
     start = Values(1.3 * np.array(TRUTH), 0.36, 900.0, (0.5, 0.002))
     objective = Objective([forward], ParameterSpace.separate(start), force_sigma=[
         pull.entry.sensor.force_sigma_n])
-    fit = gauss_newton(objective, objective.space.pack(start), evaluation_limit=8, tolerance=1e-3)
+    fit = gauss_newton(objective, objective.space.pack(start), tolerance=1e-3)
     assert np.abs(np.exp(fit.evaluation.free) / TRUTH - 1).max() < 0.1
 
 
