@@ -95,7 +95,9 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
     ninth = float(np.quantile(worst, 0.9, method="lower"))
     refused = len(trials) - len(fitted)
     told = f", {refused} refused" if refused else ""
-    told += f"; by the Cramer-Rao bounds it would be {100 * _efficient_median(fitted):.1f} %"
+    told += (f"; of truths whose field runs as differently as the fit's prior takes it to, no fit "
+             f"comes below {100 * _efficient_median(fitted):.1f} %: the forms drawn here differ "
+             "less, and are no such limit")
     enough = not quick
     return [
         Row(f"{label}: median of the worst E error", f"{100 * asked:.0f} %",
@@ -112,7 +114,10 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
 def _efficient_median(trials: list[Trial]) -> float:
     """Median of the worst E error of estimates as good as the Cramer-Rao bounds allow.
 
-    Drawn from the bounds of the trials, the moduli's errors as independent of each other.
+    Drawn from the bounds of the trials, the moduli's errors as independent of each other. What is
+    known beforehand is in the bounds as in the fit: they hold on the average over truths drawn
+    from the fit's prior. Where the field's form is drawn from less than that, estimates come closer
+    than these bounds, and their intervals hold more often than they say.
     """
     sigma = np.array([each.bound for each in trials]) / 1.96
     sigma = sigma[np.isfinite(sigma).all(axis=1)]
