@@ -95,6 +95,15 @@ def estimate_beam(branch: Path, recording: Path, load: float, name: str) -> Beam
                       float(measured), predicted_drop(branch, name, load))
 
 
+def creep() -> float:
+    """By which part of it the given recording's drop still grows, from the fourth last second to
+    the last: the swing has died out by then."""
+    table = np.loadtxt(RECORDING, delimiter=",", skiprows=1)
+    left, tips = table[-1, 0] - table[:, 0], table[:, 1:10].reshape(-1, 3, 3)
+    moved = np.linalg.norm(tips - tips[0], axis=2).mean(axis=1)
+    return float(moved[left < 1].mean() / moved[(left >= 3) & (left < 4)].mean() - 1)
+
+
 def predicted_drop(branch: Path, name: str, load: float) -> float:
     """Mean drop of the tip markers [m] that the branch folder's estimate foretells for a load."""
     found = predict(branch, PredictSettings(pull=name, weight=load))
