@@ -10,8 +10,8 @@ Starts are taken in turn over all branches, so that also a part of them speaks f
 import json
 import time
 from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,8 @@ from limber.planning.field.sampling import Sampled, sample_field, sample_positio
 from limber.planning.goals import GraspGoal, default_goal
 from limber.planning.settings import EnergySettings
 from limber.progress import Progress
+
+_TIMED_STARTS = 3  # of each branch, where only times are asked
 
 
 @dataclass(frozen=True)
@@ -58,33 +60,65 @@ class _Fielded:
     lost: float
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    """Measure; ``quick`` takes one arc, one forked branch and three starts."""
-    subjects = [*(arcs()[1:2] if quick else arcs()), *forked(seed, 1 if quick else 3, progress)]
-    settings = EnergySettings(seed=seed)
-    fielded, failed = [], []
-    for number, subject in enumerate(subjects):
-        part = progress.part(0.3 * number / len(subjects), 0.3 * (number + 1) / len(subjects))
-        try:
-            fielded.append(_fielded(subject, settings, 15 if quick else 40, out, part))
-        except LimberError as error:
-            failed.append(f"{subject.name}: {error}")
-    kept = None if out is None else out / "planning-trials.jsonl"
-    trials = _trials(fielded, 3 if quick else 10, seed, kept, progress.part(0.3, 0.85))
-    detours = _detours(fielded, 3 if quick else 10, seed,
-                       None if out is None else out / "planning-detours.jsonl",
-                       progress.part(0.85, 1.0))
-    draws = 30 if quick else 100
-    table = [*detour_rows(detours), *_saved_rows(trials), *_bound_rows(trials),
-             *_field_rows(fielded, failed), *_full_rows(trials), *_no_path_rows(fielded),
-             *sure_rows(_sure(fielded, draws, seed, out), draws), *_unmade()]
-    if out is not None:
+def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
+         only: tuple[str, ...] = ()) -> list[Row]:
+    """Measure the parts named in ``only``, or all but what repeats times of others by themselves;
+    ``quick`` takes one arc, one forked branch and three starts."""
+    run = _Run(quick, progress, out, seed)
+    table = [row for name in only or WHOLE for row in PARTS[name](run)]
+    if out is not None and "trials" in (only or WHOLE):
         raw = {one.subject.name: {
             "field_seconds": one.seconds, "errors": one.known.errors, "goal": one.goal.describe(),
-            "fresh": asdict(one.fresh), "trials": [asdict(t) for t in trials[one.subject.name]],
-        } for one in fielded}
+            "fresh": asdict(one.fresh), "trials": [asdict(t) for t in run.trials[one.subject.name]],
+        } for one in run.fielded}
         (out / "planning.json").write_text(json.dumps(plain(raw), indent=1))
     return table
+
+
+@dataclass
+class _Run:
+    """What the parts of the table share, made when it is asked for."""
+
+    quick: bool
+    progress: Progress
+    out: Path | None
+    seed: int
+    failed: list[str] = field(default_factory=list)
+
+    @property
+    def starts(self) -> int:
+        return 3 if self.quick else 10
+
+    @property
+    def draws(self) -> int:
+        return 30 if self.quick else 100
+
+    @cached_property
+    def forked(self) -> list[Subject]:
+        return forked(self.seed, 1 if self.quick else 3, self.progress)
+
+    @cached_property
+    def fielded(self) -> list[_Fielded]:
+        subjects = [*(arcs()[1:2] if self.quick else arcs()), *self.forked]
+        found = []
+        for number, subject in enumerate(subjects):
+            part = self.progress.part(0.3 * number / len(subjects),
+                                      0.3 * (number + 1) / len(subjects))
+            try:
+                found.append(_fielded(subject, EnergySettings(seed=self.seed),
+                                      15 if self.quick else 40, _own_seed(self.seed, number, 0),
+                                      self.out, part))
+            except LimberError as error:
+                self.failed.append(f"{subject.name}: {error}")
+        return found
+
+    @cached_property
+    def trials(self) -> dict[str, list[Trial]]:
+        return _trials(self.fielded, self.starts, self.seed, self.kept("trials"),
+                       self.progress.part(0.3, 0.85))
+
+    def kept(self, what: str) -> Path | None:
+        return None if self.out is None else self.out / f"planning-{what}.jsonl"
 
 
 def _source() -> str:
@@ -96,8 +130,8 @@ def _field_source() -> str:
                          Path(__file__).parent / "planning_branches.py")
 
 
-def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, out: Path | None,
-             progress: Progress) -> _Fielded:
+def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, fresh_seed: int,
+             out: Path | None, progress: Progress) -> _Fielded:
     """Sample and fit, or read what an earlier run kept of the same branch."""
     kept = None if out is None else (
         out / f"field-{settings.seed}-{subject.name.replace(' ', '-')}-{_field_source()}.npz")
@@ -107,26 +141,33 @@ def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, out: 
             fresh = _Fresh(*file["fresh"])
             seconds, lost = float(file["seconds"]), float(file["lost"])
         return _Fielded(subject, known, default_goal(known, 0.01), seconds, fresh, lost)
-    found = _sampled(subject, settings, fresh_count, progress)
+    found = _sampled(subject, settings, fresh_count, fresh_seed, progress)
     if kept is not None:
         found.known.write(kept, {"seconds": np.array(found.seconds), "lost": np.array(found.lost),
                                  "fresh": np.array(list(asdict(found.fresh).values()))})
     return found
 
 
-def _sampled(subject: Subject, settings: EnergySettings, fresh_count: int, progress: Progress,
-             ) -> _Fielded:
-    model, began = subject.model, time.perf_counter()
-    sampled = sample_field(model, settings, progress=progress.part(0.0, 0.7))
-    known = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius)
-    seconds = time.perf_counter() - began
+def _sampled(subject: Subject, settings: EnergySettings, fresh_count: int, fresh_seed: int,
+             progress: Progress) -> _Fielded:
+    model = subject.model
+    sampled, known, seconds = _timed_field(subject, settings, progress.part(0.0, 0.7))
     targets = sample_positions(model.reach, model.rest_position, 4 * fresh_count, sampled.valley,
-                               deflection=settings.deflection, seed=settings.seed + 1)
+                               deflection=settings.deflection, seed=fresh_seed)
     targets = targets[known.region.height(targets) <= 0.0]
     trusted = known.region.contains(targets)
     return _Fielded(subject, known, default_goal(known, 0.01), seconds,
                     _fresh(model, known, sampled, targets[trusted][:fresh_count],
                            progress.part(0.7, 1.0)), float((~trusted).mean()))
+
+
+def _timed_field(subject: Subject, settings: EnergySettings, progress: Progress,
+                 ) -> tuple[Sampled, EnergyField, float]:
+    """Return samples, field, and the seconds that both took."""
+    began = time.perf_counter()
+    sampled = sample_field(subject.model, settings, progress=progress)
+    known = fit_field(sampled.samples, sampled.valley.pivot, sampled.valley.radius)
+    return sampled, known, time.perf_counter() - began
 
 
 def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, targets: np.ndarray,
@@ -147,7 +188,7 @@ def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, targets: np.
 
 
 def _trials(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
-            progress: Progress) -> dict[str, list[Trial]]:
+            progress: Progress, limited: bool = True) -> dict[str, list[Trial]]:
     found: dict[str, list[Trial]] = {one.subject.name: [] for one in fielded}
     source, wanted = _source(), {}
     for number in range(count):
@@ -157,8 +198,8 @@ def _trials(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
         if trial.source == source and wanted.pop((trial.branch, trial.seed), None):
             found[trial.branch].append(trial)
     with Pool() as pool:
-        futures = [pool.submit(partial(run_trial, branch=name, source=source), one.subject.model,
-                               one.known, one.goal, number, own)
+        futures = [pool.submit(partial(run_trial, branch=name, source=source, limited=limited),
+                               one.subject.model, one.known, one.goal, number, own)
                    for (name, own), (one, number) in wanted.items()]
         for done, future in enumerate(as_completed(futures)):
             trial = future.result()
@@ -231,8 +272,6 @@ def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
     if not good:
         return [Row("certified gap", "2 / 5 %, in 10 s", _troubles(trials), False)]
     gaps = 100.0 * np.array([t.gap for t in good])
-    seconds = np.array([t.seconds for t in good])
-    soon = np.array([t.seconds_to_close for t in good])
     tree = np.array([t.tree_to_optimum for t in good if np.isfinite(t.tree_to_optimum)])
     ratio = np.array([t.to_optimum for t in good if np.isfinite(t.to_optimum)])
     below = np.array([t.bound_to_optimum for t in good if np.isfinite(t.bound_to_optimum)])
@@ -242,11 +281,7 @@ def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
         Row(f"certified gap, median / worst of {len(gaps)}", "2 / 5 %",
             f"{np.median(gaps):.2f} / {gaps.max():.2f} %",
             bool(np.median(gaps) <= 2.0 and gaps.max() <= 5.0)),
-        Row("in: RRT*, D-RRT*, plan and bound, median / worst, two at once", "10 s",
-            f"{np.median(seconds):.1f} / {seconds.max():.1f} s", bool(seconds.max() <= 10.0)),
-        Row("planning after the field to within 2 % of the best: eikonal, median / worst", "1 s",
-            f"{np.nanmedian(soon):.1f} / {np.nanmax(soon):.1f} s, {np.isnan(soon).sum()} never",
-            bool(np.median(soon) <= 1.0)),
+        *_time_rows(trials),
         Row("the same: D-RRT* of 3,000 iterations, over the best, median / worst", "2 %",
             f"{100 * np.median(tree - 1):.1f} / {100 * (tree.max() - 1):.1f} %, "
             f"{(tree <= 1.02).sum()} of {len(tree)} within" if len(tree) else "none",
@@ -256,6 +291,23 @@ def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
             bool(ratio.max() <= 1.01)),
         Row("no path below the bound", "never", f"bound at most {below.max():.4f} of the best",
             bool(below.max() <= 1.0 + 1e-9))]
+
+
+def _time_rows(trials: dict[str, list[Trial]]) -> list[Row]:
+    good = [t for some in trials.values() for t in some if np.isfinite(t.check_seconds)]
+    if not good:
+        return [Row("in: plan, and check", "10 s", _troubles(trials), False)]
+    seconds = np.array([t.seconds for t in good])
+    soon = np.array([t.seconds_to_close for t in good])
+    checks = np.array([t.check_seconds for t in good])
+    return [
+        Row(f"in: RRT*, D-RRT*, plan and bound, median / worst of {len(good)}, two at once", "10 s",
+            f"{np.median(seconds):.1f} / {seconds.max():.1f} s", bool(seconds.max() <= 10.0)),
+        Row("planning after the field to within 2 % of the best: eikonal, median / worst", "1 s",
+            f"{np.nanmedian(soon):.1f} / {np.nanmax(soon):.1f} s, {np.isnan(soon).sum()} never",
+            bool(np.median(soon) <= 1.0)),
+        Row("full-model check of both paths, median / worst, one process, two at once", "10 s",
+            f"{np.median(checks):.1f} / {checks.max():.1f} s", bool(checks.max() <= 10.0))]
 
 
 def _field_rows(fielded: list[_Fielded], failed: list[str]) -> list[Row]:
@@ -284,17 +336,22 @@ def _field_rows(fielded: list[_Fielded], failed: list[str]) -> list[Row]:
         f"{100 * max(one.lost for one in fielded):.0f} %; {missed} of "
         f"{sum(len(one.fresh.tip) for one in fielded)}", None))
     slowest = max(fielded, key=lambda one: one.seconds)
-    samples = len(slowest.known.samples.poses)
-    tets = slowest.subject.model.mesh.tet_count
-    table.append(Row("field, slowest branch, fit included", "300 grasps, 2,500 tets: 35 s",
-                     f"{slowest.seconds:.0f} s ({samples} grasps, {tets} tets)",
-                     bool(slowest.seconds * 300 / samples * 2500 / tets <= 35.0)))
+    table.append(_cost_row("field, slowest branch", slowest.subject, slowest.known,
+                           slowest.seconds))
     heights = [float(one.known.region.height(one.known.rest[None])[0]) for one in fielded]
     table.append(Row("rest pose inside the sampled region: least depth", "inside",
                      f"{-1e3 * max(heights):.2f} mm", bool(max(heights) < 0.0)))
     if failed:
         table.append(Row("branches without a field", "none", "; ".join(failed), False))
     return table
+
+
+def _cost_row(what: str, subject: Subject, known: EnergyField, seconds: float) -> Row:
+    samples, tets = len(known.samples.poses), subject.model.mesh.tet_count
+    scaled = seconds * 300 / samples * 2500 / tets
+    return Row(f"{what}, fit included", "300 grasps, 2,500 tets: 35 s",
+               f"{seconds:.0f} s ({samples} grasps, {tets} tets: {scaled:.0f} s scaled)",
+               scaled <= 35.0)
 
 
 def _full_rows(trials: dict[str, list[Trial]]) -> list[Row]:
@@ -308,9 +365,6 @@ def _full_rows(trials: dict[str, list[Trial]]) -> list[Row]:
     first = [t.first_field_error for t in good] or [np.nan]
     moving = [t.moving_seconds for t in accepted if np.isfinite(t.moving_seconds)] or [np.nan]
     return [
-        Row("full-model check of both paths, slowest, one process, two at once", "10 s",
-            f"{max([t.check_seconds for t in good], default=np.nan):.1f} s",
-            bool(good) and max(t.check_seconds for t in good) <= 10.0),
         Row("the same in time, there and back, with a force that binds: median / worst", "10 s",
             f"{np.median(moving):.1f} / {np.max(moving):.1f} s; "
             f"{sum(t.slowings > 0 for t in accepted)} of {len(accepted)} slowed down, force at "
@@ -339,10 +393,43 @@ def _no_path_rows(fielded: list[_Fielded]) -> list[Row]:
                     f"; {one}" for one in wrong), not wrong and slowest <= 10.0)]
 
 
-def _unmade() -> list[Row]:
-    return [Row("field on the reduced model, 300 grasps", "5 s", "not made", False)]
-
-
 def _troubles(trials: dict[str, list[Trial]]) -> str:
     return "; ".join(f"{name} {t.number}: {t.trouble}" for name, some in trials.items()
                      for t in some if t.trouble)
+
+
+def _trial_rows(run: _Run) -> list[Row]:
+    return [*_saved_rows(run.trials), *_bound_rows(run.trials), *_full_rows(run.trials)]
+
+
+def _detour_table(run: _Run) -> list[Row]:
+    return detour_rows(_detours(run.fielded, run.starts, run.seed, run.kept("detours"),
+                                run.progress.part(0.85, 1.0)))
+
+
+def _field_time(run: _Run) -> list[Row]:
+    """The cost of a field by itself: of the largest forked branch, on an idle machine."""
+    largest = max(run.forked, key=lambda one: one.model.mesh.tet_count)
+    _, known, seconds = _timed_field(largest, EnergySettings(seed=run.seed, samples=300),
+                                     run.progress)
+    return [_cost_row(f"field of {largest.name} alone", largest, known, seconds)]
+
+
+def _plan_time(run: _Run) -> list[Row]:
+    """The times of plans by themselves, of three starts a branch."""
+    return _time_rows(_trials(run.fielded, _TIMED_STARTS, run.seed, None,
+                              run.progress.part(0.3, 1.0), limited=False))
+
+
+WHOLE = {
+    "detours": _detour_table,
+    "trials": _trial_rows,
+    "field": lambda run: _field_rows(run.fielded, run.failed),
+    "no-path": lambda run: _no_path_rows(run.fielded),
+    "sure": lambda run: sure_rows(_sure(run.fielded, run.draws, run.seed, run.out), run.draws),
+    "reduced": lambda _run: [Row("field on the reduced model, 300 grasps", "5 s", "not made",
+                                 False)],
+}
+PARTS = WHOLE | {"field-time": _field_time, "plan-time": _plan_time}
+"""What ``--only`` knows: those, and the times by themselves, for a machine that does nothing else.
+"""

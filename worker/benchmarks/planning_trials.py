@@ -58,14 +58,17 @@ class Trial:
                 setattr(self, name, np.nan)
 
 
-def run_trial(model: GraspModel, known: EnergyField, goal: GraspGoal, number: int, seed: int,
-              **whose: str) -> Trial:
-    """Plan from rest (number 0) or from a random start, without limits and with one that binds."""
+def run_trial(model: GraspModel, known: EnergyField, goal: GraspGoal, number: int, seed: int, *,
+              limited: bool = True, **whose: str) -> Trial:
+    """Plan from rest (number 0) or from a random start, without limits and, where ``limited``, with
+    one that binds."""
     trial, began = Trial(number, seed=seed, **whose), time.perf_counter()
     settings = PlanSettings(seed=seed)
     try:
         start = known.rest.copy() if number == 0 else random_start(known, goal, settings, seed)
-        _measure(trial, model, known, start, goal, settings)
+        learnt, path = _measure(trial, model, known, start, goal, settings)
+        if limited:
+            _with_limit(trial, model, learnt, start, path, settings)
     except LimberError as error:
         trial.trouble = f"{type(error).__name__}: {error}"
     trial.all_seconds = time.perf_counter() - began
@@ -73,7 +76,8 @@ def run_trial(model: GraspModel, known: EnergyField, goal: GraspGoal, number: in
 
 
 def _measure(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndarray,
-             goal: GraspGoal, settings: PlanSettings) -> None:
+             goal: GraspGoal, settings: PlanSettings) -> tuple[EnergyField, np.ndarray]:
+    """Plan without limits; return the field that the plan ended with, and the path [n, 3]."""
     asked = settings.model_copy(update={"start": tuple(map(float, start)), "goal": goal.position,
                                         "goal_tolerance": goal.tolerance})
     motion = plan_motion(known, model, asked, workers=1)
@@ -105,7 +109,7 @@ def _measure(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndar
             trial.saved[name] = 100.0 * (1.0 - gentle["energy_integral_jm"]
                                          / path["energy_integral_jm"])
             trial.added[name] = 100.0 * (gentle["length_m"] / path["length_m"] - 1.0)
-    _with_limit(trial, model, learnt, start, points, settings)
+    return learnt, points
 
 
 def _with_limit(trial: Trial, model: GraspModel, known: EnergyField, start: np.ndarray,
