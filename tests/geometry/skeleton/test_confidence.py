@@ -77,6 +77,20 @@ def test_a_twig_with_more_points_is_surer() -> None:
     assert sure[0] < sure[1] < sure[2] < 1 and sure[2] > 0.95
 
 
+def test_a_forks_probability_is_its_twigs_not_that_of_the_gap_at_its_foot() -> None:
+    """What lies in the gap may be elsewhere; that the twig is there its points tell."""
+    stem, twig = _stem(0.008, 0.004), _twig_points(0.004, 900)
+    nodes = stem.nodes.copy()
+    nodes[41:, 0] = np.linspace(0.02, 0.1, 20)
+    around = _tube(0, 0.4, 0.008, 6000)
+    points = np.vstack([around[(around[:, 0] < 0) | (np.abs(around[:, 2] - 0.2) > 0.01)],
+                        twig[twig[:, 0] > 0.06]])
+    told = assessed(stem.moved(nodes), points, 0.0003)
+    fork, *rest = told.probability[told.branch == 1]
+    assert set(told.radius_state[told.branch == 1][:8]) == {BRIDGED}
+    assert fork >= max(rest) and rest[0] < fork - 0.02 and 0.5 < fork < 1
+
+
 def test_gaps_and_noise_make_places_doubtful() -> None:
     """A node in a gap is less sure the longer the gap, and a thin stem in noise less than a thick.
     """

@@ -182,13 +182,18 @@ def node_evidence(skeleton: Skeleton, gap: np.ndarray, noise: float) -> np.ndarr
 
 
 def _probability(skeleton: Skeleton, twig: np.ndarray, node: np.ndarray) -> np.ndarray:
-    """Probability that each node's run is there, its carriers too, and the node in its place."""
+    """Probability that each node's run is there, its carriers too, and the node in its place.
+
+    A run's first node stands for its fork: that this is there, and where, the run's own evidence
+    was fitted to. Its gap and its noise would count against it a second time.
+    """
     own = _logistic(twig, _TWIG_ODDS)
     own[0] = 1.0
-    runs = skeleton.runs()
+    placed, runs = _logistic(node, _NODE_ODDS), skeleton.runs()
     for run in range(1, skeleton.branch_count):
         own[run] *= own[int(skeleton.branch[runs[run][0]])]
-    return own[skeleton.branch] * _logistic(node, _NODE_ODDS)
+        placed[runs[run][1]] = 1.0
+    return own[skeleton.branch] * placed
 
 
 def _logistic(evidence: np.ndarray, odds: tuple[float, ...]) -> np.ndarray:
