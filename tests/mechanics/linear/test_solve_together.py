@@ -5,6 +5,7 @@ import pytest
 
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics.grasp import Grasp
+from limber.mechanics.linear.supernodal import SupernodalFactor
 from limber.mechanics.model import BranchModel
 
 
@@ -26,6 +27,30 @@ def test_several_forces_are_solved_as_each_alone(beam, count):
                  for right, move in zip(rights, moves.T, strict=True)]
         together = tangent.solve_all(list(rights), moves)
         assert np.allclose(together, alone, rtol=1e-9, atol=1e-12 * np.abs(alone).max())
+
+
+def test_forces_in_a_few_places_are_solved_as_any(beam):
+    """Three on one node each, which pass most fronts by; one after the other as well."""
+    rights = np.zeros((3, *beam.mesh.nodes.shape))
+    for right, node in zip(rights, np.flatnonzero(~beam.fixed)[[0, -1, 20]], strict=True):
+        right[node] = 1.0, -2.0, 0.5
+    tangent = beam.equations().tangent(beam, np.zeros_like(beam.mesh.nodes))
+    together, alone = tangent.solve_all(list(rights)), [tangent.solve(one) for one in rights]
+    assert np.allclose(together, alone, rtol=1e-9, atol=1e-12 * np.abs(alone).max())
+    assert not tangent.solve(np.zeros_like(rights[0])).any()
+
+
+def test_a_pin_is_solved_for_only_when_it_is_asked_for(beam, monkeypatch):
+    """Whether a state is stable is known without."""
+    equations, solved = beam.equations((Grasp.from_mesh(beam.mesh, "pinned"),)), []
+    whole = SupernodalFactor.solve
+    monkeypatch.setattr(SupernodalFactor, "solve",
+                        lambda factor, right: solved.append(right.shape) or whole(factor, right))
+    tangent = equations.tangent(beam, np.zeros_like(beam.mesh.nodes))
+    assert tangent.is_positive_definite and not solved
+    for _ in range(2):
+        tangent.solve(np.ones_like(beam.mesh.nodes))
+    assert solved.count(equations.pin_rows.shape) == 1
 
 
 def test_a_tangent_asked_for_again_is_at_hand_until_another_is_made(beam):

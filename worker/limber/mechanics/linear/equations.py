@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -63,9 +64,6 @@ class Tangent:
             values[diagonal] += self.drag
         self.is_positive_definite = self._factorise(values, diagonal)
         self.diagonal_norm = float(np.linalg.norm(values[diagonal]))
-        if equations.pinned:
-            self._pin_solutions = factor.solve(equations.pin_rows)
-            self._compliance = equations.pin_rows.T @ self._pin_solutions
 
     def __del__(self) -> None:
         self.equations.take_back(self._factor)
@@ -85,6 +83,15 @@ class Tangent:
                 shift = raised
                 continue
             return shift == 0.0
+
+    @cached_property
+    def _pin_solutions(self) -> np.ndarray:
+        # Not before they are asked for: many a tangent only says whether a state is stable.
+        return self._factor.solve(self.equations.pin_rows)
+
+    @cached_property
+    def _compliance(self) -> np.ndarray:
+        return self.equations.pin_rows.T @ self._pin_solutions
 
     def solve(self, right: np.ndarray, pin_moves: np.ndarray | None = None) -> np.ndarray:
         """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
