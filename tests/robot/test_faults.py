@@ -18,7 +18,7 @@ from benchmarks.robot_faults import (
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
 from limber.robot.expected import ExpectedWrench
-from limber.robot.link import RobotLink
+from limber.robot.link import COLUMNS, RobotLink
 
 pytest.importorskip("rtde_control")
 
@@ -198,6 +198,14 @@ def test_another_version_than_the_calibrated_one_is_refused(moving_robot):
     other = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": "5.4.1"})})
     with pytest.raises(InputError, match=r"calibrated with 5\.4\.1"):
         RobotLink(other).close()
+
+
+def test_the_last_sample_is_had_from_the_link(moving_robot):
+    """Not from who takes samples, who may not have listened yet when one came."""
+    with RobotLink(cell_for(moving_robot.address), lambda _rows: None) as link:
+        row = link.wait_for_samples()
+    assert row.shape == (len(COLUMNS),)
+    assert np.allclose(row[1:4], moving_robot.state["pose"][:3], atol=1e-4)
 
 
 def test_nobody_at_the_address_is_told_soon():

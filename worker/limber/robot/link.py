@@ -50,6 +50,7 @@ class RobotLink:
         self._on_samples = on_samples
         self._news = threading.Condition()
         self._sampled = threading.Event()
+        self._latest = np.empty(0)
         self._events: list[dict[str, Any]] = []
         self.warnings: list[str] = []
         self._ended = False
@@ -73,8 +74,8 @@ class RobotLink:
     def __exit__(self, *_exception: object) -> None:
         self.close()
 
-    def wait_for_samples(self, seconds: float = 5.0) -> None:
-        """Return when the next samples have come.
+    def wait_for_samples(self, seconds: float = 5.0) -> np.ndarray:
+        """Return the last of the next samples that come, shape [37] as in :data:`COLUMNS`.
 
         Raises:
             WorkError: none come.
@@ -83,6 +84,7 @@ class RobotLink:
         if not self._sampled.wait(seconds):
             raise WorkError(f"The robot's driver sends no samples in {seconds:.0f} s.",
                             "A port may be silent.", "Look at the robot.")
+        return self._latest
 
     def tare(self, seconds: float = 0.5) -> dict[str, Any]:
         """Take the present force as nothing; the gripper hangs free and still."""
@@ -208,10 +210,11 @@ class RobotLink:
             except json.JSONDecodeError:
                 continue
             if "samples" in content:
+                rows = np.array([[np.nan if x is None else x for x in row]
+                                 for row in content["samples"]], float)
                 if self._on_samples is not None:
-                    rows = [[np.nan if x is None else x for x in row]
-                            for row in content["samples"]]
-                    self._on_samples(np.array(rows, float))
+                    self._on_samples(rows)
+                self._latest = rows[-1]
                 self._sampled.set()
                 continue
             with self._news:

@@ -152,9 +152,8 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
             point = _grasp_point(branch, cell, link)
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
-            link.wait_for_samples()
             # Before the tare: what takes long would be drift.
-            trajectory = _pull(branch, cell, point, recorder.last, settings, blocked,
+            trajectory = _pull(branch, cell, point, link.wait_for_samples(), settings, blocked,
                                progress.part(0.02, 0.1))
             progress(0.1, "taring: keep the gripper free")
             live.at("taring")
