@@ -77,3 +77,18 @@ def test_a_twig_that_hangs_on_a_long_way_across_is_led_back_along_its_own_axis()
     assert len(fork) == 1 and abs(fork[0, 2] - 0.1) < 0.01
     first = mended.nodes[mended.runs()[1][1]] - fork[0]
     assert first @ way > np.cos(np.deg2rad(15)) * np.linalg.norm(first)
+
+
+def test_a_twig_hangs_where_its_line_leads_back_to_not_ahead() -> None:
+    """Its first nodes are a hair's, a millimetre apart, and lean towards the stem: followed ahead,
+    their line meets that farther out."""
+    z = np.arange(0, 0.4, 0.005)
+    hook = [[0.01, 0, 0.172], [0.02, 0, 0.17]]
+    lean = hook[-1] + np.outer(np.arange(1, 7), [-0.0003, 0, 0.00095])
+    out = lean[-1] + np.outer(np.arange(1, 80), [0.0003, 0, 0.00095])
+    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1), hook, lean, out])
+    parent = np.concatenate([np.arange(80) - 1, [34], np.arange(80, len(nodes) - 1)])
+    skeleton = Skeleton.from_edges(nodes, parent, np.where(np.arange(len(nodes)) < 80, 0.008, 1e-3))
+    mended = attached(skeleton)
+    fork = mended.forks()
+    assert len(fork) == 1 and 0.08 < mended.nodes[fork[0], 2] < 0.18

@@ -36,6 +36,7 @@ _HOOK, _AHEAD = 5, 7  # nodes at a twig's start that may point elsewhere, and th
 _KINK = np.deg2rad(50.0)
 # A twig's start may be as long as so many radii of its carrier, and end in such a kink.
 _HOOK_REACH, _SHARP_KINK, _BESIDE = 6.0, np.deg2rad(45.0), 3
+_LINE = 2.0  # radii of its carrier that a twig's start is long, which tells where that leads
 _ENOUGH = 200  # points that tell the noise
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 
@@ -204,7 +205,10 @@ def attached(skeleton: Skeleton) -> Skeleton:
         first = int(np.argmax(outside)) if outside.any() else len(members) - 1
         first = _past_hook(skeleton, members, min(first, max(len(members) - 2, 0)))
         keep[members[:first]] = False
-        ahead = members[first:first + 5]
+        # A hair's first nodes lie so near each other that only noise is between them.
+        along = np.cumsum(np.linalg.norm(np.diff(skeleton.nodes[members[first:]], axis=0), axis=1))
+        least = int(np.searchsorted(along, _LINE * skeleton.radius[carrier[near[first]]])) + 2
+        ahead = members[first:first + max(least, 5)]
         if len(ahead) < 2:
             parent[members[first]] = carrier[near[first]]
             continue
@@ -445,11 +449,16 @@ def _uncertainty(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, matc
 
 
 def _meeting(skeleton: Skeleton, carrier: np.ndarray, first: int, direction: np.ndarray) -> int:
-    """Carrier node nearest to the twig's line followed back from its first node outside."""
+    """Carrier node nearest to the twig's line followed back from its first node outside.
+
+    A twig grows away from its fork: a node that its line meets ahead is none, unless all are.
+    """
     offset = skeleton.nodes[carrier] - skeleton.nodes[first]
     back = -(offset @ direction)
     across = np.linalg.norm(offset + back[:, None] * direction, axis=1)
     # No farther back than the carrier is thick: at a small angle the lines meet far away.
     reach = np.linalg.norm(offset, axis=1).min() * 2.5
     allowed = np.linalg.norm(offset, axis=1) <= reach
+    if (allowed & (back > 0)).any():
+        allowed &= back > 0
     return int(carrier[np.argmin(np.where(allowed, across, np.inf))])
