@@ -52,7 +52,7 @@ class SupernodalFactor:
         """Return the solution for right sides of shape [size] or [size, k].
 
         Three are solved in the time of one: it goes into reading the factor; if they are 0 but in
-        few places, in half of that.
+        few places, in four fifths of that.
         """
         if not right.any():
             return np.zeros_like(right)
