@@ -185,6 +185,30 @@ def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
     np.testing.assert_allclose(again.radius, first.radius, atol=1e-9)
 
 
+def test_an_end_that_contraction_drew_far_beyond_its_points_may_be_the_root() -> None:
+    """Three nodes of a few points lie 20 mm apart beyond a stem's foot: drawn from as far, they
+    looked thicker than long, like a spur, and the root was the tip of a twig."""
+    from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
+    from limber.geometry.skeleton.skeletonise import _root_node
+
+    z = np.concatenate([[-0.04, -0.02], np.arange(0, 0.6, 0.005)])
+    x = 0.005 * np.arange(1, 41)
+    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
+                       np.stack([x, 0 * x, 0.3 - x], axis=1)])
+    edges = np.stack([np.arange(161), np.arange(1, 162)], axis=1)
+    edges[121] = [62, 122]
+    thickness = np.concatenate([[0.021, 0.0205], np.full(120, 0.009), np.full(40, 0.004)])
+    support = np.concatenate([[1, 4], np.full(160, 24)])
+    ring = np.stack([np.cos(np.arange(24)), np.sin(np.arange(24)), 0 * np.arange(24)], axis=1)
+    owner = np.repeat(np.arange(162), support)
+    on_axis = nodes[owner]
+    on_axis[:5] = nodes[2]
+    points = on_axis + thickness[np.maximum(owner, 2)][:, None] * np.resize(
+        np.roll(ring, 5, axis=0), (len(owner), 3))
+    graph = CurveGraph(nodes, edges, thickness, support, owner=owner)
+    assert _root_node(graph, points, None, np.array([0.0, 0.0, 1.0]), 2.5)[0] == 0
+
+
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
     from limber.geometry.skeleton.radii.axis_fit import AxisFit

@@ -298,12 +298,16 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
     reach = 0.05 * float(np.linalg.norm(np.ptp(graph.nodes, axis=0)))
     thick = np.zeros(len(tips))
     for place, tip in enumerate(tips):
-        chain = end_chain(neighbours, graph.nodes, int(tip), reach)
+        # Contraction may draw a few points of an end far beyond it.
+        chain = end_chain(neighbours, graph.nodes, int(tip), reach + graph.thickness[tip])
         mine = points[np.isin(graph.owner, chain)]
         length = np.linalg.norm(graph.nodes[chain[-1]] - graph.nodes[tip])
-        if len(mine) >= 4 and length > 2 * float(np.median(graph.thickness[chain])):
+        if len(mine) < 4:
+            continue
+        drawn = float(np.median(np.repeat(graph.thickness[chain], graph.support[chain])))
+        if length > 2 * drawn:
             least = np.sqrt(max(np.linalg.eigvalsh(np.cov(mine.T))[0], 0.0))
-            thick[place] = np.sqrt(least * float(np.median(graph.thickness[chain])))
+            thick[place] = np.sqrt(least * drawn)
     return thick
 
 
