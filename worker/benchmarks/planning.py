@@ -106,8 +106,8 @@ class _Run:
                                       0.3 * (number + 1) / len(subjects))
             try:
                 found.append(_fielded(subject, EnergySettings(seed=self.seed),
-                                      15 if self.quick else 40, _own_seed(self.seed, number, 0),
-                                      self.out, part))
+                                      15 if self.quick else 40,
+                                      _own_seed(self.seed + 1, number, 0), self.out, part))
             except LimberError as error:
                 self.failed.append(f"{subject.name}: {error}")
         return found
