@@ -86,6 +86,17 @@ class YoungField:
         """Of log E by each bump, with these moduli, shape [B]."""
         return np.zeros(0) if self.straight is None else self._sizes(values)[0]
 
+    def growth(self, values: Values) -> np.ndarray:
+        """Derivative of the logarithm of how much each further unknown changes the field to log E
+        at the control points, shape [B + 1, K]."""
+        plain = self.weights @ values.young
+        apart = self.straight @ np.log(values.young) - np.log(plain)
+        by_young = self.straight - self.weights * values.young / plain[:, None]
+        sizes, sizes_by_young = self._sizes(values)
+        # Of a uniform branch both fields of the mixture are the same.
+        return np.vstack([apart @ by_young / max(float(apart @ apart), 1e-12),
+                          sizes_by_young / sizes[:, None]])
+
     def same_at_any_step(self) -> "YoungField":
         """Return the field whose bumps are those of a uniform branch, as estimates once took it."""
         return self if self.straight is None else replace(self, steps=np.zeros_like(self.steps))

@@ -31,6 +31,7 @@ from limber.estimation.doubt.shape_error import hung_error, shape_error
 from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward, under_its_weight
+from limber.estimation.marginal import averaged
 from limber.estimation.nuisances import in_words, told, unlikely
 from limber.estimation.objective import Objective, Stopped, held_out, without
 from limber.estimation.optimise import Fit, FitStatus, gauss_newton, nelder_mead
@@ -268,6 +269,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     stopped = fit.status is FitStatus.stopped
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
+        fit = averaged(fit, objective)
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
             progress.warn(message)
