@@ -89,7 +89,7 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
     # A refusal is no small error.
     worst = [float(np.abs(each.errors).max()) if each.errors else np.inf for each in trials]
     covered = np.concatenate([each.covered for each in fitted])
-    ratio = np.concatenate([np.array(each.widths) / each.bound for each in fitted])
+    ratio = np.concatenate([np.array(each.widths) / _bound(each) for each in fitted])
     width = np.median([each.widths for each in fitted])
     share, median = float(covered.mean()), float(np.median(worst))
     ninth = float(np.quantile(worst, 0.9, method="lower"))
@@ -111,6 +111,11 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
             bool(np.nanmedian(ratio) <= 1.5))]
 
 
+def _bound(trial: Trial) -> np.ndarray:
+    """A trial's bounds; a kept one has None where there is none."""
+    return np.array(trial.bound, float)
+
+
 def _efficient_median(trials: list[Trial]) -> float:
     """Median of the worst E error of estimates as good as the Cramer-Rao bounds allow.
 
@@ -119,7 +124,7 @@ def _efficient_median(trials: list[Trial]) -> float:
     from the fit's prior. Where the field's form is drawn from less than that, estimates come closer
     than these bounds, and their intervals hold more often than they say.
     """
-    sigma = np.array([each.bound for each in trials]) / 1.96
+    sigma = np.array([_bound(each) for each in trials]) / 1.96
     sigma = sigma[np.isfinite(sigma).all(axis=1)]
     drawn = np.random.default_rng(0).standard_normal((1000, *sigma.shape)) * sigma
     return float(np.median(np.abs(np.expm1(drawn)).max(axis=-1)))
