@@ -114,4 +114,4 @@ def applied():
 
 
 drive([open_result, open_tab, edit, picture("edited"), undo, undone, apply, applied,
-       picture("applied")], longest=80)
+       picture("applied")], longest=200)

@@ -25,7 +25,8 @@ def warm_up(progress: Progress = SILENT) -> None:
                             fixed=np.array([0, 1, 2]))
         simulate_dynamics(model, times=np.array([0.0, 0.01]), sensitivities=ParameterSet())
     rest = np.zeros_like(mesh.nodes)
-    model.equations().tangent(model, rest).solve_all(3 * [rest])
+    # Nothing is solved for forces that are 0.
+    model.equations().tangent(model, rest).solve_all(3 * [rest + 1.0])
     progress(2 / 3, "compiling kernels")
     compile_kernels()
     progress(1.0, "compiling kernels")
