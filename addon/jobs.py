@@ -30,6 +30,15 @@ _KNOWN_SHARE, _KNOWN_SECONDS = 0.03, 3.0
 _POSIX = os.name == "posix"
 
 
+def _what_to_do(code: int) -> str:
+    """Return why a worker that told no reason of its own may have ended, and what to do."""
+    if code < 0:
+        return ("It was killed, by somebody or because memory ran out. What was there before is "
+                "as it was: run it again.")
+    return ("If it is of another version than this add-on, name another Python in the "
+            "extension's preferences; Check the Worker tells.")
+
+
 class JobState(enum.Enum):
     """Where a job is."""
 
@@ -209,9 +218,9 @@ class Job:
             self.state = JobState.CANCELLED
         else:
             self.state = JobState.FAILED
-            said = [line for line in self.log if line.strip()]
-            self.error = self.result.get("error") or (
-                f"The worker ended with exit code {code}. " + " ".join(said[-2:]))
+            said = [line for line in self.log if line.strip()][-2:]
+            self.error = self.result.get("error") or " ".join(
+                [f"The worker ended with exit code {code}.", *said, _what_to_do(code)])
         if self.state is not JobState.DONE and self.folder:
             # What was to go on from there has nothing to go on from.
             for job in [job for job in _waiting if job.folder == self.folder]:

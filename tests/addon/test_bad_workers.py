@@ -21,13 +21,13 @@ def part(name):
 GOOD = "print(json.dumps({'status': 'done', 'seconds': 0.1}))"
 BAD = {
     "killed": ("print(json.dumps({'progress': 0.5}), flush=True); os.kill(os.getpid(), 9)",
-               "exit code -9"),
+               "exit code -9. It was killed"),
     "rubbish": ("sys.stdout.buffer.write(bytes(range(256)) * 40 + b'\\n[[[[\\n{\\n'); "
                 "print('null'); print('[1]'); print('{\"progress\": \"half\"}')",
                 "ended without a result"),
     "rubbish, and an end": ("sys.stderr.write('\\x00' * 5000); sys.exit(7)", "exit code 7"),
     "another version": ("sys.exit('Error: No such option: --progress')",
-                        "No such option: --progress"),
+                        "No such option: --progress If it is of another version"),
     "deep": ("print('[' * 100000)", "ended without a result")}
 
 
