@@ -120,6 +120,8 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(worker_address):
         robot.ask("added_wrench", wrench=[0] * 6)
         time.sleep(0.3)
         assert link.retreat()["event"] == "reached"
+        # The program that was uploaded anew is watched like the first.
+        assert robot.state["watchdog_s"] == pytest.approx(0.1)
         assert np.allclose(robot.state["pose"][:3], begin[:3], atol=1e-4)
 
 

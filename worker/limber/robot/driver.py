@@ -25,8 +25,8 @@ from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
 from limber.robot.expected import ExpectedWrench
 from limber.robot.frames import frame_of, pose_of, turn_between
-from limber.robot.guard import Decision, Guard, GuardSettings, State, Verdict
-from limber.robot.real_time import claim_real_time
+from limber.robot.guard import PLAYING, Decision, Guard, GuardSettings, State, Verdict
+from limber.robot.real_time import claim_real_time, spare_what_is_loaded
 from limber.robot.samples import Dashboard, Sample, SampleStream
 from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
 from limber.robot.trajectory import Trajectory
@@ -40,6 +40,7 @@ PARENT_SECONDS = 1.0
 _LOOKAHEAD, _GAIN = 0.06, 900.0
 _STOP_DECELERATION = 8.0  # rad/s^2 of the joints
 _START_TOLERANCE = 0.005  # m
+_PROGRAM_SECONDS = 2.0
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
 _LONG_STEP_SECONDS = 0.004
@@ -383,8 +384,8 @@ class Driver:
         if sample.slider <= 0.0:
             raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
                              "Raise it on the pendant.")
-        if not self._control.isProgramRunning() and not self._control.reuploadScript():
-            raise WorkError("The control program does not run.", "", "See the pendant.")
+        if not self._control.isProgramRunning():
+            self._start_program()
         self.guard.begin()
         self._stopped_at, self._dashboard_was_used = None, False
         self._following = Following(trajectory)
@@ -394,6 +395,20 @@ class Driver:
             # Here the gripper closed on the resting branch: ways are measured from here.
             self._held_for, self._held_at = rest, sample.pose.copy()
         self.tell(event="started", seconds=trajectory.duration)
+
+    def _start_program(self) -> None:
+        """Upload the control program once more, and see that it runs: ur-rtde does not wait."""
+        started = self._control.reuploadScript()
+        given_up = time.monotonic() + _PROGRAM_SECONDS
+        while not (self._control.isProgramRunning()
+                   and self._require_sample().runtime_state == PLAYING):
+            if not started or time.monotonic() > given_up:
+                raise WorkError("The control program does not run.", "", "See the pendant.")
+            for sample in self._stream.read(1.0 / self._stream.rate):
+                self._look(sample)
+                self._last = sample
+        # Each program begins without one.
+        self._require(self._control.setWatchdog(WATCHDOG_HZ), "start its watchdog")
 
     def _move(self, step: float) -> None:
         """Send the next target, ``step`` [s] of the controller's time after the last one."""
@@ -526,6 +541,7 @@ def main() -> int:
     driver: Driver | None = None
     try:
         driver = Driver(Cell.model_validate_json(sys.stdin.readline()), words)
+        spare_what_is_loaded()
         driver.tell(event="connected", **driver.facts)
         orders: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()

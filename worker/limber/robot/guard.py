@@ -20,7 +20,7 @@ from limber.robot.frames import pose_between, turn_between
 from limber.robot.kinematics import singularity_distance
 from limber.robot.samples import Sample
 
-_RUNNING, _NORMAL, _PLAYING = 7, 1, 2
+_RUNNING, _NORMAL, PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
 _DEVIATIONS = 2.0  # of a prediction that are allowed for
 _NO_DOUBT = np.zeros((6, 6))
@@ -252,7 +252,7 @@ class Guard:
             return self._stop(_SAFETY.get(sample.safety_mode, f"safety mode {sample.safety_mode}"))
         if sample.robot_mode != _RUNNING:
             return self._stop(f"robot mode {sample.robot_mode}: it is not running")
-        if self.state in (State.MOVING, State.PAUSED) and sample.runtime_state != _PLAYING:
+        if self.state in (State.MOVING, State.PAUSED) and sample.runtime_state != PLAYING:
             return self._stop("the program on the controller was stopped")
         return _GO
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
-from limber.robot.real_time import claim_real_time
+from limber.robot.real_time import claim_real_time, spare_what_is_loaded
 
 _SOLVER_PRIORITY = 10
 _REST = 0.25  # of what a solution took: a process that never rests is held up by the system
@@ -380,6 +380,7 @@ def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
     solver = _Solver(setting)
     # Below the arm's own loop; above other programs, for which the branch's force would be late.
     claim_real_time(_SOLVER_PRIORITY)
+    spare_what_is_loaded()
     try:
         pipe.send(("ready", {"points": solver.seen()}))
         while True:

@@ -17,6 +17,7 @@ import numpy as np
 
 from limber.errors import LimberError, WorkError
 from limber.jobs.ending import end_by_closing
+from limber.robot.real_time import spare_what_is_loaded
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.motion import Servo, SpeedMotion, Waypoint, line_move
 from limber.robot.virtual.server import Server, new_loop
@@ -140,12 +141,13 @@ def serve(controller: Controller, address: str, *, control: bool = False,
 
 
 def _warm_up(controller: Controller) -> None:
-    """Compile what motions need before the clock runs: a compiler would stop it for seconds."""
+    """Do before the clock runs what would stop it: compiling, for seconds, and whole searches."""
     slow = Waypoint("line", controller.pose, True, 0.1, 0.1)
     line_move(controller.arm, controller.joints, controller.pose, [slow], controller.tool)
     Servo().step(controller.joints, controller.speeds, controller.seconds, 1.0)
     SpeedMotion(controller.arm, controller.tool).step(controller.joints, controller.speeds,
                                                       controller.seconds, 1.0)
+    spare_what_is_loaded()
 
 
 async def _serve(server: Server, control: bool, seconds: float | None,
@@ -200,7 +202,9 @@ def state_of(server: Server) -> dict[str, Any]:
             "tool_speed": controller.tool_speed.tolist(), "safety": controller.safety_mode.name,
             "mode": controller.robot_mode.name, "program": controller.runtime_state.name,
             "remote": controller.remote, "slider": controller.slider,
-            "payload": controller.payload, "outputs": controller.digital_outputs,
+            "payload": controller.payload,
+            "watchdog_s": controller.watchdog[0] if controller.watchdog else None,
+            "outputs": controller.digital_outputs,
             **controller.load.report(), "lost_seconds": server.lost_seconds,
             "log": list(controller.log)[-20:],
             "wall": time.time()}
