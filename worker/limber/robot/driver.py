@@ -44,6 +44,8 @@ _PROGRAM_SECONDS = 2.0
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
 _LONG_STEP_SECONDS = 0.004
+_HELD_UP_SECONDS = 0.02
+_GRACE_SECONDS = 0.015
 _NOTHING = np.full(6, np.nan)
 _UPPER = np.triu_indices(3)
 
@@ -97,6 +99,7 @@ class Driver:
         self._batch: list[list[float]] = []
         self._batch_since = time.monotonic()
         self._last: Sample | None = None
+        self._woke = -np.inf
         self._heard = time.monotonic()
         self.ended = False
 
@@ -197,22 +200,43 @@ class Driver:
         quiet = 2.0 / self._stream.rate + 0.005
         self._stream.skip()
         while not self.ended:
+            began = time.monotonic()
             try:
                 samples = self._stream.read(quiet, self._sensor.connections)
             except ConnectionError as error:
                 self._lost(str(error))
                 return
+            self._note_hold_up(time.monotonic() - began - quiet)
             for sample in samples:
                 self._look(sample)
             if samples:
                 self._last = samples[-1]
             elif self._last is not None:
-                self._judge(self.guard.silence(time.monotonic() - self._last.arrived))
+                if not self._has_just_woken:
+                    self._judge(self.guard.silence(time.monotonic() - self._last.arrived))
                 self._feel(self._last)
             self._take(orders)
             if samples and not self.ended:
                 self._move(len(samples) / self._stream.rate)
             self._send_batch()
+
+    def _note_hold_up(self, overslept: float) -> None:
+        """See that the computer held this loop up while it listened.
+
+        What came meanwhile waits in the connections, and is read and judged. That nothing came
+        tells of no silence yet: it is listened for once more, and no second time without a sample.
+        """
+        if overslept < _HELD_UP_SECONDS:
+            return
+        if self._last is None or self._last.arrived > self._woke:
+            self._woke = time.monotonic()
+        if self._following is not None:
+            self.tell(event="warning", text=f"the computer held the robot's program up for "
+                      f"{1000 * overslept:.0f} ms: nothing was watched in that time")
+
+    @property
+    def _has_just_woken(self) -> bool:
+        return time.monotonic() - self._woke < _GRACE_SECONDS
 
     def _take(self, orders: "queue.SimpleQueue[dict[str, Any] | None]") -> None:
         while True:
@@ -279,7 +303,7 @@ class Driver:
         decision = self.guard.look(
             sample, wrench=now, raw=np.stack([reading.raw, reading.wrench]), expected=expected,
             doubt=doubt, grasp=grasp[:3, 3], sent=sent)
-        if reading.age > 0.05 and decision.verdict != Verdict.STOP:
+        if reading.age > 0.05 and decision.verdict != Verdict.STOP and not self._has_just_woken:
             decision = self.guard.event(f"the force sensor is silent for {reading.age:.3f} s")
         self._judge(decision, sample)
         pose = pose_of(grasp)
