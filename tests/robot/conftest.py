@@ -1,8 +1,11 @@
 """A virtual controller stepped by hand, and one in a process with the real client on it."""
 
+import time
+
 import numpy as np
 import pytest
 
+from benchmarks.held_up import HELD_UP_SECONDS, Witness
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.launch import VirtualRobot
 
@@ -72,9 +75,41 @@ def worker_address(worker_id) -> str:
     return f"127.0.0.{11 + number}"
 
 
+class Watch:
+    """The witness of this test process, and when the test that is run began."""
+
+    witness: Witness | None = None
+    began = 0.0
+
+    @classmethod
+    def saw_the_machine_stand_still(cls) -> bool:
+        """Whether it did since the test began, for so long that a robot is stopped."""
+        return cls.witness is not None and cls.witness.longest(cls.began) > HELD_UP_SECONDS
+
+
+@pytest.fixture(autouse=True)
+def _watched(request):
+    """Look out for the machine's own stand-stills while a robot moves."""
+    if request.node.get_closest_marker("real_time") is not None:
+        Watch.witness = Watch.witness or Witness()
+        Watch.began = time.monotonic()
+
+
+def pytest_sessionfinish() -> None:
+    """End the witness."""
+    if Watch.witness is not None:
+        Watch.witness.close()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what moves a robot in a process: it is held to wall clocks, wants a core to itself."""
+    """Mark what moves a robot in a process: it is held to wall clocks, wants a core to itself.
+
+    What fails while the machine itself stands still is done again: a stop is then the right answer,
+    and another one than the test asks for.
+    """
     for item in items:
         in_a_process = "worker_address" in getattr(item, "fixturenames", ())
         if in_a_process or item.path.name == "test_faults.py":
             item.add_marker(pytest.mark.real_time)
+            item.add_marker(pytest.mark.flaky(
+                reruns=4, condition=Watch.saw_the_machine_stand_still))

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.held_up import Voided, Witness
 from benchmarks.robot_branches import FAULTS_OF_BRANCHES, followed_paths, lost_branches
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
     FAULTS,
+    Outcome,
     cell_for,
     new_robot,
     provoke,
@@ -43,17 +45,19 @@ class Setting:
     quick: bool
     seed: int
     out: Path | None
+    voided: Voided
 
 
 def rows(quick: bool, progress: Progress, out: Path | None, seed: int = 0,
          only: tuple[str, ...] = ()) -> list[Row]:
     """Measure the parts named in ``only``, or all."""
     table: list[Row] = []
-    chosen, setting = only or WHOLE, Setting(quick, seed, out)
-    for number, name in enumerate(chosen):
-        share = progress.part(number / len(chosen), (number + 1) / len(chosen))
-        share(0.0, name)
-        table += PARTS[name](setting, share)
+    chosen = only or WHOLE
+    with Witness() as witness:
+        for number, name in enumerate(chosen):
+            share = progress.part(number / len(chosen), (number + 1) / len(chosen))
+            share(0.0, name)
+            table += PARTS[name](Setting(quick, seed, out, Voided(witness)), share)
     return table
 
 
@@ -155,15 +159,19 @@ def _faults(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple
         progress(number / len(names), name)
         seed = setting.seed + list(FAULTS).index(name)
         robot = new_robot(_ADDRESS, "ur5e", seed)
+
+        def run(name: str = name, seed: int = seed) -> Outcome:
+            nonlocal robot
+            if robot.process.poll() is not None:
+                robot.close()
+                robot = new_robot(_ADDRESS, "ur5e", seed)
+            restored(robot)
+            return provoke(name, robot, cell_for(_ADDRESS))
         try:
             for _ in range(runs):
-                if robot.process.poll() is not None:
-                    robot.close()
-                    robot = new_robot(_ADDRESS, "ur5e", seed)
-                restored(robot)
                 total += 1
                 try:
-                    outcome = provoke(name, robot, cell_for(_ADDRESS))
+                    outcome = setting.voided.again(run, name)
                 except (AssertionError, LimberError) as error:
                     failed.append(f"{name}: {error}")
                     continue
@@ -176,17 +184,18 @@ def _faults(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple
         print(line)
     told = f"{len(names)} faults" if len(names) > 1 else names[0]
     return [Row(f"{told} while moving, {runs} runs each: standstill and a report", "every one",
-                f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s",
-                not failed)]
+                f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s"
+                f"{setting.voided}", not failed)]
 
 
 def _followed(setting: Setting, _progress: Progress) -> list[Row]:
-    return followed_paths(setting.seed, 1 if setting.quick else 10, _ADDRESS)
+    return followed_paths(setting.seed, 1 if setting.quick else 10, _ADDRESS, setting.voided)
 
 
 def _lost(setting: Setting, _progress: Progress) -> list[Row]:
     return [lost_branches(setting.seed, 1 if setting.quick else 20, _ADDRESS,
-                          FAULTS_OF_BRANCHES[:1] if setting.quick else FAULTS_OF_BRANCHES)]
+                          FAULTS_OF_BRANCHES[:1] if setting.quick else FAULTS_OF_BRANCHES,
+                          setting.voided)]
 
 
 def _stream(setting: Setting, _progress: Progress) -> list[Row]:
@@ -194,7 +203,8 @@ def _stream(setting: Setting, _progress: Progress) -> list[Row]:
 
 
 def _loops(setting: Setting, progress: Progress) -> list[Row]:
-    return closed_loops(setting.seed, 1 if setting.quick else 10, _ADDRESS, progress, setting.out)
+    return closed_loops(setting.seed, 1 if setting.quick else 10, _ADDRESS, progress, setting.out,
+                        setting.voided)
 
 
 WHOLE: dict[str, Callable[[Setting, Progress], list[Row]]] = {

@@ -8,10 +8,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.held_up import Voided
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.table import Row
 from limber.errors import LimberError, SafetyStop
@@ -87,16 +89,16 @@ def _plan_sideways(branch: Branch, push: np.ndarray) -> None:
         stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def followed_paths(seed: int, count: int, address: str) -> list[Row]:
+def followed_paths(seed: int, count: int, address: str, voided: Voided) -> list[Row]:
     """Follow a path with each of ``count`` branches: force as predicted, where the arm went."""
     within, errors, ways, stopped = [], [], [], []
     for number in range(count):
-        with tempfile.TemporaryDirectory() as place:
-            try:
-                result, state = _executed(Path(place), seed + number, address)
-            except LimberError as error:
-                stopped.append(f"seed {seed + number}: {error}")
-                continue
+        try:
+            result, state = voided.again(partial(_executed, seed + number, address),
+                                         f"seed {seed + number}")
+        except LimberError as error:
+            stopped.append(f"seed {seed + number}: {error}")
+            continue
         within.append(result["force_within_share"])
         errors.append(result["force_error_of_peak"])
         ways.append(result["path_error_m"])
@@ -111,15 +113,21 @@ def followed_paths(seed: int, count: int, address: str) -> list[Row]:
     return [
         Row(f"force within 5 % of the peak or the interval, {count} branches, least share of a "
             "path", "95 %", f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f}); "
-            f"{len(stopped)} stopped", min(within) >= 0.95 and not stopped),
+            f"{len(stopped)} stopped{voided}", min(within) >= 0.95 and not stopped),
         Row("difference of the force, 95 % of a path below, worst branch", "reported",
             f"{100 * max(errors):.1f} % of the peak", None),
         Row("following a branch's path: distance from it, worst", "1 mm",
             f"{1000 * max(ways):.2f} mm", max(ways) < 1e-3)]
 
 
-def _executed(folder: Path, seed: int, address: str,
+def _executed(seed: int, address: str,
               fault: Callable[[VirtualRobot], None] | None = None) -> tuple[dict, float]:
+    with tempfile.TemporaryDirectory() as place:
+        return _executed_in(Path(place), seed, address, fault)
+
+
+def _executed_in(folder: Path, seed: int, address: str,
+                 fault: Callable[[VirtualRobot], None] | None) -> tuple[dict, float]:
     """Execute the path armed; with ``fault`` done to the robot once the force is up.
 
     Returns:
@@ -164,24 +172,36 @@ FAULTS_OF_BRANCHES: tuple[tuple[str, Callable[[VirtualRobot], None]], ...] = (
 
 def lost_branches(seed: int, runs: int, address: str,
                   faults: tuple[tuple[str, Callable[[VirtualRobot], None]], ...],
-                  ) -> Row:
+                  voided: Voided) -> Row:
     """The branch slips in the grip, or breaks, while it is led: the arm stands and says so."""
     told, failed = [], []
     for number in range(runs):
         for name, fault in faults:
-            with tempfile.TemporaryDirectory() as place:
-                began = time.monotonic()
-                try:
-                    _executed(Path(place), seed + number, address, fault)
-                    failed.append(f"{name}, seed {seed + number}: it went on")
-                except SafetyStop as stop:
-                    # Another reason than the lost force: the fault was not what stopped it.
-                    (told if "slipped, broke" in str(stop) else failed).append(str(stop))
-                except LimberError as error:
-                    failed.append(f"{name}, seed {seed + number}: {error}")
-                print(f"branch {name}: {time.monotonic() - began:.0f} s in all")
+            began = time.monotonic()
+            try:
+                told.append(voided.again(partial(_stop_for_loss, seed + number, address, fault),
+                                         f"{name}, seed {seed + number}"))
+            except (AssertionError, LimberError) as error:
+                failed.append(f"{name}, seed {seed + number}: {error}")
+            print(f"branch {name}: {time.monotonic() - began:.0f} s in all", flush=True)
     for line in (*failed, *told[:2]):
         print(line)
     names = ", ".join(f"branch {name}" for name, _ in faults)
     return Row(f"{names} while it is led, {runs} runs each: stop for the lost force, and a report",
-               "every one", f"{len(told)} of {len(faults) * runs}", not failed)
+               "every one", f"{len(told)} of {len(faults) * runs}{voided}", not failed)
+
+
+def _stop_for_loss(seed: int, address: str, fault: Callable[[VirtualRobot], None]) -> str:
+    """Return what was told of the stop.
+
+    Raises:
+        AssertionError: it went on.
+        LimberError: another reason than the lost force: the fault was not what stopped it.
+    """
+    try:
+        _executed(seed, address, fault)
+    except SafetyStop as stop:
+        if "slipped, broke" not in str(stop):
+            raise
+        return str(stop)
+    raise AssertionError("it went on")

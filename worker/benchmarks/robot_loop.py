@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.held_up import Voided
 from benchmarks.kept_trials import keep, read_trials, source_digest
 from benchmarks.table import Row
 from limber.closed_loop.loop import GOAL_TOLERANCE_M, OPEN_FACTOR, ClosedLoop, comparison
@@ -28,8 +29,8 @@ class _Loop:
     error: str | None
 
 
-def closed_loops(seed: int, count: int, address: str, progress: Progress,
-                 out: Path | None = None) -> list[Row]:
+def closed_loops(seed: int, count: int, address: str, progress: Progress, out: Path | None,
+                 voided: Voided) -> list[Row]:
     """Go around with each of ``count`` random branches.
 
     Where ``out`` is given folders stay there, and loops that were made before with these seeds and
@@ -43,19 +44,23 @@ def closed_loops(seed: int, count: int, address: str, progress: Progress,
         which = seed + number
         if which not in known:
             known[which] = _once(which, source, address, out, progress.part(
-                number / count, (number + 1) / count))
+                number / count, (number + 1) / count), voided)
             keep(known[which], kept)
         loops.append(known[which])
-    return _rows(loops)
+    return _rows(loops, voided)
 
 
-def _once(seed: int, source: str, address: str, out: Path | None, progress: Progress) -> _Loop:
+def _once(seed: int, source: str, address: str, out: Path | None, progress: Progress,
+          voided: Voided) -> _Loop:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place, "loop") if out is None else out / f"loop-{seed}"
-        # Of a run that was stopped in the middle.
-        shutil.rmtree(folder, ignore_errors=True)
+
+        def run() -> dict[str, Any]:
+            # Of a run that was stopped in the middle.
+            shutil.rmtree(folder, ignore_errors=True)
+            return ClosedLoop(folder, seed, address, progress=progress).run()
         try:
-            result = ClosedLoop(folder, seed, address, progress=progress).run()
+            result = voided.again(run, f"closed loop, seed {seed}")
         except LimberError as error:
             print(f"closed loop, seed {seed}: {error}", flush=True)
             return _Loop(seed, source, None, str(error))
@@ -65,7 +70,7 @@ def _once(seed: int, source: str, address: str, out: Path | None, progress: Prog
     return _Loop(seed, source, result, None)
 
 
-def _rows(loops: list[_Loop]) -> list[Row]:
+def _rows(loops: list[_Loop], voided: Voided) -> list[Row]:
     results = [loop.result for loop in loops if loop.result is not None]
     failed = [f"seed {loop.seed}: {loop.error}" for loop in loops if loop.error is not None]
     count = len(loops)
@@ -92,7 +97,8 @@ def _rows(loops: list[_Loop]) -> list[Row]:
             f"{sum(flowers)} of {count}; farthest {1000 * worst:.1f} mm",
             all(flowers) and not failed),
         Row(f"{told}: ended, no limit broken", "all",
-            f"{len(results)} of {count} ended, {broken} broke one", not failed and not broken),
+            f"{len(results)} of {count} ended, {broken} broke one{voided}",
+            not failed and not broken),
         Row(f"{told}: force within 5 % of the peak or the interval, least share of a path", "95 %",
             f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f})",
             min(within) >= 0.95 and not failed),
