@@ -29,7 +29,10 @@ while True:
     time.sleep(0.002)
     now = time.monotonic()
     if now - last > 0.01:
-        print(now, now - last, flush=True)
+        try:
+            print(now, now - last, flush=True)
+        except BrokenPipeError:
+            sys.exit()
     last = now
 """
 

@@ -174,14 +174,13 @@ def _faults(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple
                     outcome = setting.voided.again(run, name)
                 except (AssertionError, LimberError) as error:
                     failed.append(f"{name}: {error}")
+                    print(failed[-1], flush=True)
                     continue
                 if name not in ENDS_ROBOT:
                     slowest = max(slowest, outcome.standstill_s)
         finally:
             robot.close()
         print(f"{name}: {runs} runs, {len(failed)} failed so far", flush=True)
-    for line in failed:
-        print(line)
     told = f"{len(names)} faults" if len(names) > 1 else names[0]
     return [Row(f"{told} while moving, {runs} runs each: standstill and a report", "every one",
                 f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s"

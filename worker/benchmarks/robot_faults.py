@@ -107,7 +107,9 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
         while abs(before["tool_speed"][1]) < 0.02 and time.monotonic() - waited < _START_SECONDS:
             time.sleep(0.05)
             before = robot.state
-        assert abs(before["tool_speed"][1]) > 0.02, "it did not move before the fault"
+        if abs(before["tool_speed"][1]) < 0.02:
+            told = link.wait("stopped", seconds=1.0)["reason"]
+            raise AssertionError(f"it did not move before the fault: {told}")
         began = time.monotonic()
         FAULTS[name](robot, link)
         standstill, way = float("nan"), float("nan")
