@@ -138,21 +138,20 @@ def grasp_slopes(model: BranchModel, grasp: Grasp, displacement: np.ndarray) -> 
     tangent = model.equations([grasp]).tangent(model, displacement)
     state = model.internal(displacement)
     held = state.force[grasp.nodes] - model.weight_force[grasp.nodes]
-    stiffness = np.empty((6, 6))
-    changes = np.empty((*displacement.shape, 6))
+    rigid = np.zeros((6, *displacement.shape))
     for k in range(6):
-        change = np.zeros_like(displacement)
         axis = np.eye(3)[k % 3]
-        moved = np.tile(axis, (len(arm), 1)) if k < 3 else np.cross(axis, arm)
-        change[grasp.nodes] = moved
-        change = change + tangent.solve(-model.tangent_times(displacement, change))
-        changes[..., k] = change
+        rigid[k, grasp.nodes] = axis if k < 3 else np.cross(axis, arm)
+    followed = tangent.solve_all([-model.tangent_times(displacement, moved) for moved in rigid])
+    stiffness = np.empty((6, 6))
+    for k, (moved, change) in enumerate(zip(rigid, followed, strict=True)):
+        change += moved
         forces = model.tangent_times(displacement, change)[grasp.nodes]
         stiffness[:3, k] = forces.sum(axis=0)
         stiffness[3:, k] = np.cross(arm, forces).sum(axis=0)
         if k >= 3:
-            stiffness[3:, k] += np.cross(moved, held).sum(axis=0)
-    return GraspSlopes(stiffness, changes)
+            stiffness[3:, k] += np.cross(moved[grasp.nodes], held).sum(axis=0)
+    return GraspSlopes(stiffness, np.stack(followed, axis=-1))
 
 
 def refined_solve(tangent: Tangent, force: Callable[[np.ndarray], np.ndarray],

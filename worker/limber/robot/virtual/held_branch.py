@@ -420,6 +420,7 @@ class _Solver:
         self._held = self._model
         self._state = np.zeros_like(mesh.nodes)
         self._last: Solution | None = None
+        self._follows: np.ndarray | None = None
         self._faces: np.ndarray | None = None
         self._rng = np.random.default_rng(0)
         self._warm_up()
@@ -487,17 +488,23 @@ class _Solver:
     def solve(self, patch: np.ndarray) -> Solution:
         """Return the solution at a frame of the patch; the last one where there is none."""
         from limber.mechanics.sensitivities import grasp_slopes
-        from limber.mechanics.statics.solve import solve_static
+        from limber.mechanics.statics.solve import follow_poses
         from limber.mechanics.strain import strain_state
 
         pose = np.r_[patch[:3, 3], rotation_vector(patch)]
-        result = solve_static(self._held, grasp=self._grasp, pose=pose, start=self._state)
+        # By the tangent of the solution before it is nearly there.
+        guess = None
+        if self._last is not None and self._follows is not None:
+            guess = self._state + self._follows @ self._last.change_to(patch)
+        result = follow_poses(self._held, self._grasp, pose[None], start=self._state,
+                              guess=guess)[0]
         if not result.converged and self._last is not None:
             self._last = replace(self._last, seconds=result.seconds, converged=False)
             return self._last
         self._state = result.displacement
         strain = strain_state(self._held, self._state).principal_strain
         slopes = grasp_slopes(self._held, self._grasp, self._state)
+        self._follows = slopes.displacement
         points = (np.zeros((0, 6)) if self._operator is None
                   else self._operator @ slopes.displacement.reshape(-1, 6))
         self._last = Solution(
