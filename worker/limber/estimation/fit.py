@@ -27,6 +27,7 @@ from limber.estimation.doubt.model_error import (
     steady_loads,
 )
 from limber.estimation.doubt.path_error import led_by_path, path_error
+from limber.estimation.doubt.profile import profiled
 from limber.estimation.doubt.shape_error import hung_error, shape_error
 from limber.estimation.doubt.uncertainty import Uncertainty, outliers, uncertainty
 from limber.estimation.evaluations import EvaluationLog
@@ -273,7 +274,10 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     elif not stopped:
         for message in link_unresolved(fit.evaluation, objective.space)[1]:
             progress.warn(message)
-    found = Estimate(fit, objective, uncertainty(fit.evaluation, objective), judged)
+    sure = uncertainty(fit.evaluation, objective)
+    if not stopped:
+        sure = profiled(sure, fit.evaluation, objective, progress)
+    found = Estimate(fit, objective, sure, judged)
     _judge(found, progress)
     if settings.hold_out and len(objective.forwards) > 1 and not stopped:
         found.held_out = _held_out(found, settings)

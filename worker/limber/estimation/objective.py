@@ -1,5 +1,6 @@
 """What an optimiser minimises: differences of simulated and measured, each over its deviation."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -123,6 +124,12 @@ class Objective:
                           progress=self._progress, expected_count=self._expected)
         other.forward_count = self.forward_count
         return other
+
+    def apart(self) -> "Objective":
+        """Return an objective on copies of the pulls with a log of its own: what is tried on it
+        leaves this one as it is."""
+        return Objective([copy.copy(forward) for forward in self.forwards], self.space,
+                         force_sigma=self.force_sigma)
 
     def forget(self) -> None:
         """Evaluate anew what was evaluated last: a forward has changed."""

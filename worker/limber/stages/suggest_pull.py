@@ -127,11 +127,15 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
     groups = found["groups"]
     measured = np.array(found["covariance"], float)[np.ix_(groups, groups)]
     measured = measured + _FIRM * np.diag(np.diag(measured))
-    interval = np.array(found["young_interval_pa"], float)
-    if not (np.isfinite(measured).all() and np.isfinite(interval).all()):
+    interval, sensor = (np.array(found.get(name) or found["young_interval_pa"], float)
+                        for name in ("young_interval_pa", "young_interval_sensor_pa"))
+    if not np.isfinite([*measured.ravel(), *interval.ravel(), *sensor.ravel()]).all():
         return subject, values, Known.nothing(len(values.young))
-    total = (np.log(interval[:, 1] / interval[:, 0]) / (2 * 1.96))**2
-    return subject, values, Known(measured, np.diag(np.maximum(total - np.diag(measured), 0.0)))
+    whole, told = (np.log(each[:, 1] / each[:, 0]) / (2 * 1.96) for each in (interval, sensor))
+    # Of a soft piece the interval is wider than the covariance says, and a pull can narrow it.
+    wider = told / np.sqrt(np.diag(measured))
+    return subject, values, Known(measured * np.outer(wider, wider),
+                                  np.diag(np.maximum(whole**2 - told**2, 0.0)))
 
 
 def _cell(branch: Branch) -> Cell:

@@ -28,6 +28,7 @@ class Uncertainty:
         repetition: How many frames in a row say the same thing: 1 where their errors are
             independent.
         recording_spread: Standard deviation of log E, all alike, from recording to recording.
+        quantile: How many deviations the half width of a 95 % interval has (Student's t).
     """
 
     covariance: np.ndarray
@@ -36,6 +37,7 @@ class Uncertainty:
     correlation: np.ndarray
     repetition: float = 1.0
     recording_spread: float = 0.0
+    quantile: float = 1.96
 
 
 def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.95) -> Uncertainty:
@@ -63,17 +65,15 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
         # that it is smaller.
         factor = max(factor, 1.0)
     repetition = repeated(objective.standardised(evaluation))
-    jacobian = np.vstack([jacobian / np.sqrt(max(factor * repetition, 1e-300)),
-                          evaluation.jacobian[count:]])
-    _, values, rows = np.linalg.svd(jacobian, full_matrices=False)
-    spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
-    covariance = spread @ spread.T
+    covariance = inverse_information(scaled_rows(evaluation.jacobian, objective.space.own_row_count,
+                                                 factor * repetition))
     from_recording = recording_spread(evaluation, objective, factor * repetition)
     together = np.zeros(len(covariance))
     together[:objective.space.group_count] = 1.0
     covariance += np.outer(together, together) * from_recording**2 / len(objective.forwards)
     deviation = np.sqrt(np.diag(covariance))
-    width = stats.t.ppf(0.5 + level / 2, freedom) * deviation
+    quantile = float(stats.t.ppf(0.5 + level / 2, freedom))
+    width = quantile * deviation
     space = objective.space
     # Wider than 30 orders of magnitude says no more than that nothing is known.
     width = np.minimum(width, 70.0)
@@ -83,7 +83,27 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     interval = np.clip(np.column_stack([low.young, high.young]), *bounds)
     return Uncertainty(covariance, interval, factor,
                        covariance / np.maximum(np.outer(deviation, deviation), 1e-300), repetition,
-                       from_recording)
+                       from_recording, quantile)
+
+
+def scaled_rows(rows: np.ndarray, own_row_count: int, scale: float) -> np.ndarray:
+    """Standardised residuals, or their slopes, with the noise that they show themselves.
+
+    Args:
+        rows: As of an evaluation; the last are priors and links, which stay.
+        own_row_count: How many these are.
+        scale: Variance of what was measured over the stated.
+    """
+    scaled, count = rows.copy(), len(rows) - own_row_count
+    scaled[:count] /= np.sqrt(max(scale, 1e-300))
+    return scaled
+
+
+def inverse_information(slopes: np.ndarray) -> np.ndarray:
+    """Covariance of the free vector from slopes [r, p] of residuals of unit variance, [p, p]."""
+    _, values, rows = np.linalg.svd(slopes, full_matrices=False)
+    spread = rows.T / np.maximum(values, 1e-9 * max(values[0], 1e-300))
+    return spread @ spread.T
 
 
 def recording_spread(evaluation: Evaluation, objective: Objective, scale: float) -> float:
