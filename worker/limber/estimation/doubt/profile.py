@@ -12,11 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import brentq
 
-from limber.estimation.doubt.uncertainty import (
-    Uncertainty,
-    inverse_information,
-    scaled_rows,
-)
+from limber.estimation.doubt.uncertainty import Uncertainty, inverse_information, scaled_rows
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.optimise import OUTLYING
 from limber.estimation.parameters import LINK_DEVIATION
@@ -155,8 +151,8 @@ class _Profile:
 def bend_of(at: float, root: float) -> float:
     """How a profile bends that goes through a point: a of (1 - exp(-a x)) / a.
 
-    That is the root of the rise where what was measured is linear in the power -a of the modulus:
-    0 where it is linear in log E, 1 over the deviation where in the compliance.
+    That is the root of the rise where what was measured is linear in a power of the modulus: its
+    exponent is -a over the deviation of log E; -1 is the compliance, 0 log E itself.
 
     Args:
         at: Shift x of log E in its deviations, not 0.
