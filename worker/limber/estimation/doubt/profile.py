@@ -2,9 +2,9 @@
 
 A pull measures the compliance of a soft piece: the stiffer that is thought to be, the less the data
 see of it. Its modulus may then be several times the likeliest, where the curvature at the best
-allows twice as much to both sides. The limits of an interval are where what was measured has become
-as much less likely as at the limits of a normal distribution, all else having followed (the profile
-likelihood; Venzon and Moolgavkar 1988).
+allows twice as much to both sides; other intervals reach farther to the soft side. Limits are where
+what was measured has become as much less likely as at the limits of a normal distribution, all else
+having followed (the profile likelihood; Venzon and Moolgavkar 1988).
 """
 
 from dataclasses import replace
