@@ -56,6 +56,12 @@ class SeenSides:
     share: np.ndarray
     along_sight: bool = False
 
+    @property
+    def one_sided(self) -> bool:
+        """Whether some places of a cross-section were not seen."""
+        return bool(self.share.min() < 1.0)
+
+
 SCATTERED_ALONG_SIGHT = SeenSides(np.array([0.0, 0.0, 1.0]), np.ones(_PLACES), along_sight=True)
 """What a depth camera is known to have seen; from where does not matter to places then."""
 
@@ -152,7 +158,7 @@ def _half_sphere() -> np.ndarray:
 
 def side_doubt(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
     """Standard deviation of radii [m] from not knowing where the seen side ends, shape [n]."""
-    if seen.share.min() == 1.0:
+    if not seen.one_sided:
         return np.zeros_like(radius)
     hidden = np.minimum(noise / np.maximum(radius, 1e-300) / _ARC_HIDDEN, 1.0)
     return _GRAZING_MOVES * _GRAZING_SIGMA * hidden * radius
@@ -176,13 +182,24 @@ def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout:
         # Scatter along the sight widens no silhouette: what it adds to the radius is bounded.
         return out * np.clip(1 - 0.5 / np.maximum(sharpness, 1e-9), _SIGHT_LEAST, 1.0)[:, None]
     # By the radius alone: chosen by their distance too, near points would count otherwise than far.
-    blurred = np.flatnonzero(stout < (_SHARP if seen.share.min() == 1.0 else _SHARP_SIDE))
+    blurred = np.flatnonzero(stout < (_SHARP_SIDE if seen.one_sided else _SHARP))
     side, cross = _sides(axis[blurred], seen.view)
     cosine, sine = (np.einsum("mj,mj->m", out[blurred], way) for way in (side, cross))
     size = np.maximum(np.hypot(cosine, sine), 1e-300)
     place = mean_on_circle(cosine / size, sine / size, sharpness[blurred], seen.share)
     mean[blurred] = place[:, :1] * side + place[:, 1:] * cross
     return mean
+
+
+def across_sight(out: np.ndarray, axis: np.ndarray, seen: SeenSides) -> np.ndarray:
+    """Sine of the angle around the axis between points and the viewer of one side, shape [m].
+
+    Args:
+        out: Unit vectors from the axis to the points, shape [m, 3].
+        axis: Unit vectors along the axis at each, shape [m, 3].
+        seen: What was seen.
+    """
+    return np.einsum("mj,mj->m", out, _sides(axis, seen.view)[1])
 
 
 def _sides(axis: np.ndarray, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
