@@ -7,7 +7,13 @@ import pytest
 
 from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
-from limber.geometry.skeleton.radii.along_runs import filled_in, point_counts, steadied, tapered
+from limber.geometry.skeleton.radii.along_runs import (
+    filled_in,
+    point_counts,
+    steadied,
+    tapered,
+    unpinched,
+)
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
@@ -54,6 +60,23 @@ def test_few_points_at_a_foot_do_not_thin_the_run() -> None:
         told = tapered(stem, count)
         assert (told.radius_state == LIMITED).any() == limited
     assert point_counts(stem, _points()).sum() == 4000
+
+
+def test_a_foot_of_wide_interval_limits_no_twig() -> None:
+    """A foot half as thick as the rest limits that, unless its interval reaches as far."""
+    foot = slice(0, 13)
+    stem = _stem(foot, thin=0.003)
+    for sigma, limited in ((0.0002, True), (0.0016, False)):
+        told = tapered(replace(stem, radius_sigma=np.where(np.arange(81) < 13, sigma, 0.0)))
+        assert (told.radius_state == LIMITED).any() == limited
+
+
+def test_a_pinched_stretch_starts_as_thick_as_what_is_beyond() -> None:
+    """A tip as thin as that stays."""
+    points = _points()
+    np.testing.assert_allclose(unpinched(_stem(slice(21, 36)), points).radius, RADIUS)
+    tip = _stem(slice(60, 81))
+    np.testing.assert_array_equal(unpinched(tip, points).radius, tip.radius)
 
 
 def test_a_scan_with_holes_keeps_its_volume() -> None:

@@ -48,6 +48,16 @@ def test_a_side_seen_to_the_grazing_angle_has_no_bias_at_any_noise(share: float)
     assert np.median(fit.skeleton.radius[5:-5]) == pytest.approx(0.006, rel=0.012)
 
 
+def test_a_strip_of_a_half_hidden_branch_is_no_thin_branch() -> None:
+    """Between two parts whose side is seen whole: taken for all of a side, it came to 0.7."""
+    rng = np.random.default_rng(0)
+    angle, z = rng.uniform(-1.4, 1.4, 3000), rng.uniform(0, 0.5, 3000)
+    seen = (np.abs(z - 0.25) > 0.1) | (angle < -0.35)
+    points = np.stack([0.006 * np.cos(angle), 0.006 * np.sin(angle), z], axis=1)[seen]
+    fit = fit_axes(_axis(0.006), points + rng.normal(0, 0.001, points.shape), rounds=30)
+    assert fit.skeleton.radius[5:-5].min() > 0.85 * 0.006
+
+
 def test_an_axis_that_starts_far_too_thin_does_not_follow_single_points() -> None:
     """Begun at a seventh of the noise, it stays straight: its bends made it 5 % too long."""
     z = np.arange(0, 0.3, 0.0003)

@@ -38,6 +38,7 @@ from limber.geometry.skeleton.radii.along_runs import (
     point_counts,
     steadied,
     tapered,
+    unpinched,
 )
 from limber.geometry.skeleton.radii.axis_fit import (
     AxisFit,
@@ -314,7 +315,7 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
 def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
          camera: bool, progress: Progress):
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
-    skeleton = resampled(steadied(skeleton, points), 1.5)
+    skeleton = resampled(unpinched(steadied(skeleton, points), points), 1.5)
     fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
                    progress=progress.part(0.0, 0.5))
     hung, _ = without_backward_starts(attached(fit.skeleton))
@@ -323,7 +324,8 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
     skeleton, strands = _without_strands(skeleton.subset(keep))
-    skeleton = resampled(limited(steadied(skeleton, points), low, high), 1.0)
+    first = unpinched(steadied(skeleton, points), points)
+    skeleton = resampled(limited(first, low, high), 1.0)
     fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
                    progress=progress.part(0.5, 0.8))
     skeleton, late = _without_strands(fit.skeleton)

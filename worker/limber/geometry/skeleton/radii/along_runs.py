@@ -9,6 +9,7 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, MEASURED, S
 
 _RAG = 0.25  # of a run's median radius by length, under which a part of it speaks for nothing
 _STEADY = 40  # points whose nodes' radii make a steady one
+_SURE = 1.96  # standard deviations
 _SPEAK = 1 / 8  # of a run's nodes, and of its points, that speak for what follows
 
 
@@ -58,6 +59,26 @@ def steadied(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
     return replace(skeleton, radius=radius)
 
 
+def unpinched(skeleton: Skeleton, points: np.ndarray) -> Skeleton:
+    """Return the skeleton with no first radius under the median of its run's farther out.
+
+    Of a strip along a stem whose rest is hidden, contraction leaves a hair: too far from the axis,
+    in its radii, to be let there by the fit.
+
+    Args:
+        skeleton: With first radii.
+        points: Scanned points [m], shape [m, 3].
+    """
+    count, radius = point_counts(skeleton, points), skeleton.radius.copy()
+    for run, members in enumerate(skeleton.runs()):
+        own = members if run == 0 else members[1:]
+        for place, node in enumerate(own):
+            beyond = own[place:][count[own[place:]] > 0]
+            if len(beyond):
+                radius[node] = max(radius[node], _middle(skeleton.radius[beyond], count[beyond]))
+    return replace(skeleton, radius=radius)
+
+
 def limited(skeleton: Skeleton, low: float, high: float) -> Skeleton:
     """Return the skeleton with radii limited to [low, high] [m], those nodes marked.
 
@@ -73,8 +94,10 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float =
 
     A run is no thicker than its carrier where it starts, nor ``growth`` times the median of what
     was measured of it so far, nor at its tip than that median: a bunch of twigs that the scan did
-    not resolve would otherwise become a fat cylinder. What is far thinner than most of the run
-    speaks for nothing: a rag at a stem's foot does not make a hair of the stem. Nor do few points.
+    not resolve would otherwise become a fat cylinder. What limits counts as thick as its interval
+    allows: a foot that few points show says little of the twig. What is far thinner than most of
+    the run speaks for nothing: a rag at a stem's foot does not make a hair of the stem. Nor do few
+    points.
 
     Args:
         skeleton: Fitted.
@@ -82,12 +105,13 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float =
         growth: See above.
     """
     radius, state = skeleton.radius.copy(), skeleton.radius_state.copy()
+    at_most = radius + _SURE * skeleton.radius_sigma
     count = np.ones(skeleton.node_count) if count is None else count
     step = np.linalg.norm(skeleton.nodes - skeleton.nodes[np.maximum(skeleton.parent, 0)], axis=1)
     for run, members in enumerate(skeleton.runs()):
         own = members if run == 0 else members[1:]
         carrier = members[0]
-        cap = np.inf if run == 0 else max(radius[carrier], radius[skeleton.parent[carrier]])
+        cap = np.inf if run == 0 else max(at_most[carrier], at_most[skeleton.parent[carrier]])
         speaks = (state[own] == MEASURED) & (count[own] > 0)
         if speaks.any():
             speaks &= radius[own] > _RAG * _middle(radius[own[speaks]], step[own[speaks]])
@@ -98,9 +122,9 @@ def tapered(skeleton: Skeleton, count: np.ndarray | None = None, growth: float =
             if len(before) >= max(6, int(_SPEAK * len(own))) and (
                     told[place - 1] >= _SPEAK * total):
                 allowed = growth + (1 - growth) * place / len(own)
-                cap = min(cap, allowed * _middle(radius[before], count[before]))
+                cap = min(cap, allowed * _middle(at_most[before], count[before]))
             if radius[node] > cap:
-                radius[node], state[node] = cap, LIMITED
+                radius[node], at_most[node], state[node] = cap, cap, LIMITED
     return replace(skeleton, radius=radius, radius_state=state)
 
 
