@@ -400,7 +400,9 @@ def _is_strand(skeleton: Skeleton, run: int) -> bool:
         return False
     gap = np.linalg.norm(skeleton.nodes[own][:, None] - skeleton.nodes[others], axis=2)
     near = np.argmin(gap, axis=1)
-    share = gap[np.arange(len(own)), near] / skeleton.radius[others][near]
+    # A strand may be the thicker one of the two.
+    thick = np.maximum(skeleton.radius[others][near], skeleton.radius[own])
+    share = gap[np.arange(len(own)), near] / thick
     return float(np.median(share)) < 1.3
 
 
