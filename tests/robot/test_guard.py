@@ -192,6 +192,15 @@ def test_slip_is_told_from_the_predicted_force():
     assert decision.verdict == Verdict.STOP and "slipped" in decision.reason
 
 
+def test_less_force_than_predicted_is_named_as_what_it_most_often_is():
+    """8 N wanted: at 4.9 there is too much for a lost branch, too little for the prediction."""
+    bench = Bench()
+    bench.guard.begin()
+    bench.run(200, force=(8, 0, 0), expected=(8, 0, 0))
+    decision = bench.run(200, force=(4.9, 0, 0), expected=(8, 0, 0))
+    assert decision.verdict == Verdict.STOP and "slipped, broke or is softer" in decision.reason
+
+
 @pytest.mark.parametrize("off, sigma, verdict", [
     ((0, 0, 4.5), 2.0, Verdict.GO), ((0, 4.5, 0), 2.0, Verdict.STOP),
     ((0, 0, 6.0), 2.0, Verdict.STOP), ((0, 0, 14.0), 50.0, Verdict.STOP)])

@@ -23,6 +23,7 @@ from limber.robot.samples import Sample
 _RUNNING, _NORMAL, PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
 _DEVIATIONS = 2.0  # of a prediction that are allowed for
+_MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a difference lies
 _NO_DOUBT = np.zeros((6, 6))
 
 
@@ -339,15 +340,19 @@ class Guard:
                 return self._stop("the branch slipped, broke or was never held: force along the "
                                   "predicted one [N]", along, wanted)
         limits = settings.limits
+        off = filtered - expected
+        # What is missing along the predicted force is named as what it most often is.
+        is_short = wanted > settings.least_force and (
+            -float(off[:3] @ expected[:3]) > _MOSTLY * wanted * float(np.linalg.norm(off[:3])))
+        force_name = ("less force than predicted: the branch slipped, broke or is softer [N]"
+                      if is_short else "force unlike the predicted one [N]")
         for name, part, allowed, most in (
-                ("force unlike the predicted one [N]", slice(0, 3), limits.unexpected_force_n,
-                 limits.soft_force_n),
+                (force_name, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
                 ("torque unlike the predicted one [N m]", slice(3, 6),
                  settings.largest_torque_error, limits.hard_torque_nm)):
-            off = filtered[part] - expected[part]
-            error = float(np.linalg.norm(off))
+            error = float(np.linalg.norm(off[part]))
             if error > allowed:
-                within = _allowed(off, doubt[part, part], allowed, most)
+                within = _allowed(off[part], doubt[part, part], allowed, most)
                 if error > within:
                     return self._stop(name, error, within)
         return _GO
