@@ -315,16 +315,23 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
 def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, diagonal: float,
          camera: bool, progress: Progress):
     low, high = settings.radius_low * diagonal, settings.radius_high * diagonal
-    skeleton = resampled(unpinched(steadied(skeleton, points), points), 1.5)
-    fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
-                   progress=progress.part(0.0, 0.5))
+    first = steadied(skeleton, points)
+    fit = fit_axes(resampled(first, 1.5), points, along_sight=camera, uncertainty=False,
+                   progress=progress.part(0.0, 0.4))
+    # Of leaves too it would make thick stems, that seem to have none.
+    may_be_pinched = fit.seen.one_sided and _beside(fit) <= LEAF_SHARE
+    if may_be_pinched:
+        fit = fit_axes(resampled(unpinched(first, points), 1.5), points, along_sight=camera,
+                       uncertainty=False, progress=progress.part(0.4, 0.5))
     hung, _ = without_backward_starts(attached(fit.skeleton))
     skeleton = _with_full_tips(_without_bare_ends(hung, points), points, fit)
     # Noise makes a carrier look thicker, and its outliers look like twigs.
     reach = skeleton.radius + 2 * fit.noise
     keep, pruned = prune_spurs(skeleton.nodes, skeleton.parent, reach, settings.prune)
     skeleton, strands = _without_strands(skeleton.subset(keep))
-    first = unpinched(steadied(skeleton, points), points)
+    first = steadied(skeleton, points)
+    if may_be_pinched:
+        first = unpinched(first, points)
     skeleton = resampled(limited(first, low, high), 1.0)
     fit = fit_axes(skeleton, points, along_sight=camera, uncertainty=False,
                    progress=progress.part(0.5, 0.8))
@@ -337,7 +344,7 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     pruned += strands + late
     ended = _ends_within(fit.skeleton, points)
     # Where leaves swell or starve the axes, what lies beside a blank tells nothing of it either.
-    beside = float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
+    beside = _beside(fit)
     if beside <= LEAF_SHARE:
         ended = filled_in(ended, points)
     ended = limited(ended, low, high)
@@ -382,6 +389,11 @@ def _without_strands(skeleton: Skeleton) -> tuple[Skeleton, int]:
             run = skeleton.branch_count
         run -= 1
     return skeleton, count
+
+
+def _beside(fit: AxisFit) -> float:
+    """Share of the points that lie farther off their axis than twice its radius, as leaves do."""
+    return float(np.mean(fit.residual > fit.skeleton.radius[fit.segment]))
 
 
 def _is_strand(skeleton: Skeleton, run: int) -> bool:
