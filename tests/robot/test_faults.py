@@ -1,5 +1,6 @@
 """Faults while the robot moves, with the real client and processes: standstill and a report."""
 
+import signal
 import threading
 import time
 
@@ -123,6 +124,28 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(worker_address):
         # The program that was uploaded anew is watched like the first.
         assert robot.state["watchdog_s"] == pytest.approx(0.1)
         assert np.allclose(robot.state["pose"][:3], begin[:3], atol=1e-4)
+
+
+@pytest.mark.parametrize("held_up, ends", [("both", "reached"), ("the robot", "stopped")])
+def test_a_computer_that_stands_still_is_no_silent_robot(moving_robot, held_up, ends):
+    """Both held up for 80 ms: nothing was there to be heard. The robot alone: its data is old."""
+    with RobotLink(cell_for(moving_robot.address)) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(moving_robot, (0.0, 0.08, 0.0)))
+        time.sleep(0.8)
+        held = [moving_robot.process] + ([link.process] if held_up == "both" else [])
+        for process in reversed(held):
+            process.send_signal(signal.SIGSTOP)
+        time.sleep(0.08)
+        for process in held:
+            process.send_signal(signal.SIGCONT)
+        event = link.wait("reached", "stopped", seconds=10)
+        assert event["event"] == ends, event
+    if held_up == "both":
+        assert any("held the robot's program up" in each for each in link.warnings)
+    else:
+        assert "no data from the robot" in event["reason"]
 
 
 def test_after_a_stop_only_a_choice_moves_it(moving_robot):

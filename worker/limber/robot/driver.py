@@ -99,7 +99,7 @@ class Driver:
         self._batch: list[list[float]] = []
         self._batch_since = time.monotonic()
         self._last: Sample | None = None
-        self._woke = -np.inf
+        self._woke, self._listened = -np.inf, time.monotonic()
         self._heard = time.monotonic()
         self.ended = False
 
@@ -200,13 +200,12 @@ class Driver:
         quiet = 2.0 / self._stream.rate + 0.005
         self._stream.skip()
         while not self.ended:
-            began = time.monotonic()
             try:
                 samples = self._stream.read(quiet, self._sensor.connections)
             except ConnectionError as error:
                 self._lost(str(error))
                 return
-            self._note_hold_up(time.monotonic() - began - quiet)
+            self._note_hold_up(quiet)
             for sample in samples:
                 self._look(sample)
             if samples:
@@ -220,16 +219,18 @@ class Driver:
                 self._move(len(samples) / self._stream.rate)
             self._send_batch()
 
-    def _note_hold_up(self, overslept: float) -> None:
-        """See that the computer held this loop up while it listened.
+    def _note_hold_up(self, quiet: float) -> None:
+        """See that the computer held this loop up; it listens for ``quiet`` [s] at a time.
 
         What came meanwhile waits in the connections, and is read and judged. That nothing came
         tells of no silence yet: it is listened for once more, and no second time without a sample.
         """
+        before, self._listened = self._listened, time.monotonic()
+        overslept = self._listened - before - quiet
         if overslept < _HELD_UP_SECONDS:
             return
         if self._last is None or self._last.arrived > self._woke:
-            self._woke = time.monotonic()
+            self._woke = self._listened
         if self._following is not None:
             self.tell(event="warning", text=f"the computer held the robot's program up for "
                       f"{1000 * overslept:.0f} ms: nothing was watched in that time")
@@ -418,6 +419,8 @@ class Driver:
         if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
             # Here the gripper closed on the resting branch: ways are measured from here.
             self._held_for, self._held_at = rest, sample.pose.copy()
+        # Starting a program takes its time, and is no hold-up.
+        self._listened = time.monotonic()
         self.tell(event="started", seconds=trajectory.duration)
 
     def _start_program(self) -> None:
