@@ -184,21 +184,17 @@ def test_a_force_unlike_the_predicted_one_stops_long_before_the_limit():
     assert decision.verdict == Verdict.STOP and "unlike" in decision.reason
 
 
-def test_slip_is_told_from_the_predicted_force():
+@pytest.mark.parametrize("wanted, left, told", [
+    (5, 0.5, "never held"),
+    # Too much for a lost branch, too little for the prediction.
+    (8, 4.9, "slipped, broke or is softer")])
+def test_slip_is_told_from_the_predicted_force(wanted, left, told):
     bench = Bench()
     bench.guard.begin()
-    bench.run(200, force=(5, 0, 0), expected=(5, 0, 0))
-    decision = bench.run(200, force=(0.5, 0, 0), expected=(5, 0, 0))
-    assert decision.verdict == Verdict.STOP and "slipped" in decision.reason
-
-
-def test_less_force_than_predicted_is_named_as_what_it_most_often_is():
-    """8 N wanted: at 4.9 there is too much for a lost branch, too little for the prediction."""
-    bench = Bench()
-    bench.guard.begin()
-    bench.run(200, force=(8, 0, 0), expected=(8, 0, 0))
-    decision = bench.run(200, force=(4.9, 0, 0), expected=(8, 0, 0))
-    assert decision.verdict == Verdict.STOP and "slipped, broke or is softer" in decision.reason
+    bench.run(200, force=(wanted, 0, 0), expected=(wanted, 0, 0))
+    decision = bench.run(200, force=(left, 0, 0), expected=(wanted, 0, 0))
+    assert decision.verdict == Verdict.STOP
+    assert "slipped" in decision.reason and told in decision.reason
 
 
 @pytest.mark.parametrize("off, sigma, verdict", [
