@@ -135,7 +135,7 @@ def grasp_slopes(model: BranchModel, grasp: Grasp, displacement: np.ndarray) -> 
     pose = grasp.pose_of(model.mesh.nodes, displacement)
     positions = model.mesh.nodes[grasp.nodes] + displacement[grasp.nodes]
     arm = positions - pose[:3]
-    tangent = model.equations([grasp]).tangent(model, displacement)
+    tangent = model.equations([grasp]).exact_tangent(model, displacement)
     state = model.internal(displacement)
     held = state.force[grasp.nodes] - model.weight_force[grasp.nodes]
     rigid = np.zeros((6, *displacement.shape))
