@@ -22,6 +22,7 @@ import numpy as np
 from limber.errors import InputError
 from limber.robot.frames import crossed, frame_of, inverse_of, rotation_vector
 from limber.robot.real_time import claim_real_time, spare_what_is_loaded
+from limber.robot.virtual.kernels import led_on
 
 _SOLVER_PRIORITY = 10
 _REST = 0.25  # of what a solution took: a process that never rests is held up by the system
@@ -29,7 +30,6 @@ _BLEND_SECONDS = 0.05
 _LEAD = 1.5  # times what a solution takes: the middle of when it is used
 _LONGEST_LEAD = 0.5  # s
 _LEAST_WAY = 2e-3  # m between two solutions whose tangents are compared
-_FARTHEST = 0.03  # m over which such a change of the tangent is led on
 _SAME_PLACE = 1e-6  # m, rad; over that the tangent leads on exactly
 _TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
 
@@ -81,6 +81,15 @@ class BranchSetting:
                    tuple(map(float, truth.gravity)), compliance=cell.tool.compliance_m_per_n)
 
 
+Bends = tuple[np.ndarray, np.ndarray]
+"""Ways [m], shape [n, 3], and by how much the stiffness changes over each, shape [n, 6, 6]."""
+_NO_BENDS: Bends = np.zeros((0, 3)), np.zeros((0, 6, 6))
+
+
+def _joined(first: Bends, then: Bends) -> Bends:
+    return np.concatenate((first[0], then[0])), np.concatenate((first[1], then[1]))
+
+
 @dataclass
 class Solution:
     """The branch at one pose of the held patch.
@@ -94,8 +103,8 @@ class Solution:
         peak_strain: Greatest principal strain.
         seconds: What it took.
         converged: Whether it is an equilibrium; if not, the rest is of the last one.
-        bends: Ways [m, shape 3] and by how much the stiffness changes over each: the way from the
-            solution before first, then those that were tried when the gripper closed.
+        bends: Over the way from the solution before first, then over those that were tried when
+            the gripper closed.
     """
 
     frame: np.ndarray
@@ -106,30 +115,26 @@ class Solution:
     peak_strain: float
     seconds: float
     converged: bool
-    bends: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    bends: Bends = _NO_BENDS
+
+    def wrench_at(self, patch: np.ndarray, compliance: float) -> np.ndarray:
+        """Return the wrench [6] with the gripper where the patch's frame would be ``patch``.
+
+        The patch stays behind by ``compliance`` [m/N] times the force; near the own frame.
+        """
+        return led_on(self.frame, self.wrench, self.stiffness, *self.bends, patch, compliance)
 
     def change_to(self, patch: np.ndarray) -> np.ndarray:
         """Return the way [m] and the turn [rad] to another frame of the patch, shape [6]."""
         return np.concatenate((patch[:3, 3] - self.frame[:3, 3],
                                rotation_vector(patch @ inverse_of(self.frame))))
 
-    def secant(self, change: np.ndarray) -> np.ndarray:
-        """Return the stiffness that leads over ``change`` [6]: with half of how it changes."""
-        stiffness, left = self.stiffness, change[:3]
-        for way, bend in self.bends:
-            square = float(way @ way)
-            most = _FARTHEST / np.sqrt(square)
-            part = float(np.clip(left @ way / square, -most, most))
-            stiffness = stiffness + 0.5 * part * bend
-            left = left - part * way
-        return stiffness
-
-    def bend_from(self, before: "Solution") -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    def bend_from(self, before: "Solution") -> Bends:
         """Return how the stiffness has changed on the way from another solution, if it tells."""
         way = self.frame[:3, 3] - before.frame[:3, 3]
         if not (self.converged and before.converged and np.linalg.norm(way) > _LEAST_WAY):
-            return ()
-        return ((way, self.stiffness - before.stiffness),)
+            return _NO_BENDS
+        return way[None], (self.stiffness - before.stiffness)[None]
 
 
 class HeldBranch:
@@ -153,7 +158,7 @@ class HeldBranch:
         self._taken, self._asked_age = 0.0, 0.0
         self._jump = np.zeros(6)
         self._largest_jump = 0.0
-        self._tried: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+        self._tried = _NO_BENDS
         self._twist, self._last_patch = np.zeros(6), np.eye(4)
         self._gripper = self._closed_at = np.eye(4)
         self._view: dict[str, Any] | None = None
@@ -223,7 +228,7 @@ class HeldBranch:
                 self._solution, self._age, self.state = answer["solution"], 0.0, "held"
                 self._jump, self._largest_jump = np.zeros(6), 0.0
                 self._twist, self._last_patch = np.zeros(6), rest
-                self._taken, self._tried = answer["solution"].seconds, ()
+                self._taken, self._tried = answer["solution"].seconds, _NO_BENDS
                 self._pipe.send(("try", None))
                 self._busy = True
                 return
@@ -311,7 +316,7 @@ class HeldBranch:
             if before is not None:
                 # Where it hardly moved, what was known before still holds.
                 newest = found.bend_from(before)
-                found.bends = newest + self._tried if newest else before.bends
+                found.bends = _joined(newest, self._tried) if len(newest[0]) else before.bends
                 # The wrench goes over to the new solution, a branch's force does not jump.
                 jump = self._extrapolated(before, patch) - self._extrapolated(found, patch)
                 self._jump += jump
@@ -348,7 +353,7 @@ class HeldBranch:
         return content
 
     def _extrapolated(self, solution: Solution, patch: np.ndarray) -> np.ndarray:
-        return extrapolated(solution, patch, self.setting.compliance)
+        return solution.wrench_at(patch, self.setting.compliance)
 
     def _at_flange(self, wrench: np.ndarray, patch: np.ndarray, flange: np.ndarray) -> np.ndarray:
         """A wrench at the patch, branch frame, as one at the flange in its frame."""
@@ -357,23 +362,6 @@ class HeldBranch:
         origin = self._base[:3, :3] @ flange[:3, 3] + self._base[:3, 3]
         lever = rotation @ (patch[:3, 3] - origin)
         return np.concatenate((force, torque + crossed(lever, force)))
-
-
-def extrapolated(solution: Solution, patch: np.ndarray, compliance: float) -> np.ndarray:
-    """Return the wrench with the gripper where the patch's frame would be ``patch`` [4, 4].
-
-    The patch stays behind by ``compliance`` [m/N] times the force; near the frame of a solution.
-    """
-    change = solution.change_to(patch)
-    at, felt = change.copy(), np.zeros(6)
-    # The stiffness is that of the way that the patch goes, which the force tells.
-    for _ in range(2 if compliance > 0.0 and solution.bends else 1):
-        stiffness = solution.secant(at)
-        yielding = np.eye(6)
-        yielding[:, :3] += compliance * stiffness[:, :3]
-        felt = np.linalg.solve(yielding, solution.wrench + stiffness @ change)
-        at[:3] = change[:3] - compliance * felt[:3]
-    return felt
 
 
 def _solve_for_ever(setting: BranchSetting, pipe: Connection) -> None:
@@ -470,18 +458,18 @@ class _Solver:
         frame[:3, 3] = self._grasp.centre
         return {"centre": self._grasp.centre, "solution": self.solve(frame)}
 
-    def tried(self) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    def tried(self) -> Bends:
         """How the stiffness changes both ways across the branch, turned as it turns by itself."""
         solution, state = self._last, self._state
         if solution is None:
-            return ()
+            return _NO_BENDS
         stiffness = solution.stiffness
         axes = np.linalg.eigh(stiffness[:3, :3] + stiffness[:3, :3].T)[1]
-        bends: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+        bends = _NO_BENDS
         for way in _TRIED_WAY * axes.T[:2]:
             turn = -np.linalg.solve(stiffness[3:, 3:], stiffness[3:, :3] @ way)
-            bends += self.solve(frame_of(np.r_[solution.frame[:3, 3] + way, turn])
-                                ).bend_from(solution)
+            there = self.solve(frame_of(np.r_[solution.frame[:3, 3] + way, turn]))
+            bends = _joined(bends, there.bend_from(solution))
         self._state, self._last = state, solution
         return bends
 
@@ -489,7 +477,7 @@ class _Solver:
         """Return the solution at a frame of the patch; the last one where there is none."""
         from limber.mechanics.sensitivities import grasp_slopes
         from limber.mechanics.statics.solve import follow_poses
-        from limber.mechanics.strain import strain_state
+        from limber.mechanics.strain import peak_load
 
         pose = np.r_[patch[:3, 3], rotation_vector(patch)]
         # By the tangent of the solution before it is nearly there.
@@ -502,12 +490,12 @@ class _Solver:
             self._last = replace(self._last, seconds=result.seconds, converged=False)
             return self._last
         self._state = result.displacement
-        strain = strain_state(self._held, self._state).principal_strain
         slopes = grasp_slopes(self._held, self._grasp, self._state)
         self._follows = slopes.displacement
         points = (np.zeros((0, 6)) if self._operator is None
                   else self._operator @ slopes.displacement.reshape(-1, 6))
         self._last = Solution(
             patch, np.r_[result.reaction_force, result.reaction_torque], slopes.wrench,
-            self.seen(), points, float(np.abs(strain).max()), result.seconds, result.converged)
+            self.seen(), points, peak_load(self._held, self._state)[0], result.seconds,
+            result.converged)
         return self._last

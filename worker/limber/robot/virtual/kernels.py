@@ -1,10 +1,14 @@
-"""What the virtual controller computes at every step, compiled: flange pose and speed, servo."""
+"""What the virtual robot computes at every step, compiled: flange pose and speed, servo, and the
+wrench of the branch in its gripper.
+"""
 
 import numpy as np
 
 from limber.compiled import compiled
-from limber.robot.frames import rotation_vector
+from limber.robot.frames import inverse_of, rotation_vector
 from limber.robot.kinematics import _forward, _jacobian
+
+_FARTHEST = 0.03  # m over which a change of the tangent is led on
 
 
 @compiled
@@ -54,3 +58,36 @@ def servo_step(joints: np.ndarray, speeds: np.ndarray, target: np.ndarray, gain:
         new_speeds[k] = speeds[k] + change
         new_joints[k] = joints[k] + step * new_speeds[k]
     return new_joints, new_speeds
+
+
+@compiled
+def led_on(frame: np.ndarray, wrench: np.ndarray, stiffness: np.ndarray, ways: np.ndarray,
+           bends: np.ndarray, patch: np.ndarray, compliance: float) -> np.ndarray:
+    """Return the wrench [6] of a held branch near where it was solved.
+
+    Args:
+        frame, wrench, stiffness: Where it was solved [4, 4], the wrench there [6] and its
+            derivative to position and rotation [6, 6].
+        ways, bends: Ways [m], shape [n, 3], and by how much the stiffness changes over each,
+            shape [n, 6, 6]; the first that leads somewhere counts first.
+        patch: Frame of the held patch if nothing gave way, shape [4, 4].
+        compliance: What the patch stays behind by [m/N].
+    """
+    change = np.empty(6)
+    change[:3] = patch[:3, 3] - frame[:3, 3]
+    change[3:] = rotation_vector(patch @ inverse_of(frame))
+    at, felt = change.copy(), np.zeros(6)
+    # The stiffness is that of the way that the patch goes, which the force tells.
+    for _ in range(2 if compliance > 0.0 and len(ways) > 0 else 1):
+        secant, left = stiffness.copy(), at[:3].copy()
+        for way, bend in zip(ways, bends):  # noqa: B905 (no strict in a kernel)
+            square = (way * way).sum()
+            most = _FARTHEST / np.sqrt(square)
+            part = min(max((left * way).sum() / square, -most), most)
+            secant += 0.5 * part * bend
+            left -= part * way
+        yielding = np.eye(6)
+        yielding[:, :3] += compliance * secant[:, :3]
+        felt = np.linalg.solve(yielding, wrench + secant @ change)
+        at[:3] = change[:3] - compliance * felt[:3]
+    return felt
