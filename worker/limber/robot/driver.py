@@ -528,9 +528,8 @@ class Driver:
     def _send_batch(self) -> None:
         now = time.monotonic()
         if self._batch and now - self._batch_since >= _BATCH_SECONDS:
-            rows = [[None if not np.isfinite(x) else round(float(x), 7) for x in row]
-                    for row in self._batch]
-            self.tell(samples=rows)
+            rows = np.round(np.array(self._batch, float), 7)
+            self.tell(samples=np.where(np.isfinite(rows), rows, None).tolist())
             self._batch, self._batch_since = [], now
 
     def _require_sample(self) -> Sample:
