@@ -24,7 +24,11 @@ _RUNNING, _NORMAL, PLAYING = 7, 1, 2
 _SAME = 1e-9  # N, N m
 _DEVIATIONS = 2.0  # of a prediction that are allowed for
 _MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a difference lies
+_MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides pulls askew
 _NO_DOUBT = np.zeros((6, 6))
+_UNLIKE = "force unlike the predicted one [N]"
+_SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
+_FELL = "the predicted force fell at once: the branch slipped, broke or came loose [N]"
 
 
 class State(Enum):
@@ -104,6 +108,7 @@ class _Memory:
     frozen_since: float = 0.0
     filtered: np.ndarray | None = None
     peak: float = 0.0
+    usual_off: np.ndarray | None = None
     grasp: np.ndarray | None = None
     way: np.ndarray | None = None
 
@@ -341,11 +346,7 @@ class Guard:
                                   "predicted one [N]", along, wanted)
         limits = settings.limits
         off = filtered - expected
-        # What is missing along the predicted force is named as what it most often is.
-        is_short = wanted > settings.least_force and (
-            -float(off[:3] @ expected[:3]) > _MOSTLY * wanted * float(np.linalg.norm(off[:3])))
-        force_name = ("less force than predicted: the branch slipped, broke or is softer [N]"
-                      if is_short else "force unlike the predicted one [N]")
+        force_name = self._name_of(off[:3], expected[:3])
         for name, part, allowed, most in (
                 (force_name, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
                 ("torque unlike the predicted one [N m]", slice(3, 6),
@@ -356,6 +357,21 @@ class Guard:
                 if error > within:
                     return self._stop(name, error, within)
         return _GO
+
+    def _name_of(self, off: np.ndarray, expected: np.ndarray) -> str:
+        """Return what a force [3] beside the expected one [3] is called: what it most often is."""
+        memory, settings = self._memory, self._settings
+        before = off if memory.usual_off is None else memory.usual_off
+        kept = np.exp(-self._step / settings.loss_time)
+        memory.usual_off = kept * before + (1 - kept) * off
+        wanted, missing = float(np.linalg.norm(expected)), -float(off @ expected)
+        if wanted <= settings.least_force:
+            return _UNLIKE
+        size = wanted * float(np.linalg.norm(off))
+        at_once = np.linalg.norm(off - before) > 0.5 * np.linalg.norm(off)
+        if at_once and missing > _MOSTLY_AT_ONCE * size:
+            return _FELL
+        return _SHORT if missing > _MOSTLY * size else _UNLIKE
 
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
         decision = Decision(Verdict.STOP, reason, value, limit)
