@@ -142,6 +142,8 @@ class HeldBranch:
 
     def __init__(self, setting: BranchSetting):
         self.setting = setting
+        # Compiled before the robot's clock runs.
+        led_on(np.eye(4), np.zeros(6), np.eye(6), *_NO_BENDS, np.eye(4), 0.0)
         self._base = frame_of(np.array(setting.base_pose, float))
         self._tool = frame_of(np.array(setting.grasp_pose, float))
         context = get_context("spawn")
