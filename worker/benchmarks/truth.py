@@ -89,15 +89,15 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
     # A refusal is no small error.
     worst = [float(np.abs(each.errors).max()) if each.errors else np.inf for each in trials]
     covered = np.concatenate([each.covered for each in fitted])
-    ratio = np.concatenate([np.array(each.widths) / _bound(each) for each in fitted])
+    ratio = np.concatenate([np.array(each.widths) / _half_widths(each) for each in fitted])
     width = np.median([each.widths for each in fitted])
     share, median = float(covered.mean()), float(np.median(worst))
     ninth = float(np.quantile(worst, 0.9, method="lower"))
     refused = len(trials) - len(fitted)
     told = f", {refused} refused" if refused else ""
-    told += (f"; of truths whose field runs as differently as the fit's prior takes it to, no fit "
-             f"comes below {100 * _efficient_median(fitted):.1f} %: the forms drawn here differ "
-             "less, and are no such limit")
+    told += f"; as good as the data allow: {_efficient([each.bound for each in fitted])}"
+    told += (", were the form of the field known: "
+             f"{_efficient([each.bound_of_known_form for each in fitted])}")
     enough = not quick
     return [
         Row(f"{label}: median of the worst E error", f"{100 * asked:.0f} %",
@@ -111,20 +111,25 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
             bool(np.nanmedian(ratio) <= 1.5))]
 
 
-def _bound(trial: Trial) -> np.ndarray:
-    """A trial's bounds; a kept one has None where there is none."""
-    return np.array(trial.bound, float)
+def _half_widths(trial: Trial) -> np.ndarray:
+    """Of 95 % intervals of log E by a trial's bound, shape [4]."""
+    return 1.96 * np.sqrt(np.diag(np.array(trial.bound, float)))
 
 
-def _efficient_median(trials: list[Trial]) -> float:
-    """Median of the worst E error of estimates as good as the Cramer-Rao bounds allow.
+def _efficient(bounds: list[tuple]) -> str:
+    """Median, in percent, of the worst E error of estimates that attain Cramer-Rao bounds.
 
-    Drawn from the bounds of the trials, the moduli's errors as independent of each other. What is
-    known beforehand is in the bounds as in the fit: they hold on the average over truths drawn
-    from the fit's prior. Where the field's form is drawn from less than that, estimates come closer
-    than these bounds, and their intervals hold more often than they say.
+    What is known beforehand is in the bounds as in the fit: they hold on the average over truths
+    drawn from the fit's prior. The field's form is drawn from less than that here. Estimates then
+    come between this and the same with that form known, which no fit comes below, and their
+    intervals hold more often than they say.
+
+    Args:
+        bounds: Covariance of log E of each trial, shape [4, 4]; a kept one has None where there is
+            none.
     """
-    sigma = np.array([_bound(each) for each in trials]) / 1.96
-    sigma = sigma[np.isfinite(sigma).all(axis=1)]
-    drawn = np.random.default_rng(0).standard_normal((1000, *sigma.shape)) * sigma
-    return float(np.median(np.abs(np.expm1(drawn)).max(axis=-1)))
+    covariance = np.array(bounds, float)
+    covariance = covariance[np.isfinite(covariance).all(axis=(1, 2))]
+    drawn = np.random.default_rng(0).standard_normal((1000, len(covariance), 4, 1))
+    errors = np.expm1(np.linalg.cholesky(covariance) @ drawn)
+    return f"{100 * np.median(np.abs(errors).max(axis=(-2, -1))):.1f} %"

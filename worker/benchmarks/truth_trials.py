@@ -23,8 +23,8 @@ from benchmarks.truth_branch import (
     recorded,
 )
 from limber.errors import Cancelled, LimberError
-from limber.estimation.doubt.causes import variance_parts
 from limber.estimation.doubt.model_error import total_interval
+from limber.estimation.doubt.uncertainty import inverse_information
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.field_form import open_field
 from limber.estimation.fit import Estimate, fit_branch, judge_model, require_result
@@ -53,7 +53,8 @@ class Trial:
         errors: Relative errors of the moduli, shape [4].
         covered: Whether each 95 % interval holds the truth, shape [4].
         widths: Half widths of the intervals in log E, shape [4].
-        bound: 1.96 deviations of log E by the Cramer-Rao bound, shape [4].
+        bound: Covariance of log E by the Cramer-Rao bound, shape [4, 4].
+        bound_of_known_form: The same if the form of the field were known.
         variance_factor: Mean squared residual over the stated.
         converged: Of the optimiser.
         seconds: Of the fit.
@@ -66,7 +67,8 @@ class Trial:
     errors: tuple[float, ...] = ()
     covered: tuple[bool, ...] = ()
     widths: tuple[float, ...] = ()
-    bound: tuple[float, ...] = ()
+    bound: tuple[tuple[float, ...], ...] = ()
+    bound_of_known_form: tuple[tuple[float, ...], ...] = ()
     variance_factor: float = float("nan")
     converged: bool = False
     seconds: float = 0.0
@@ -100,8 +102,9 @@ def trial(seed: tuple[int, ...], calibration: CalibrationEntry, pull_count: int,
     return Trial(
         seed, truth.form, tuple((found.young / truth.young - 1).tolist()),
         tuple(((low <= log_truth) & (log_truth <= high)).tolist()),
-        tuple(((high - low) / 2).tolist()),
-        tuple((1.96 * bound(truth, found.objective, subject)).tolist()),
+        tuple(((high - low) / 2).tolist()), *(tuple(map(tuple, covariance.tolist()))
+                                              for covariance in bounds(truth, found.objective,
+                                                                       subject)),
         found.uncertainty.variance_factor, found.fit.converged, seconds, source=source)
 
 
@@ -119,14 +122,21 @@ def fitting_subject(truth: Truth) -> Subject:
     return _subject(branch.mesh(slice_length=3.0, sides=8), truth, POISSON, DENSITY)
 
 
-def bound(truth: Truth, objective: Objective, subject: Subject) -> np.ndarray:
-    """Standard deviation of log E by the Cramer-Rao bound, shape [4]; no link helps it."""
+def bounds(truth: Truth, objective: Objective, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances of log E by the Cramer-Rao bound, each of shape [4, 4]; no link helps them.
+
+    With the form of the field as little known as the fit takes it to be, and with it known: no fit
+    that knows as little of the cell comes below the latter, however forms are drawn.
+    """
     objective = objective.with_space(objective.space.linked(()))
     evaluation = objective.evaluate(objective.space.pack(true_values(truth, subject)),
                                     jacobian=True)
+    count = len(truth.young)
     if evaluation is None:
-        return np.full(len(truth.young), np.nan)
-    return np.sqrt(np.sum(list(variance_parts(evaluation, objective).values()), axis=0))
+        return (np.full((count, count), np.nan),) * 2
+    known = [name not in subject.field.names for name in objective.space.names]
+    return tuple(inverse_information(slopes)[:count, :count] for slopes in (
+        evaluation.jacobian, evaluation.jacobian[:, known]))
 
 
 def true_values(truth: Truth, subject: Subject) -> Values:

@@ -1,0 +1,30 @@
+"""How close estimates of the truth bench can come."""
+
+import numpy as np
+from tests.subjects.paper_branches import measured
+
+from benchmarks.truth import _efficient
+from benchmarks.truth_branch import drawn_truth, exact_pull
+from benchmarks.truth_trials import SETTINGS, bounds, fitting_subject
+from limber.estimation.objective import Objective
+from limber.estimation.preparation import forwards_of, parameter_space
+
+
+def test_moduli_that_err_together_count_as_one():
+    """A tenth off all alike: the median of a normal's size is .67 of its deviation."""
+    together = np.full((4, 4), 0.01) + 1e-12 * np.eye(4)
+    assert abs(float(_efficient([together, together]).split()[0]) - 6.8) < 0.4
+    assert float(_efficient([0.01 * np.eye(4)]).split()[0]) > 14
+    nothing = np.full((4, 4), None)
+    assert _efficient([together, nothing]) == _efficient([together])
+
+
+def test_a_known_form_leaves_less_open():
+    """Of one drawn branch and pull; less of each modulus and of any mixture of them."""
+    truth = drawn_truth(np.random.default_rng(3))
+    subject = fitting_subject(truth)
+    forwards = forwards_of([measured(exact_pull(truth, 0, 0.0), 4)], subject, SETTINGS)
+    objective = Objective(forwards, parameter_space(subject, forwards, SETTINGS))
+    as_fitted, of_known_form = bounds(truth, objective, subject)
+    assert np.all(np.linalg.eigvalsh(as_fitted - of_known_form) > -1e-9)
+    assert np.all(np.diag(of_known_form) < 0.8 * np.diag(as_fitted))
