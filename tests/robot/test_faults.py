@@ -1,5 +1,6 @@
 """Faults while the robot moves, with the real client and processes: standstill and a report."""
 
+import shutil
 import signal
 import threading
 import time
@@ -16,6 +17,7 @@ from benchmarks.robot_faults import (
     restored,
     straight,
 )
+from limber.compiled import cache_folder
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
 from limber.robot.expected import ExpectedWrench
@@ -146,6 +148,19 @@ def test_a_computer_that_stands_still_is_no_silent_robot(moving_robot, held_up, 
         assert any("held the robot's program up" in each for each in link.warnings)
     else:
         assert "no data from the robot" in event["reason"]
+
+
+def test_a_first_run_compiles_before_the_watchdog_listens(moving_robot, tmp_path, monkeypatch):
+    """It had just compiled, and looked for what that left behind while its watchdog ran out."""
+    kernels = tmp_path / "kernels"
+    shutil.copytree(cache_folder(), kernels, ignore=shutil.ignore_patterns("frames.*"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernels))
+    with RobotLink(cell_for(moving_robot.address)) as link:
+        assert any(kernels.rglob("frames.turned_wrench*.nbc"))
+        time.sleep(0.3)
+        link.tare()
+        link.start(straight(moving_robot, (0.0, 0.02, 0.0)))
+        assert link.wait("reached", "stopped", seconds=10)["event"] == "reached"
 
 
 def test_after_a_stop_only_a_choice_moves_it(moving_robot):

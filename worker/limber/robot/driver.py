@@ -87,6 +87,8 @@ class Driver:
         self._chain = WrenchChain(cell, count=5 if self._stream.rate > 200 else 3)
         self.guard = self._new_guard()
         self._warm_up()
+        # Now: where it has just compiled this takes longer than the watchdog would wait.
+        spare_what_is_loaded()
         self._control = self._connect(address)
         self._following: Following | None = None
         self._gone: Trajectory | None = None
@@ -567,7 +569,6 @@ def main() -> int:
     driver: Driver | None = None
     try:
         driver = Driver(Cell.model_validate_json(sys.stdin.readline()), words)
-        spare_what_is_loaded()
         driver.tell(event="connected", **driver.facts)
         orders: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=_read_orders, args=(orders,), daemon=True).start()
