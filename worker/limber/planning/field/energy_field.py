@@ -207,13 +207,13 @@ class EnergyField:
 
     def poses(self, points: np.ndarray) -> np.ndarray:
         """Return positions with the rotation that the grasped piece takes there, [n, 6]."""
-        return np.hstack([_rows(points), self._value(self.shape_fit, points, True)[:, :3]])
+        return np.hstack([_rows(points), self._value(self.shape_fit, points, slice(3), True)])
 
     def tip(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
         """Return where the branch's tip, or a target, is with the grasp at ``points`` [m], [n, 3].
         """
         first = 3 if target is None else 6 + 3 * target
-        return self._value(self.shape_fit, points, True)[:, first:first + 3]
+        return self._value(self.shape_fit, points, slice(first, first + 3), True)
 
     def tip_gradient(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
         """Return d tip_c / d x_k, shape [n, 3 (k), 3 (c)]."""
@@ -221,18 +221,21 @@ class EnergyField:
         return np.stack([self._gradient(self.shape_fit, points, first + c, True)
                          for c in range(3)], axis=2)
 
-    def _value(self, fit: RadialInterpolant, points: np.ndarray, shape: bool = False,
-               ) -> np.ndarray:
-        return fit.value((self.shape_chart if shape else self.chart).map(_rows(points)))
+    def _value(self, fit: RadialInterpolant, points: np.ndarray, channels: slice = slice(1),
+               shape: bool = False) -> np.ndarray:
+        chart = self.shape_chart if shape else self.chart
+        return fit.value(chart.map(_rows(points)), channels)
 
     def _gradient(self, fit: RadialInterpolant, points: np.ndarray, channel: int,
                   shape: bool = False) -> np.ndarray:
         points, chart = _rows(points), self.shape_chart if shape else self.chart
-        return chart.pull_back(points, fit.gradient(chart.map(points))[:, :, channel])
+        slope = fit.gradient(chart.map(points), slice(channel, channel + 1))
+        return chart.pull_back(points, slope[:, :, 0])
 
     def load(self, points: np.ndarray, name: str) -> np.ndarray:
         """Return one of ``LOADS`` at ``points`` [n, 3], shape [n]."""
-        return self._value(self.load_fit, points, True)[:, LOADS.index(name)]
+        channel = LOADS.index(name)
+        return self._value(self.load_fit, points, slice(channel, channel + 1), True)[:, 0]
 
     def load_gradient(self, points: np.ndarray, name: str) -> np.ndarray:
         """Return its gradient to the position, shape [n, 3]."""

@@ -7,11 +7,13 @@ gives the force beside the energy, which is the energy's gradient: the second su
 interpolation, Wu 1992) makes the field match both, so the same number of solutions tells
 ``1 + dimension`` times as much.
 
-The fit is dense linear algebra; values and gradients are evaluated by compiled loops that the
-planner calls some hundred thousand times.
+The fit is dense linear algebra; values and gradients, in three coordinates, are evaluated by
+compiled loops that the planner calls some million times: each over all samples, of which arrays in
+the order of the loop hold one coordinate, so that the processor takes several at once.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -124,19 +126,24 @@ class RadialInterpolant:
         missed[:, 1:] /= scale
         return missed
 
-    def value(self, points: np.ndarray) -> np.ndarray:
-        """Return the field at ``points`` [n, dimension], shape [n, channels]."""
-        return _values(np.ascontiguousarray(points, float), *self.arrays)
+    def value(self, points: np.ndarray, channels: slice = slice(None)) -> np.ndarray:
+        """Return ``channels`` of the field at ``points`` [n, 3], shape [n, channels]."""
+        return _values(np.ascontiguousarray(points, float), self._asked(channels), *self.arrays)
 
-    def gradient(self, points: np.ndarray) -> np.ndarray:
-        """Return its gradient, shape [n, dimension, channels]."""
-        return _gradients(np.ascontiguousarray(points, float), *self.arrays)
+    def gradient(self, points: np.ndarray, channels: slice = slice(None)) -> np.ndarray:
+        """Return their gradients, shape [n, 3, channels]."""
+        return _gradients(np.ascontiguousarray(points, float), self._asked(channels), *self.arrays)
 
-    @property
+    def _asked(self, channels: slice) -> np.ndarray:
+        return np.arange(self.value_weights.shape[1])[channels]
+
+    @cached_property
     def arrays(self) -> tuple:
-        """What the compiled loops take after the point."""
-        return (KERNELS[self.kernel], self.shape, self.shift, self.scale, self.centres,
-                self.value_weights, self.gradient_weights, self.polynomial, self.powers)
+        """What the compiled loops take after the point; samples along the last axis."""
+        return (KERNELS[self.kernel], self.shape, self.scale, self.shift,
+                np.ascontiguousarray(self.centres.T), np.ascontiguousarray(self.value_weights.T),
+                np.ascontiguousarray(self.gradient_weights.transpose(2, 1, 0)), self.polynomial,
+                self.powers)
 
     def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """Return plain arrays for an ``npz`` file, names starting with ``prefix``."""
@@ -262,91 +269,128 @@ def _system(centres, kernel, shape, with_gradients):
 
 
 @compiled
-def value_at(point, channel, kernel, shape, shift, scale, centres, value_weights,
+def value_at(point, channel, kernel, shape, scale, shift, centres, value_weights,
              gradient_weights, polynomial, powers):
-    """Return one channel of the field at ``point`` [dimension]."""
-    count, dimension = centres.shape
-    with_gradients = gradient_weights.shape[0] > 0
-    scaled = (point - shift) / scale
-    total = 0.0
-    for j in range(count):
-        squared = 0.0
-        along = 0.0
-        for k in range(dimension):
-            d = scaled[k] - centres[j, k]
-            squared += d * d
-            if with_gradients:
-                along += d * gradient_weights[j, k, channel]
-        phi, a, _b = radial_terms(kernel, shape, squared)
-        total += value_weights[j, channel] * phi - a * along
-    for t in range(powers.shape[0]):
-        term = polynomial[t, channel]
-        for k in range(dimension):
-            if powers[t, k] > 0:
-                term *= scaled[k] ** powers[t, k]
-        total += term
+    """Return one channel of the field at ``point`` [3]; arrays as ``RadialInterpolant.arrays``."""
+    scaled = _scaled(point, shift, scale)
+    weights, slopes = value_weights[channel], gradient_weights[channel]
+    # With the kernel's number written out the choice is made outside the loop, as it has to be.
+    if kernel == 0:
+        total = _value_sum(0, scaled, shape, centres, weights, slopes)
+    elif kernel == 1:
+        total = _value_sum(1, scaled, shape, centres, weights, slopes)
+    elif kernel == 2:
+        total = _value_sum(2, scaled, shape, centres, weights, slopes)
+    else:
+        total = _value_sum(3, scaled, shape, centres, weights, slopes)
+    x, y, z = scaled
+    for t in range(len(powers)):
+        total += polynomial[t, channel] * (
+            _power(x, powers[t, 0]) * _power(y, powers[t, 1]) * _power(z, powers[t, 2]))
     return total
 
 
 @compiled
-def gradient_at(point, channel, kernel, shape, shift, scale, centres, value_weights,
-                gradient_weights, polynomial, powers, out):
-    """Write the gradient of one channel at ``point`` into ``out`` [dimension]."""
-    count, dimension = centres.shape
-    with_gradients = gradient_weights.shape[0] > 0
-    scaled = (point - shift) / scale
-    for k in range(dimension):
-        out[k] = 0.0
-    for j in range(count):
-        squared = 0.0
-        along = 0.0
-        for k in range(dimension):
-            d = scaled[k] - centres[j, k]
-            squared += d * d
-            if with_gradients:
-                along += d * gradient_weights[j, k, channel]
-        _phi, a, b = radial_terms(kernel, shape, squared)
-        radial = value_weights[j, channel] * a - b * along
-        for k in range(dimension):
-            d = scaled[k] - centres[j, k]
-            out[k] += radial * d
-            if with_gradients:
-                out[k] -= a * gradient_weights[j, k, channel]
-    for t in range(powers.shape[0]):
-        for axis in range(dimension):
-            if powers[t, axis] == 0:
-                continue
-            term = polynomial[t, channel] * powers[t, axis]
-            for k in range(dimension):
-                power = powers[t, k] - 1 if k == axis else powers[t, k]
-                if power > 0:
-                    term *= scaled[k] ** power
-            out[axis] += term
-    for k in range(dimension):
-        out[k] /= scale
+def _value_sum(kernel, scaled, shape, centres, weights, slopes):
+    x, y, z = scaled
+    first, second, third = centres[0], centres[1], centres[2]
+    along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
+    total = 0.0
+    if len(along_x) > 0:
+        for j in range(len(weights)):
+            dx, dy, dz = x - first[j], y - second[j], z - third[j]
+            phi, a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+            total += weights[j] * phi - a * (dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
+        return total
+    for j in range(len(weights)):
+        dx, dy, dz = x - first[j], y - second[j], z - third[j]
+        phi, _a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+        total += weights[j] * phi
+    return total
 
 
 @compiled
-def _values(points, kernel, shape, shift, scale, centres, value_weights, gradient_weights,
-            polynomial, powers):
-    out = np.empty((len(points), value_weights.shape[1]))
-    for i in range(len(points)):
-        for channel in range(value_weights.shape[1]):
-            out[i, channel] = value_at(
-                points[i], channel, kernel, shape, shift, scale, centres, value_weights,
-                gradient_weights, polynomial, powers)
+def gradient_at(point, channel, kernel, shape, scale, shift, centres, value_weights,
+                gradient_weights, polynomial, powers, out):
+    """Write the gradient of one channel at ``point`` [3] into ``out`` [3]."""
+    scaled = _scaled(point, shift, scale)
+    weights, slopes = value_weights[channel], gradient_weights[channel]
+    if kernel == 0:
+        total = _slope_sum(0, scaled, shape, centres, weights, slopes)
+    elif kernel == 1:
+        total = _slope_sum(1, scaled, shape, centres, weights, slopes)
+    elif kernel == 2:
+        total = _slope_sum(2, scaled, shape, centres, weights, slopes)
+    else:
+        total = _slope_sum(3, scaled, shape, centres, weights, slopes)
+    (x, y, z), (along_x, along_y, along_z) = scaled, total
+    for t in range(len(powers)):
+        p, q, r = powers[t, 0], powers[t, 1], powers[t, 2]
+        term = polynomial[t, channel]
+        along_x += term * p * _power(x, p - 1) * _power(y, q) * _power(z, r)
+        along_y += term * q * _power(x, p) * _power(y, q - 1) * _power(z, r)
+        along_z += term * r * _power(x, p) * _power(y, q) * _power(z, r - 1)
+    out[0], out[1], out[2] = along_x / scale, along_y / scale, along_z / scale
+
+
+@compiled
+def _slope_sum(kernel, scaled, shape, centres, weights, slopes):
+    x, y, z = scaled
+    first, second, third = centres[0], centres[1], centres[2]
+    along_x, along_y, along_z = slopes[0], slopes[1], slopes[2]
+    sum_x, sum_y, sum_z = 0.0, 0.0, 0.0
+    if len(along_x) > 0:
+        for j in range(len(weights)):
+            dx, dy, dz = x - first[j], y - second[j], z - third[j]
+            _phi, a, b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+            radial = weights[j] * a - b * (
+                dx * along_x[j] + dy * along_y[j] + dz * along_z[j])
+            sum_x += radial * dx - a * along_x[j]
+            sum_y += radial * dy - a * along_y[j]
+            sum_z += radial * dz - a * along_z[j]
+        return sum_x, sum_y, sum_z
+    for j in range(len(weights)):
+        dx, dy, dz = x - first[j], y - second[j], z - third[j]
+        _phi, a, _b = radial_terms(kernel, shape, dx * dx + dy * dy + dz * dz)
+        sum_x += weights[j] * a * dx
+        sum_y += weights[j] * a * dy
+        sum_z += weights[j] * a * dz
+    return sum_x, sum_y, sum_z
+
+
+@compiled
+def _scaled(point, shift, scale):
+    return ((point[0] - shift[0]) / scale, (point[1] - shift[1]) / scale,
+            (point[2] - shift[2]) / scale)
+
+
+@compiled
+def _power(x, exponent):
+    out = 1.0
+    for _ in range(exponent):
+        out *= x
     return out
 
 
 @compiled
-def _gradients(points, kernel, shape, shift, scale, centres, value_weights, gradient_weights,
-               polynomial, powers):
-    channels = value_weights.shape[1]
-    out = np.empty((len(points), points.shape[1], channels))
-    slope = np.empty(points.shape[1])
+def _values(points, channels, kernel, shape, scale, shift, centres, value_weights,
+            gradient_weights, polynomial, powers):
+    out = np.empty((len(points), len(channels)))
     for i in range(len(points)):
-        for channel in range(channels):
-            gradient_at(points[i], channel, kernel, shape, shift, scale, centres,
+        for c in range(len(channels)):
+            out[i, c] = value_at(points[i], channels[c], kernel, shape, scale, shift, centres,
+                                 value_weights, gradient_weights, polynomial, powers)
+    return out
+
+
+@compiled
+def _gradients(points, channels, kernel, shape, scale, shift, centres, value_weights,
+               gradient_weights, polynomial, powers):
+    out = np.empty((len(points), 3, len(channels)))
+    slope = np.empty(3)
+    for i in range(len(points)):
+        for c in range(len(channels)):
+            gradient_at(points[i], channels[c], kernel, shape, scale, shift, centres,
                         value_weights, gradient_weights, polynomial, powers, slope)
-            out[i, :, channel] = slope
+            out[i, :, c] = slope
     return out
