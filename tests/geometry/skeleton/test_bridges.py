@@ -80,6 +80,23 @@ def test_stems_are_joined_before_twigs() -> None:
     assert joined.label.max() == 0
 
 
+def test_a_twigs_foot_that_is_nearer_than_the_stems_next_patch_is_not_taken_for_it() -> None:
+    """It leaves the patch and the upper stem to come from aside: all together the other way costs
+    half."""
+    low, patch, high = (_line([0, 0, 0], [0, 0, 0.3]), _line([0, 0, 0.342], [0, 0, 0.347], 2),
+                        _line([0, 0, 0.4], [0, 0, 0.7]))
+    foot = np.array([0.012, 0, 0.325])
+    twig = _line(foot, foot + 0.2 * np.array([np.sin(0.6), 0, np.cos(0.6)]))
+    nodes, edges = _forest(low, patch, high, twig)
+    joined = join_pieces(nodes, edges, np.repeat([0.006, 0.004, 0.006, 0.005], [12, 2, 12, 12]),
+                         np.full(38, 20), np.zeros(38), gap=0.01, bridge_limit=0.3, up=Z,
+                         join_plants=False)
+    assert joined.label.max() == 0
+    assert {11, 14} in [set(pair) for pair in joined.bridges.tolist()]
+    twigs = next(pair for pair in joined.bridges.tolist() if 26 in pair)
+    assert np.abs(joined.nodes[twigs, 0]).min() < 1e-9
+
+
 def test_a_twig_at_a_stems_end_does_not_close_it() -> None:
     """An end that a bridge joined from the side stays one, with its direction; the bridge has none.
     """

@@ -1,6 +1,6 @@
 """Pieces of a scan: which belong to one plant and are bridged, and which are left away."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import scipy.sparse as sparse
@@ -19,6 +19,9 @@ _AHEAD, _BEHIND = np.deg2rad(10.0), np.deg2rad(15.0)
 # Length in thicknesses, under which a piece tells no direction; and if it has few points.
 _SPECK, _SPECK_FEW, _FEW = 5.0, 10.0, 30
 _SINGLE = 2  # nodes of a piece that tells no direction
+_ODD = 1.9  # price of a bridge over its length, from which those around it are tried without
+_AROUND = 2.0  # lengths of such a bridge
+_CLEARLY = 0.98  # of what all bridges cost, under which others are better
 _PLANT_SHARE = 0.2  # of all points, from which a piece may be a plant of its own
 _BASE_SHARE = 0.12  # of a piece's reach, up to which a bridge starts at its base
 _FAR_SHARE = 0.3  # from which it starts far from its base
@@ -43,6 +46,7 @@ class Joined:
         label: Which piece each node belongs to now, shape [n].
         joints: Edges by which bridges joined the side of a piece, the bridge's node first, shape
             [j, 2].
+        piece: Which of the given pieces each node is of, -1 along bridges, shape [n].
     """
 
     nodes: np.ndarray
@@ -55,10 +59,30 @@ class Joined:
     plants: np.ndarray
     label: np.ndarray
     joints: np.ndarray
+    piece: np.ndarray
 
     def ends(self) -> Ends:
         """The free ends of the pieces."""
         return free_ends(self.nodes, self.edges, self.thickness, self.joints)
+
+    def lengths(self) -> np.ndarray:
+        """Of each bridge [m], shape [b]."""
+        return np.linalg.norm(self.nodes[self.bridges[:, 0]] - self.nodes[self.bridges[:, 1]],
+                              axis=1)
+
+    def cost(self) -> float:
+        """What all bridges cost [m]."""
+        return float(self.prices @ self.lengths())
+
+
+@dataclass(frozen=True)
+class _Rules:
+    """What bridges may be, as :func:`join_pieces` has it."""
+
+    gap: float
+    bridge_limit: float
+    up: np.ndarray
+    join_plants: bool
 
 
 def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, support: np.ndarray,
@@ -82,34 +106,87 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
         up: Which way is up, shape [3].
         join_plants: Join even what looks like two plants.
     """
-    state = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
-                   np.empty(0), np.empty((0, 2), np.int64), _labels(len(nodes), edges),
-                   np.empty((0, 2), np.int64))
+    label = _labels(len(nodes), edges)
+    first = Joined(nodes, thickness, support, spread, edges, np.empty((0, 2), np.int64),
+                   np.empty(0), np.empty((0, 2), np.int64), label, np.empty((0, 2), np.int64),
+                   label)
+    rules = _Rules(gap, bridge_limit, up, join_plants)
+    state = _reconsidered(first, _joined(first, rules), rules)
+    plants = _apart(state.nodes, state.thickness, state.support, state.label, up)
+    state.plants = np.array(plants, np.int64).reshape(-1, 2)
+    return state
+
+
+def _joined(first: Joined, rules: _Rules, refused: frozenset[tuple[int, int]] = frozenset(),
+            dearest: float = np.inf) -> Joined:
+    """Bridge after bridge from what was given; those between ``refused`` pieces are not made.
+
+    It ends early once they cost ``dearest`` [m].
+    """
+    state = replace(first)
     # One node or two tell no direction: unless an end goes straight on to them, they come last.
     alone = True
     while True:
         weight = np.bincount(state.label, state.support)
-        if len(weight) == 1:
+        if len(weight) == 1 or state.cost() >= dearest:
             break
         ends = state.ends()
-        found = hypotheses(state.nodes, state.edges, state.thickness, state.label, weight,
-                           bridge_limit, ends)
-        chosen = _mutual(found, state, ends, weight, gap, bridge_limit, up, join_plants, alone)
+        found = _unrefused(hypotheses(state.nodes, state.edges, state.thickness, state.label,
+                                      weight, rules.bridge_limit, ends), state.piece, refused)
+        chosen = _mutual(found, state, ends, weight, rules, alone)
         if not chosen and alone:
             alone = False
             continue
         if not chosen:
             break
         for place in chosen:
-            _bridge(state, ends, found, place, gap / 3)
+            _bridge(state, ends, found, place, rules.gap / 3)
         state.label = _labels(len(state.nodes), state.edges)
-    plants = _apart(state.nodes, state.thickness, state.support, state.label, up)
-    state.plants = np.array(plants, np.int64).reshape(-1, 2)
     return state
 
 
-def _mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, gap: float,
-            limit: float, up: np.ndarray, join_plants: bool, alone: bool) -> list[int]:
+def _reconsidered(first: Joined, state: Joined, rules: _Rules) -> Joined:
+    """The bridges without one that left an odd one to others, if all together then cost less.
+
+    A stem's end takes the foot of a twig that happens to be nearer than the stem's next patch;
+    that patch is then left to come to the twig from aside.
+    """
+    refused: frozenset[tuple[int, int]] = frozenset()
+    while True:
+        best, without = state, refused
+        for pair in _doubted(state, rules.gap):
+            dearest = _CLEARLY * best.cost()
+            other = _joined(first, rules, refused | {pair}, dearest)
+            if other.label.max() <= best.label.max() and other.cost() < dearest:
+                best, without = other, refused | {pair}
+        if without == refused:
+            return state
+        state, refused = best, without
+
+
+def _doubted(state: Joined, gap: float) -> list[tuple[int, int]]:
+    """Pairs of pieces whose bridge ends near an odd one."""
+    ends, length = state.nodes[state.bridges], state.lengths()
+    doubted = set()
+    for odd in np.flatnonzero((state.prices > _ODD) & (length > gap)):
+        apart = np.linalg.norm(ends[:, :, None] - ends[odd], axis=3).min(axis=(1, 2))
+        near = np.flatnonzero((apart <= _AROUND * length[odd]) & (length > gap))
+        pairs = np.sort(state.piece[state.bridges[near]], axis=1)
+        doubted |= set(map(tuple, pairs[pairs[:, 0] >= 0].tolist()))
+    return sorted(doubted)
+
+
+def _unrefused(found: Hypotheses, piece: np.ndarray, refused: frozenset[tuple[int, int]],
+               ) -> Hypotheses:
+    if not refused:
+        return found
+    pairs = np.sort(np.stack([piece[found.one], piece[found.other]], axis=1), axis=1)
+    able = ~(pairs[:, None] == np.array(sorted(refused))).all(axis=2).any(axis=1)
+    return Hypotheses(*(getattr(found, column.name)[able] for column in fields(Hypotheses)))
+
+
+def _mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rules: _Rules,
+            alone: bool) -> list[int]:
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
 
     Stems are joined before twigs; where two pieces belong together, a price counts more than how
@@ -124,7 +201,7 @@ def _mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, ga
     def able(place: int, a: int, b: int) -> bool:
         odd = found.price[place] > _STRAIGHT_ON * found.length[place]
         return not (alone and odd and (single[a] or single[b])) and _allowed(
-            found, place, state, ends, weight, gap, limit, up, join_plants)
+            found, place, state, ends, weight, rules)
 
     for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
         a, b = int(state.label[one]), int(state.label[other])
@@ -141,7 +218,7 @@ def _mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, ga
 
 
 def _allowed(found: Hypotheses, place: int, state: Joined, ends: Ends, weight: np.ndarray,
-             gap: float, limit: float, up: np.ndarray, join_plants: bool) -> bool:
+             rules: _Rules) -> bool:
     """Whether the smaller piece is large enough for the bridge, and no plant of its own."""
     pair = int(found.one[place]), int(found.other[place])
     length, price = float(found.length[place]), float(found.price[place])
@@ -152,14 +229,14 @@ def _allowed(found: Hypotheses, place: int, state: Joined, ends: Ends, weight: n
                    + np.maximum(state.spread, state.thickness)[own]).max())
     # An end may go far straight on to what is left of its tip; that itself points anywhere.
     straight = price < _STRAIGHT_ON * length and a != small
-    farthest = max((_REACH_STRAIGHT if straight else _REACH) * reach, _SHORT * limit)
+    farthest = max((_REACH_STRAIGHT if straight else _REACH) * reach, _SHORT * rules.bridge_limit)
     if length > farthest and not (
             straight and found.turn[place] < _AHEAD
-            and length <= min(_straight_behind(state, ends, pair[0]), limit)):
+            and length <= min(_straight_behind(state, ends, pair[0]), rules.bridge_limit)):
         return False
     large = min(weight[a], weight[b]) > _PLANT_SHARE * state.support.sum()
-    return not (large and length > gap and not join_plants
-                and _are_plants(state.nodes, state.thickness, state.label, pair, up))
+    return not (large and length > rules.gap and not rules.join_plants
+                and _are_plants(state.nodes, state.thickness, state.label, pair, rules.up))
 
 
 def _straight_behind(state: Joined, ends: Ends, end: int) -> float:
@@ -188,6 +265,7 @@ def _bridge(state: Joined, ends: Ends, found: Hypotheses, place: int, step: floa
     state.support = np.concatenate([state.support, np.zeros(len(curve), state.support.dtype)])
     state.spread = np.concatenate([state.spread, np.zeros(len(curve))])
     state.bridges = np.vstack([state.bridges, [one, other]])
+    state.piece = np.concatenate([state.piece, np.full(len(curve), -1)])
     state.prices = np.append(state.prices, found.price[place] / found.length[place])
 
 
