@@ -185,28 +185,41 @@ def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
     np.testing.assert_allclose(again.radius, first.radius, atol=1e-9)
 
 
-def test_an_end_that_contraction_drew_far_beyond_its_points_may_be_the_root() -> None:
-    """Three nodes of a few points lie 20 mm apart beyond a stem's foot: drawn from as far, they
-    looked thicker than long, like a spur, and the root was the tip of a twig."""
+def _root_of_stem(foot: np.ndarray, thick: list[float], support: list[int]) -> int:
+    """The root's node of a stem with one twig, to whose foot a chain of nodes was contracted."""
     from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
     from limber.geometry.skeleton.skeletonise import _root_node
 
-    z = np.concatenate([[-0.04, -0.02], np.arange(0, 0.6, 0.005)])
-    x = 0.005 * np.arange(1, 41)
-    nodes = np.vstack([np.stack([0 * z, 0 * z, z], axis=1),
+    z, x = np.arange(0, 0.6, 0.005), 0.005 * np.arange(1, 41)
+    count = len(foot)
+    nodes = np.vstack([foot, np.stack([0 * z, 0 * z, z], axis=1),
                        np.stack([x, 0 * x, 0.3 - x], axis=1)])
-    edges = np.stack([np.arange(161), np.arange(1, 162)], axis=1)
-    edges[121] = [62, 122]
-    thickness = np.concatenate([[0.021, 0.0205], np.full(120, 0.009), np.full(40, 0.004)])
-    support = np.concatenate([[1, 4], np.full(160, 24)])
+    edges = np.stack([np.arange(len(nodes) - 1), np.arange(1, len(nodes))], axis=1)
+    edges[count + 119] = [count + 60, count + 120]
+    thickness = np.concatenate([thick, np.full(120, 0.009), np.full(40, 0.004)])
+    support = np.concatenate([support, np.full(160, 24)])
     ring = np.stack([np.cos(np.arange(24)), np.sin(np.arange(24)), 0 * np.arange(24)], axis=1)
-    owner = np.repeat(np.arange(162), support)
+    owner = np.repeat(np.arange(len(nodes)), support)
     on_axis = nodes[owner]
-    on_axis[:5] = nodes[2]
-    points = on_axis + thickness[np.maximum(owner, 2)][:, None] * np.resize(
+    on_axis[:sum(support[:count])] = nodes[count]
+    points = on_axis + thickness[np.maximum(owner, count)][:, None] * np.resize(
         np.roll(ring, 5, axis=0), (len(owner), 3))
     graph = CurveGraph(nodes, edges, thickness, support, owner=owner)
-    assert _root_node(graph, points, None, np.array([0.0, 0.0, 1.0]), 2.5)[0] == 0
+    return _root_node(graph, points, None, np.array([0.0, 0.0, 1.0]), 2.5)[0]
+
+
+def test_an_end_that_contraction_drew_far_beyond_its_points_may_be_the_root() -> None:
+    """Three nodes of a few points lie 20 mm apart beyond a stem's foot: drawn from as far, they
+    looked thicker than long, like a spur, and the root was the tip of a twig."""
+    foot = np.array([[0, 0, -0.04], [0, 0, -0.02]])
+    assert _root_of_stem(foot, [0.021, 0.0205], [1, 4]) == 0
+
+
+def test_a_ragged_foot_that_contraction_led_around_its_rim_may_be_the_root() -> None:
+    """From its first node to its last it is not longer than thick, but along its nodes it is."""
+    turn = np.linspace(0, 1.5 * np.pi, 10)
+    rim = 0.006 * np.stack([np.cos(turn), np.sin(turn), 0.05 * turn - 0.4], axis=1)
+    assert _root_of_stem(rim, [0.009] * 10, [10] * 10) == 0
 
 
 def test_an_end_is_not_left_beyond_the_points() -> None:

@@ -302,7 +302,8 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
         # Contraction may draw a few points of an end far beyond it.
         chain = end_chain(neighbours, graph.nodes, int(tip), reach + graph.thickness[tip])
         mine = points[np.isin(graph.owner, chain)]
-        length = np.linalg.norm(graph.nodes[chain[-1]] - graph.nodes[tip])
+        # Along the chain: contraction leads what is left of a ragged foot around its rim.
+        length = np.linalg.norm(np.diff(graph.nodes[chain], axis=0), axis=1).sum()
         if len(mine) < 4:
             continue
         drawn = float(np.median(np.repeat(graph.thickness[chain], graph.support[chain])))
