@@ -77,29 +77,8 @@ class Chart:
     def _turned(self, points: np.ndarray, gradients: np.ndarray, forward: bool) -> np.ndarray:
         if self.radius == 0.0:
             return gradients
-        local = (points - self.pivot) @ self.axes.T
-        rho = np.maximum(np.linalg.norm(local[:, :2], axis=1), 1e-12)
-        r = np.sqrt(rho**2 + local[:, 2]**2)
-        angle = np.arctan2(rho, local[:, 2])
-        across = local[:, :2] / rho[:, None]
-        # Unit vectors at the point: along the meridian, along the parallel, outward.
-        nothing = np.zeros((len(points), 1))
-        here = np.stack([
-            np.column_stack([(local[:, 2] / r)[:, None] * across, -rho / r]),
-            np.column_stack([-across[:, 1], across[:, 0], nothing]),
-            np.column_stack([(rho / r)[:, None] * across, local[:, 2] / r])], axis=1) @ self.axes
-        there = np.stack([np.column_stack([across, nothing]),
-                          np.column_stack([-across[:, 1], across[:, 0], nothing]),
-                          np.tile([0.0, 0.0, 1.0], (len(points), 1))], axis=1)
-        growth = np.column_stack([self.radius / r, self.radius * angle / rho,
-                                  self.stretch * self._slope(r - self.radius)])
-        if forward:
-            return np.einsum("nk,nkc->nc", np.einsum("nkc,nc->nk", here, gradients) / growth, there)
-        return np.einsum("nk,nkc->nc", np.einsum("nkc,nc->nk", there, gradients) * growth, here)
-
-    def _slope(self, off: np.ndarray) -> np.ndarray:
-        square = (off / self.depth) ** 2
-        return (1.0 + 0.5 * square) / (1.0 + square) ** 1.25
+        return _turned(np.ascontiguousarray(points, float),
+                       np.ascontiguousarray(gradients, float), forward, *self.arrays)
 
     def growth(self, points: np.ndarray, reach: float) -> np.ndarray:
         """Return the most by which plain coordinates differ a metre within ``reach`` [m], [n].
@@ -172,6 +151,48 @@ def _mapped(points, pivot, radius, axes, stretch, depth):
     out = np.empty_like(points)
     for i in range(len(points)):
         out[i] = mapped(points[i], pivot, radius, axes, stretch, depth)
+    return out
+
+
+@compiled
+def _turned(points, gradients, forward, pivot, radius, axes, stretch, depth):
+    out = np.zeros_like(gradients)
+    local, own, other = np.empty(3), np.empty(3), np.empty(3)
+    for n in range(len(points)):
+        for k in range(3):
+            local[k] = 0.0
+            own[k] = gradients[n, k]
+            for j in range(3):
+                local[k] += axes[k, j] * (points[n, j] - pivot[j])
+        if forward:
+            for k in range(3):
+                own[k] = 0.0
+                for j in range(3):
+                    own[k] += axes[k, j] * gradients[n, j]
+        rho = max(np.sqrt(local[0] * local[0] + local[1] * local[1]), 1e-12)
+        r = np.sqrt(rho * rho + local[2] * local[2])
+        x, y, sine, cosine = local[0] / rho, local[1] / rho, rho / r, local[2] / r
+        square = ((r - radius) / depth) ** 2
+        meridian, parallel = radius / r, radius * np.arctan2(rho, local[2]) / rho
+        outward = stretch * (1.0 + 0.5 * square) / (1.0 + square) ** 1.25
+        # Parts along the meridian, along the parallel and outward, there and here.
+        across = x * own[0] + y * own[1]
+        aside = x * own[1] - y * own[0]
+        if forward:
+            along = (cosine * across - sine * own[2]) / meridian
+            aside /= parallel
+            other[2] = (sine * across + cosine * own[2]) / outward
+            other[0], other[1] = x * along - y * aside, y * along + x * aside
+            for k in range(3):
+                out[n, k] = other[k]
+            continue
+        along, aside, off = across * meridian, aside * parallel, own[2] * outward
+        out_across = cosine * along + sine * off
+        other[0], other[1] = x * out_across - y * aside, y * out_across + x * aside
+        other[2] = cosine * off - sine * along
+        for k in range(3):
+            for j in range(3):
+                out[n, k] += axes[j, k] * other[j]
     return out
 
 

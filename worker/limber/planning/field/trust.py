@@ -159,6 +159,18 @@ def _nearest(point, others):
 
 
 @compiled
+def nearest_of(points, others):
+    """Return the distance of ``points`` [n, 3] to the nearest of ``others`` [m, 3], shape [n], and
+    the unit vectors from it, shape [n, 3]."""
+    distance, away = np.empty(len(points)), np.empty_like(points)
+    for n in range(len(points)):
+        number = _nearest_number(points[n], others)
+        distance[n] = np.sqrt(np.sum((points[n] - others[number]) ** 2))
+        away[n] = (points[n] - others[number]) / max(distance[n], 1e-12)
+    return distance, away
+
+
+@compiled
 def _surely_refused(centres, halves, accepted, rejected):
     """Return which boxes are nearer to one refused pose than to any accepted one."""
     found = np.zeros(len(centres), np.bool_)

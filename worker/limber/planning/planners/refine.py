@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import LOADS, EnergyField
+from limber.planning.field.trust import nearest_of
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
 
@@ -102,8 +103,8 @@ def _excesses(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
     height[0] = 0.0
     yield height / scale, slope / scale
     if len(field.region.rejected):
-        accepted, toward = _nearest(points, field.region.accepted)
-        rejected, away = _nearest(points, field.region.rejected)
+        accepted, toward = nearest_of(points, field.region.accepted)
+        rejected, away = nearest_of(points, field.region.rejected)
         beyond = accepted - rejected + margin
         beyond[0] = 0.0
         yield beyond / scale, (toward - away) / scale
@@ -124,16 +125,6 @@ def _excesses(points: np.ndarray, problem: GentleProblem, margin: float, scale: 
     if limits.max_force < np.inf:
         size, slope = _force_size(points, field)
         yield size / limits.max_force - 1.0 + reserve, slope / limits.max_force
-
-
-def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances to the nearest of ``others`` and the unit vectors from it."""
-    offset = points[:, None] - others[None]
-    distance = np.linalg.norm(offset, axis=2)
-    index = distance.argmin(axis=1)
-    rows = np.arange(len(points))
-    least = distance[rows, index]
-    return least, offset[rows, index] / np.maximum(least, 1e-12)[:, None]
 
 
 def _force_size(points: np.ndarray, field: EnergyField) -> tuple[np.ndarray, np.ndarray]:
