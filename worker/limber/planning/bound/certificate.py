@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
-from scipy.ndimage import binary_dilation, label, maximum_filter
+from scipy.ndimage import label, maximum_filter
 
 from limber.errors import Cancelled, NoPathError
 from limber.planning.bound.subsolution import (
@@ -25,12 +25,13 @@ from limber.planning.bound.subsolution import (
     Terrain,
     corner_values,
     corners_of,
-    curvature_allowance,
+    least_between,
     least_in_cells,
     second_differences,
     spline_value,
     subsolution,
     terrain,
+    widened,
 )
 from limber.planning.field.energy_field import LOADS
 from limber.planning.problem import GentleProblem
@@ -88,12 +89,16 @@ Improve = Callable[[np.ndarray | None], float]
 
 @dataclass
 class _Grid:
-    """Cells in the turned frame; corner ``(i, j, k)`` lies at ``origin + (i, j, k) h``."""
+    """Cells in the turned frame; corner ``(i, j, k)`` lies at ``origin + (i, j, k) h``.
+
+    How far the goal is need not be asked but in the cells ``about_goal``.
+    """
 
     origin: np.ndarray
     axes: np.ndarray
     spacing: float
     open_cells: np.ndarray
+    about_goal: np.ndarray
 
     def points(self, numbers: np.ndarray) -> np.ndarray:
         """Return the positions [n, 3] of corners ``numbers`` [n, 3]; halves are centres."""
@@ -130,7 +135,7 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
             except NoPathError:
                 if level == 0:
                     # Corners so far apart say too little of what lies in a narrow valley.
-                    grid, cell = _refined(grid, grid.open_cells, cell)
+                    grid, cell = _refined(grid, grid.open_cells, grid.about_goal, cell)
                     upper = improve(None)
                     continue
                 if upper < np.inf:
@@ -152,7 +157,7 @@ def certify(problem: GentleProblem, improve: Improve, *, enough: float = ENOUGH,
             keep = found.keep(upper)
             if _CHILDREN * keep.sum() > _MOST_CELLS:
                 break
-            grid, cell = _refined(grid, keep, cell)
+            grid, cell = _refined(grid, keep, found.about_goal, cell)
     except (Cancelled, KeyboardInterrupt) as stop:
         if not (levels and upper < np.inf):
             raise Cancelled from stop
@@ -170,6 +175,7 @@ class _Bounds:
     cell: np.ndarray
     slack: float
     rough_path: np.ndarray
+    about_goal: np.ndarray
 
     @property
     def open_cells(self) -> np.ndarray:
@@ -189,67 +195,99 @@ class _Bounds:
 
 
 def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
+    open_cells = grid.open_cells & ~_surely_outside(problem, grid)
     # One corner more than the active cells': for the second differences there.
-    corners = np.argwhere(binary_dilation(corners_of(binary_dilation(
-        grid.open_cells, _NEAR, iterations=RIM)), _NEAR))
+    corners = np.argwhere(widened(corners_of(widened(open_cells, RIM))))
     points = grid.points(corners)
-    open_cells = grid.open_cells & ~_surely_closed(problem, grid, corners, points)
+    energy = grid.spread(corners, problem.energy_field.energy(points))
+    open_cells &= ~_surely_over(problem, grid, open_cells, energy)
     if not open_cells[tuple(cell)]:
         raise _separated(problem, grid, open_cells)
     # Only what hangs together with the start, also by an edge or a corner of a cell.
     together = label(open_cells, _NEAR)[0]
     open_cells = together == together[tuple(cell)]
-    raw = grid.spread(corners, problem.energy_field.energy(points) - problem.field_error)
+    raw = energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
     ground = terrain(rate, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
-    known, shape, inside, slack, meets = _about_goal(problem, grid, ground)
-    if not meets:
+    goal = _about_goal(problem, grid, ground)
+    if not goal.meets:
         raise _separated(problem, grid, open_cells)
-    to_goal, factor = subsolution(ground, known, shape, inside)
-    lower = spline_value(to_goal, cell) - factor * slack
-    return _Bounds(max(lower, 0.0), ground, to_goal, cell, factor * slack,
-                   _descent(grid, to_goal, cell))
+    to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
+    slack = factor * goal.slack
+    lower = spline_value(to_goal, cell) - slack
+    return _Bounds(max(lower, 0.0), ground, to_goal, cell, slack, _descent(grid, to_goal, cell),
+                   goal.near)
 
 
-def _about_goal(problem: GentleProblem, grid: _Grid, ground: Terrain,
-                ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]:
-    """Return cells on and about the goal, a signed cost there, cells inside it, its error.
+@dataclass(frozen=True)
+class _AboutGoal:
+    """A signed cost of the way left, below 0 inside the goal, and where it is known.
 
-    The cost is that of the way left, below 0 inside. Every point of the goal lies in a cell that
-    has all its coefficients among the known ones; there the spline of the cost is at most the error
-    (a spline whose coefficients are a function's values differs from it by ``h^2 / 8 sum_i
-    max |second derivative|``). Last: whether any open cell may have a point of the goal.
+    Every point of the goal lies in a cell that has all its coefficients among those ``known``;
+    there the spline of the ``cost`` is at most ``slack``. ``inside`` are cells of the goal alone.
+    ``meets``: whether any open cell may have a point of the goal. ``near``: where the cells of the
+    next grid that are asked lie.
     """
-    h = ground.spacing
-    cells = np.argwhere(ground.active)
-    centres = grid.points(cells + 0.5)
-    distance = _spread(ground.open_cells.shape, cells,
-                       problem.goal.distance(problem.energy_field, centres)
-                       - problem.goal.tolerance)
+
+    known: np.ndarray
+    cost: np.ndarray
+    inside: np.ndarray
+    slack: float
+    meets: bool
+    near: np.ndarray
+
+
+def _about_goal(problem: GentleProblem, grid: _Grid, ground: Terrain) -> _AboutGoal:
+    """Return what is known about the goal.
+
+    A spline whose coefficients are a function's values differs from it by
+    ``h^2 / 8 sum_i max |second derivative|``.
+    """
+    h, shape = ground.spacing, ground.open_cells.shape
+    cells = np.argwhere(ground.active & grid.about_goal)
+    nothing = np.zeros(shape, bool)
+    if len(cells) == 0:
+        return _AboutGoal(nothing, np.zeros(shape), nothing, 0.0, False, nothing)
+    away = (problem.goal.distance(problem.energy_field, grid.points(cells + 0.5))
+            - problem.goal.tolerance)
+    # In the box about them alone, with a layer in which nothing is known.
+    low, high = np.maximum(cells.min(axis=0) - 1, 0), cells.max(axis=0) + 2
+    box = tuple(map(slice, low, high))
+    open_cells = ground.open_cells[box]
+    distance = _spread(open_cells.shape, cells - low, away)
     filled = np.nan_to_num(distance, nan=np.inf)
     growth = _growth(distance, np.abs(filled) <= 4.0 * h, h)
-    cost = _way_left(distance / growth, problem.goal.tolerance / growth, ground)
+    corners = tuple(map(slice, low, high + 1))
+    rate = np.where(ground.level[box], ground.floor,
+                    corner_values(ground.rate[corners]).mean(axis=0))
+    cost = _way_left(distance / growth, problem.goal.tolerance / growth, rate, h)
     curved = CURVATURE_FACTOR / 8.0 * sum(
         maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * h * np.sqrt(3.0)
-    touching = ground.open_cells & (filled <= growth * half)
-    known = filled <= growth * 3.0 * half
+    touching = open_cells & (filled <= growth * half)
     inside = filled < -growth * half
     border = touching & ~inside
     slack = float(curved[border].max()) if border.any() else 0.0
-    return known, np.nan_to_num(cost), inside, slack, bool(touching.any())
+
+    def whole(part: np.ndarray) -> np.ndarray:
+        out = np.zeros(shape, part.dtype)
+        out[box] = part
+        return out
+    # A next cell asks up to 4 of its edges away; its centre lies within ``half`` of this one's.
+    return _AboutGoal(whole(filled <= growth * 3.0 * half), whole(np.nan_to_num(cost)),
+                      whole(inside), slack, bool(touching.any()),
+                      whole(filled <= growth * (half + 6.0 * h / _CUT)))
 
 
-def _way_left(length: np.ndarray, depth: float, ground: Terrain) -> np.ndarray:
-    """Return what a ``length`` [m] to the goal costs, at the rate half-way; nan where not known.
+def _way_left(length: np.ndarray, depth: float, rate: np.ndarray, h: float) -> np.ndarray:
+    """Return what a ``length`` [m] to the goal costs, at the ``rate`` half-way, of cells with an
+    edge of ``h`` [m]; nan where not known.
 
     One rate for all sides of the goal would be the least of them. Inside, where nothing is asked,
     the length flattens out to a goal's middle ``depth`` [m] below its outside: it has no tip there.
     """
-    h = ground.spacing
     flat = np.maximum(length, -depth)
     flat = np.where(flat < 0.0, flat + flat**2 / (2.0 * depth), flat)
-    rate = np.where(ground.level, ground.floor, corner_values(ground.rate).mean(axis=0))
     growing = sum(np.gradient(rate, h, axis=axis) * np.gradient(length, h, axis=axis)
                   for axis in range(3))
     half_way = rate - 0.5 * length * np.nan_to_num(growing)
@@ -280,38 +318,33 @@ def _from_start(ground: Terrain, cell: np.ndarray) -> np.ndarray:
     return u - factor * CURVATURE_FACTOR * 3.0 * h / 16.0
 
 
-def _surely_closed(problem: GentleProblem, grid: _Grid, nodes: np.ndarray, points: np.ndarray,
-                   ) -> np.ndarray:
-    """Return the cells in which no point is allowed."""
-    limits, closed = problem.limits, np.zeros(grid.open_cells.shape, bool)
+def _surely_outside(problem: GentleProblem, grid: _Grid) -> np.ndarray:
+    """Return the open cells in which no point is trusted and in the workspace."""
+    limits, outside = problem.limits, np.zeros(grid.open_cells.shape, bool)
     cells = np.argwhere(grid.open_cells)
-    halves = 0.5 * grid.spacing * grid.axes
-    outside = problem.energy_field.region.surely_outside(grid.points(cells + 0.5), halves)
-    closed[tuple(cells[outside].T)] = True
+    centres, halves = grid.points(cells + 0.5), 0.5 * grid.spacing * grid.axes
+    beyond = np.maximum(limits.low - centres, centres - limits.high) > np.abs(halves).sum(axis=0)
+    outside[tuple(cells.T)] = beyond.any(axis=1) | problem.energy_field.region.surely_outside(
+        centres, halves)
+    return outside
+
+
+def _surely_over(problem: GentleProblem, grid: _Grid, cells: np.ndarray, energy: np.ndarray,
+                 ) -> np.ndarray:
+    """Return those of ``cells`` in which no point keeps the limits; ``energy`` at the corners."""
+    limits, field, over = problem.limits, problem.energy_field, np.zeros(cells.shape, bool)
+    nodes = np.argwhere(widened(corners_of(cells)))
+    points = grid.points(nodes)
     if limits.max_energy < np.inf:
-        energy = grid.spread(nodes, problem.energy_field.energy(points))
-        closed |= _all_above(energy, limits.max_energy + problem.field_error)
+        over |= least_between(energy, cells) > limits.max_energy + problem.field_error
     for name, limit in zip(LOADS, limits.max_loads, strict=True):
         if limit < np.inf:
-            load = grid.spread(nodes, problem.energy_field.load(points, name)**2)
-            closed |= _all_above(load, limit**2)
-    if np.isfinite([limits.low, limits.high]).any():
-        centres, reach = grid.points(cells + 0.5), np.abs(halves).sum(axis=0)
-        beyond = np.maximum(limits.low - centres, centres - limits.high) > reach
-        closed[tuple(cells[beyond.any(axis=1)].T)] = True
+            load = grid.spread(nodes, field.load(points, name)**2)
+            over |= least_between(load, cells) > limit**2
     if limits.max_force < np.inf:
-        force = grid.spread(nodes, (problem.energy_field.force(points)**2).sum(axis=1))
-        closed |= _all_above(force, limits.max_force**2)
-    return closed
-
-
-def _corners_of(grid: _Grid, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.nan_to_num(corner_values(grid.spread(nodes, values)), nan=-np.inf)
-
-
-def _all_above(values: np.ndarray, limit: float) -> np.ndarray:
-    least = np.nan_to_num(corner_values(values).min(axis=0), nan=-np.inf)
-    return least - curvature_allowance(values) > limit
+        force = grid.spread(nodes, (field.force(points)**2).sum(axis=1))
+        over |= least_between(force, cells) > limits.max_force**2
+    return over
 
 
 def _first_grid(problem: GentleProblem) -> tuple[_Grid, np.ndarray]:
@@ -325,7 +358,8 @@ def _first_grid(problem: GentleProblem) -> tuple[_Grid, np.ndarray]:
     before = np.ceil(-low / spacing - 0.5).astype(int) + _PAD
     after = np.ceil(high / spacing - 0.5).astype(int) + _PAD + 1
     open_cells = np.pad(np.ones(tuple(before + after - 2 * _PAD), bool), _PAD)
-    return _Grid(start - ((before + 0.5) * spacing) @ axes, axes, spacing, open_cells), before
+    return _Grid(start - ((before + 0.5) * spacing) @ axes, axes, spacing, open_cells,
+                 np.ones_like(open_cells)), before
 
 
 def _axes(direction: np.ndarray) -> np.ndarray:
@@ -339,21 +373,26 @@ def _axes(direction: np.ndarray) -> np.ndarray:
     return np.stack([first, second, np.cross(first, second)])
 
 
-def _refined(grid: _Grid, keep: np.ndarray, cell: np.ndarray) -> tuple[_Grid, np.ndarray]:
+def _refined(grid: _Grid, keep: np.ndarray, about_goal: np.ndarray, cell: np.ndarray,
+             ) -> tuple[_Grid, np.ndarray]:
     """Return cells of a third the edge over ``keep``, in the smallest box; and the start's.
 
     A third, not a half: so the start stays in the centre of a cell.
     """
     places = np.argwhere(keep)
-    low = np.minimum(places.min(axis=0), cell)
-    high = np.maximum(places.max(axis=0), cell) + 1
-    box = keep[low[0]:high[0], low[1]:high[1], low[2]:high[2]]
-    for axis in range(3):
-        box = np.repeat(box, _CUT, axis=axis)
+    # A closed layer of whole cells about them is as deep as ``_PAD`` new ones.
+    low = np.minimum(places.min(axis=0), cell) - 1
+    high = np.maximum(places.max(axis=0), cell) + 2
     spacing = grid.spacing / _CUT
-    origin = grid.points(low[None].astype(float))[0] - _PAD * spacing * grid.axes.sum(axis=0)
-    return (_Grid(origin, grid.axes, spacing, np.pad(box, _PAD)),
-            _CUT * (cell - low) + _CUT // 2 + _PAD)
+
+    def cut(cells: np.ndarray) -> np.ndarray:
+        box = cells[tuple(map(slice, low, high))]
+        for axis in range(3):
+            box = np.repeat(box, _CUT, axis=axis)
+        return box
+    origin = grid.points(low[None].astype(float))[0]
+    return (_Grid(origin, grid.axes, spacing, cut(keep), cut(about_goal)),
+            _CUT * (cell - low) + _CUT // 2)
 
 
 def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:

@@ -11,103 +11,108 @@ from limber.compiled import compiled
 
 
 @compiled
-def march(rate, active, known, values, spacing):
-    """Return arrival costs ``u`` [nx, ny, nz]; infinite where no active node leads.
+def neighbours(active):
+    """Return numbers of the nodes ``active`` [nx, ny, nz], -1 elsewhere, their places in the flat
+    grid [n], and the numbers of their neighbours below and above along each axis [n, 6]."""
+    shape = np.array(active.shape)
+    steps = np.array([shape[1] * shape[2], shape[2], 1])
+    flat = active.ravel()
+    numbers = np.full(flat.size, -1, np.int32)
+    places = np.flatnonzero(flat)
+    for k in range(len(places)):
+        numbers[places[k]] = k
+    near = np.full((len(places), 6), -1, np.int32)
+    for k in range(len(places)):
+        for axis in range(3):
+            at = places[k] // steps[axis] % shape[axis]
+            if at > 0:
+                near[k, 2 * axis] = numbers[places[k] - steps[axis]]
+            if at + 1 < shape[axis]:
+                near[k, 2 * axis + 1] = numbers[places[k] + steps[axis]]
+    return numbers.reshape(active.shape), places, near
+
+
+@compiled
+def march(rate, near, known, values, spacing):
+    """Return arrival costs ``u`` [n]; infinite where no node leads.
 
     Args:
-        rate: Cost per metre at the nodes [1/m], shape [nx, ny, nz].
-        active: Nodes that may be entered, bool [nx, ny, nz].
-        known: Active nodes whose value is given, bool [nx, ny, nz].
-        values: Their values, shape [nx, ny, nz].
+        rate: Cost per metre at the nodes [1/m], shape [n].
+        near: As :func:`neighbours` gives them, shape [n, 6].
+        known: Nodes whose value is given, bool [n].
+        values: Their values, shape [n].
         spacing: Distance between nodes [m].
     """
-    nx, ny, nz = rate.shape
-    count = nx * ny * nz
+    count = len(rate)
     u = np.full(count, np.inf)
     done = np.zeros(count, np.bool_)
-    heap = np.empty(count, np.int64)
-    place = np.full(count, -1, np.int64)
+    heap = np.empty(count, np.int32)
+    place = np.full(count, -1, np.int32)
+    used = np.empty((3, 3))
     size = 0
-    flat_rate, flat_active = rate.ravel(), active.ravel()
-    flat_known, flat_values = known.ravel(), values.ravel()
-    steps = np.array([ny * nz, nz, 1])
-    shape = np.array([nx, ny, nz])
-    at = np.empty(3, np.int64)
     for node in range(count):
-        if flat_known[node] and flat_active[node]:
-            u[node] = flat_values[node]
+        if known[node]:
+            u[node] = values[node]
             size = _push(heap, place, u, size, node)
     while size > 0:
         node = heap[0]
         size = _pop(heap, place, u, size)
         done[node] = True
-        _coordinates(node, shape, at)
-        for axis in range(3):
-            for side in (-1, 1):
-                if not 0 <= at[axis] + side < shape[axis]:
-                    continue
-                near = node + side * steps[axis]
-                if done[near] or flat_known[near] or not flat_active[near]:
-                    continue
-                cost = _arrival(near, u, done, flat_rate[near], steps, shape, spacing)
-                if cost < u[near]:
-                    u[near] = cost
-                    if place[near] < 0:
-                        size = _push(heap, place, u, size, near)
-                    else:
-                        _rise(heap, place, u, place[near])
-    return u.reshape((nx, ny, nz))
+        for side in range(6):
+            other = near[node, side]
+            if other < 0 or done[other] or known[other]:
+                continue
+            cost = _arrival(other, u, done, rate[other] * spacing, near, used)
+            if cost < u[other]:
+                u[other] = cost
+                if place[other] < 0:
+                    size = _push(heap, place, u, size, other)
+                else:
+                    _rise(heap, place, u, place[other])
+    return u
 
 
 @compiled
-def _coordinates(node, shape, out):
-    out[2] = node % shape[2]
-    out[1] = (node // shape[2]) % shape[1]
-    out[0] = node // (shape[2] * shape[1])
+def _arrival(node, u, done, step, near, used):
+    """Solve sum_i w_i (u - t_i)^2 = step^2 over the axes whose upwind neighbour is done.
 
-
-@compiled
-def _arrival(node, u, done, rate, steps, shape, spacing):
-    """Solve sum_i w_i (u - t_i)^2 = rate^2 over the axes whose upwind neighbour is done."""
-    at = np.empty(3, np.int64)
-    _coordinates(node, shape, at)
-    t, w, nearest = np.empty(3), np.empty(3), np.empty(3)
-    used = 0
+    ``used`` [3, 3] is room for t, w and the neighbour's value of each axis.
+    """
+    count = 0
     for axis in range(3):
-        best, value = 0, np.inf
-        for side in (-1, 1):
-            if 0 <= at[axis] + side < shape[axis]:
-                near = node + side * steps[axis]
-                if done[near] and u[near] < value:
-                    best, value = side, u[near]
-        if best == 0:
+        best, value = -1, np.inf
+        for side in (2 * axis, 2 * axis + 1):
+            other = near[node, side]
+            if other >= 0 and done[other] and u[other] < value:
+                best, value = side, u[other]
+        if best < 0:
             continue
-        t[used], w[used], nearest[used] = value, 1.0, value
-        if 0 <= at[axis] + 2 * best < shape[axis]:
-            far = node + 2 * best * steps[axis]
-            if done[far] and u[far] <= value:
-                t[used], w[used] = (4.0 * value - u[far]) / 3.0, 2.25
-        used += 1
-    target = (rate * spacing) ** 2
+        used[0, count], used[1, count], used[2, count] = value, 1.0, value
+        far = near[near[node, best], best]
+        if far >= 0 and done[far] and u[far] <= value:
+            used[0, count], used[1, count] = (4.0 * value - u[far]) / 3.0, 2.25
+        count += 1
     # Drop the axis whose neighbour lies highest until the solution lies above all that are used.
-    while used > 0:
-        a, b, c, top = 0.0, 0.0, -target, -np.inf
+    while count > 0:
+        a, b, c, top = 0.0, 0.0, -step * step, -np.inf
         last = 0
-        for i in range(used):
-            a += w[i]
-            b += w[i] * t[i]
-            c += w[i] * t[i] * t[i]
-            if nearest[i] > top:
-                top, last = nearest[i], i
+        for i in range(count):
+            t, w = used[0, i], used[1, i]
+            a += w
+            b += w * t
+            c += w * t * t
+            if used[2, i] > top:
+                top, last = used[2, i], i
         root = b * b - a * c
         if root >= 0.0:
             solution = (b + np.sqrt(root)) / a
             if solution >= top:
                 return solution
-        if used == 1:
-            return nearest[0] + rate * spacing
-        used -= 1
-        t[last], w[last], nearest[last] = t[used], w[used], nearest[used]
+        if count == 1:
+            return used[2, 0] + step
+        count -= 1
+        for k in range(3):
+            used[k, last] = used[k, count]
     return np.inf
 
 

@@ -29,10 +29,9 @@ inside a cell (the energy is cut off at zero) the cost of length counts.
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, maximum_filter
 
 from limber.compiled import compiled
-from limber.planning.bound.marching import march
+from limber.planning.bound.marching import march, neighbours
 
 CURVATURE_FACTOR = 2.0
 """What second differences at a cell's corners are multiplied by to bound derivatives inside."""
@@ -40,9 +39,8 @@ CURVATURE_FACTOR = 2.0
 RIM = 2
 """Closed cells about the open ones that have coefficients as well."""
 
-_ROUNDS = 8  # of local reweighting; stops before when nothing is over by more than _CLOSE
+_ROUNDS = 8  # of local reweighting; ends when nothing is over by more than _CLOSE, or no less is
 _CLOSE = 1.0005
-_NEAR = np.ones((3, 3, 3))
 
 
 class Terrain(NamedTuple):
@@ -71,7 +69,19 @@ class Terrain(NamedTuple):
         Open cells need those of their neighbours. The others let a cost arrive along a slanting
         border as if there were none: about each of its steps it would bend, and be too steep.
         """
-        return binary_dilation(self.open_cells, _NEAR, iterations=RIM)
+        return widened(self.open_cells, RIM)
+
+
+def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
+    """Return ``cells`` and all that touch them, ``times`` deep."""
+    out = cells.copy()
+    for _ in range(times):
+        for axis in range(3):
+            before = out.copy()
+            here, after = out.swapaxes(0, axis), before.swapaxes(0, axis)
+            here[1:] |= after[:-1]
+            here[:-1] |= after[1:]
+    return out
 
 
 def terrain(rate: np.ndarray, positive: np.ndarray, open_cells: np.ndarray, spacing: float,
@@ -82,8 +92,7 @@ def terrain(rate: np.ndarray, positive: np.ndarray, open_cells: np.ndarray, spac
     hold nan in ``rate`` and are no neighbours of an open cell's.
     """
     bends = _bends(rate, open_cells)
-    above = corner_values(positive.astype(float))
-    level = (above.min(axis=0) < 0.5) & (above.max(axis=0) > 0.5)
+    level = with_corner(positive) & with_corner(~positive)
     return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
 
 
@@ -127,14 +136,35 @@ def _bends(values, cells):
     return out
 
 
-def curvature_allowance(values: np.ndarray) -> np.ndarray:
-    """Return how far a smooth function may leave its trilinear interpolation in each cell.
+@compiled
+def least_between(values, cells):
+    """Return what a smooth function is at least in ``cells`` [nx, ny, nz], -inf where not known.
 
-    ``values`` at the corners, nan where not known; the result has one less along each axis:
-    ``CURVATURE_FACTOR / 8`` times the sum over axes of the largest second difference.
+    Its least value at the cell's corners, less how far it may leave its trilinear interpolation:
+    ``CURVATURE_FACTOR / 8`` times the sum over axes of the largest second difference there (one
+    with a value that is not known, nan, counts as 0).
     """
-    return CURVATURE_FACTOR / 8.0 * sum(
-        corner_values(difference).max(axis=0) for difference in second_differences(values))
+    out = np.full(cells.shape, -np.inf)
+    curved = np.empty(3)
+    places = np.argwhere(cells)
+    for n in range(len(places)):
+        i, j, k = places[n, 0], places[n, 1], places[n, 2]
+        least = np.inf
+        curved[:] = 0.0
+        for p in range(i, i + 2):
+            for q in range(j, j + 2):
+                for r in range(k, k + 2):
+                    here = values[p, q, r]
+                    least = here if np.isnan(here) else min(least, here)
+                    x = abs(values[p - 1, q, r] - 2.0 * here + values[p + 1, q, r])
+                    y = abs(values[p, q - 1, r] - 2.0 * here + values[p, q + 1, r])
+                    z = abs(values[p, q, r - 1] - 2.0 * here + values[p, q, r + 1])
+                    curved[0] = x if x > curved[0] else curved[0]
+                    curved[1] = y if y > curved[1] else curved[1]
+                    curved[2] = z if z > curved[2] else curved[2]
+        if not np.isnan(least):
+            out[i, j, k] = least - CURVATURE_FACTOR / 8.0 * curved.sum()
+    return out
 
 
 def second_differences(values: np.ndarray) -> list[np.ndarray]:
@@ -165,6 +195,17 @@ def corners_of(cells: np.ndarray) -> np.ndarray:
     return nodes
 
 
+def with_corner(nodes: np.ndarray) -> np.ndarray:
+    """Return the cells of which a corner is one of ``nodes`` [nx + 1, ny + 1, nz + 1]."""
+    cells = np.zeros(tuple(n - 1 for n in nodes.shape), bool)
+    nx, ny, nz = cells.shape
+    for i in (0, 1):
+        for j in (0, 1):
+            for k in (0, 1):
+                cells |= nodes[i:nx + i, j:ny + j, k:nz + k]
+    return cells
+
+
 def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cells: np.ndarray,
                 rounds: int = _ROUNDS) -> tuple[np.ndarray, float]:
     """Return coefficients of a ``u`` with |grad u| <= c in every open cell, and a factor.
@@ -179,30 +220,70 @@ def subsolution(ground: Terrain, known: np.ndarray, shape: np.ndarray, free_cell
     The coefficients are ``factor * shape`` on ``known``; infinite where nothing leads from there.
     """
     active = ground.active
-    bound = np.ascontiguousarray(corner_values(ground.rate).mean(axis=0))
-    asked = ground.open_cells & ~free_cells
-    held = known & active
-    if not held.any():
-        return np.full(active.shape, np.inf), 0.0
-    steep = float(_excess(np.where(held, shape, np.inf), *ground, ground.open_cells).max())
+    around = known & active
+    u = np.full(active.shape, np.inf)
+    if not around.any():
+        return u, 0.0
+    numbers, places, near = neighbours(active)
+    bound = _middles(ground.rate, places, active.shape)
+    u[around] = shape[around]
+    steep = float(_excess(u, *ground, np.argwhere(around & ground.open_cells)).max(initial=0.0))
+    asked = np.argwhere(ground.open_cells & ~free_cells)
+    own = numbers[tuple(asked.T)]
+    held, about = around.ravel()[places], widened(around).ravel()[places]
+    lengths = shape.ravel()[places]
     factor = 1.0 / steep if steep > 0.0 else float(bound[held].min())
-    rate = bound.copy()
-    u, used = bound, factor
-    about = held
+    rate, beside = bound, held
+    least, best, of_best = np.inf, bound, factor
     for _ in range(rounds):
-        used = factor
-        u = march(rate, active, held, used * shape, ground.spacing)
-        over = np.maximum(_excess(u, *ground, asked), 1.0)
-        if over.max() <= _CLOSE:
+        values = march(rate, near, held, factor * lengths, ground.spacing)
+        u.ravel()[places] = values
+        over = np.ones(len(places))
+        over[own] = np.maximum(_excess(u, *ground, asked), 1.0)
+        worst = float(over.max())
+        improved = worst < least
+        if improved:
+            least, best, of_best = worst, values, factor
+        if not improved or worst <= _CLOSE:
             break
-        factor /= float(over[about].max())
-        about = binary_dilation(held, _NEAR)
+        factor /= float(over[beside].max())
+        beside = about
         # The largest of the neighbours: reweighting cell by cell stirs up a chequerboard.
         over[held] = 1.0
-        rate /= maximum_filter(over, 3)
-    worst = max(float(_excess(u, *ground, asked).max()), 1.0)
+        rate = rate / _most_about(over, numbers, places)
     # The rescaling is what makes it a proof; the rounds before only keep it small.
-    return u / worst, used / worst
+    u.ravel()[places] = best / least
+    return u, of_best / least
+
+
+@compiled
+def _middles(values, places, shape):
+    """Return the mean of the values at the corners of the cells at ``places`` [n] of a grid."""
+    out = np.empty(len(places))
+    for n in range(len(places)):
+        i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
+            places[n] % shape[2])
+        out[n] = values[i:i + 2, j:j + 2, k:k + 2].sum() / 8.0
+    return out
+
+
+@compiled
+def _most_about(values, numbers, places):
+    """Return the largest of each cell's value [n] and those of the cells that touch it."""
+    out = np.empty(len(places))
+    shape = numbers.shape
+    for n in range(len(places)):
+        i, j, k = places[n] // (shape[1] * shape[2]), places[n] // shape[2] % shape[1], (
+            places[n] % shape[2])
+        most = values[n]
+        for p in range(max(i - 1, 0), min(i + 2, shape[0])):
+            for q in range(max(j - 1, 0), min(j + 2, shape[1])):
+                for r in range(max(k - 1, 0), min(k + 2, shape[2])):
+                    other = numbers[p, q, r]
+                    if other >= 0 and values[other] > most:
+                        most = values[other]
+        out[n] = most
+    return out
 
 
 def spline_value(u: np.ndarray, cell: np.ndarray) -> float:
@@ -216,81 +297,113 @@ def spline_value(u: np.ndarray, cell: np.ndarray) -> float:
 def least_in_cells(u, cells):
     """Return a lower bound of the spline in each of ``cells``: its least Bernstein coefficient."""
     out = np.full(u.shape, np.inf)
-    block, work = np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    for i in range(1, u.shape[0] - 1):
-        for j in range(1, u.shape[1] - 1):
-            for k in range(1, u.shape[2] - 1):
-                if cells[i, j, k]:
-                    block[:] = u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2]
-                    for axis in range(3):
-                        _bernstein(block, work, axis, False)
-                        block[:] = work
-                    out[i, j, k] = block.min()
+    one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    places = np.argwhere(cells)
+    for n in range(len(places)):
+        i, j, k = places[n, 0], places[n, 1], places[n, 2]
+        _along_last(u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2], one)
+        _along_middle(one, two)
+        _along_first(two, three)
+        out[i, j, k] = three.min()
     return out
 
 
+# Bernstein coefficients along one axis of a spline from 3 of its own, in all 9 lines along it.
+
+
 @compiled
-def _bernstein(source, out, axis, slope):
-    """Write Bernstein coefficients along ``axis`` of the spline, or of its slope, from 3 of it."""
+def _along_last(source, out):
     for p in range(3):
         for q in range(3):
-            if axis == 0:
-                a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
-            elif axis == 1:
-                a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
-            else:
-                a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
-            if slope:
-                first, second, third = b - a, 0.5 * (c - a), c - b
-            else:
-                first, second, third = 0.5 * (a + b), b, 0.5 * (b + c)
-            if axis == 0:
-                out[0, p, q], out[1, p, q], out[2, p, q] = first, second, third
-            elif axis == 1:
-                out[p, 0, q], out[p, 1, q], out[p, 2, q] = first, second, third
-            else:
-                out[p, q, 0], out[p, q, 1], out[p, q, 2] = first, second, third
+            a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
+            out[p, q, 0], out[p, q, 1], out[p, q, 2] = 0.5 * (a + b), b, 0.5 * (b + c)
+
+
+@compiled
+def _along_middle(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
+            out[p, 0, q], out[p, 1, q], out[p, 2, q] = 0.5 * (a + b), b, 0.5 * (b + c)
+
+
+@compiled
+def _along_first(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
+            out[0, p, q], out[1, p, q], out[2, p, q] = 0.5 * (a + b), b, 0.5 * (b + c)
+
+
+# Those of its slope along the axis.
+
+
+@compiled
+def _slope_last(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, q, 0], source[p, q, 1], source[p, q, 2]
+            out[p, q, 0], out[p, q, 1], out[p, q, 2] = b - a, 0.5 * (c - a), c - b
+
+
+@compiled
+def _slope_middle(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[p, 0, q], source[p, 1, q], source[p, 2, q]
+            out[p, 0, q], out[p, 1, q], out[p, 2, q] = b - a, 0.5 * (c - a), c - b
+
+
+@compiled
+def _slope_first(source, out):
+    for p in range(3):
+        for q in range(3):
+            a, b, c = source[0, p, q], source[1, p, q], source[2, p, q]
+            out[0, p, q], out[1, p, q], out[2, p, q] = b - a, 0.5 * (c - a), c - b
 
 
 @compiled
 def _excess(u, spacing, open_cells, rate, bends, level, floor, asked):
-    """Return for each asked cell the largest |grad u| over what is allowed there, else 0."""
-    over = np.zeros(u.shape)
-    block, one, two = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
-    size = np.empty((3, 3, 3))
-    for i in range(1, u.shape[0] - 1):
-        for j in range(1, u.shape[1] - 1):
-            for k in range(1, u.shape[2] - 1):
-                if not (asked[i, j, k] and open_cells[i, j, k]):
-                    continue
-                block[:] = u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2]
-                if not block.max() < np.inf:
-                    continue
-                size[:] = 0.0
-                for component in range(3):
-                    _bernstein(block, one, 0, component == 0)
-                    _bernstein(one, two, 1, component == 1)
-                    _bernstein(two, one, 2, component == 2)
-                    size += one * one
-                worst, uneven, even = 0.0, 0.0, 0.0
-                whole = 0.5 * bends[:, i, j, k].sum()
-                for p in range(3):
-                    for q in range(3):
-                        for r in range(3):
-                            steep = np.sqrt(size[p, q, r]) / spacing
-                            worst = max(worst, steep / floor)
-                            if level[i, j, k]:
-                                continue
-                            allowed = _between(rate, i, j, k, p, q, r)
-                            even = max(even, _over(steep, allowed - whole))
-                            if p == 1:
-                                allowed -= bends[0, i, j, k]
-                            if q == 1:
-                                allowed -= bends[1, i, j, k]
-                            if r == 1:
-                                allowed -= bends[2, i, j, k]
-                            uneven = max(uneven, _over(steep, allowed))
-                over[i, j, k] = worst if level[i, j, k] else min(worst, even, uneven)
+    """Return for each of the open cells ``asked`` [n, 3] the largest |grad u| over what is allowed
+    there, else 0."""
+    over = np.zeros(len(asked))
+    along, down = np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    one, two, three = np.empty((3, 3, 3)), np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    allowed = np.empty((3, 3, 3))
+    for n in range(len(asked)):
+        i, j, k = asked[n, 0], asked[n, 1], asked[n, 2]
+        block = u[i - 1:i + 2, j - 1:j + 2, k - 1:k + 2]
+        if not (open_cells[i, j, k] and block.max() < np.inf):
+            continue
+        _along_last(block, along)
+        _slope_last(block, down)
+        _along_middle(along, one)
+        _slope_first(one, two)
+        _slope_middle(along, one)
+        _along_first(one, three)
+        _along_middle(down, one)
+        _along_first(one, along)
+        for p in range(3):
+            for q in range(3):
+                for r in range(3):
+                    one[p, q, r] = np.sqrt(two[p, q, r]**2 + three[p, q, r]**2
+                                           + along[p, q, r]**2) / spacing
+        worst = one.max() / floor
+        if level[i, j, k]:
+            over[n] = worst
+            continue
+        _between(rate, i, j, k, allowed)
+        x, y, z = bends[0, i, j, k], bends[1, i, j, k], bends[2, i, j, k]
+        uneven, even, whole = 0.0, 0.0, 0.5 * (x + y + z)
+        for p in range(3):
+            for q in range(3):
+                for r in range(3):
+                    most = allowed[p, q, r]
+                    even = max(even, _over(one[p, q, r], most - whole))
+                    most -= (x if p == 1 else 0.0) + (y if q == 1 else 0.0) + (
+                        z if r == 1 else 0.0)
+                    uneven = max(uneven, _over(one[p, q, r], most))
+        over[n] = min(worst, even, uneven)
     return over
 
 
@@ -300,14 +413,14 @@ def _over(steep, allowed):
 
 
 @compiled
-def _between(values, i, j, k, p, q, r):
-    """Return the trilinear interpolation at ``(p, q, r) / 2`` in the cell ``(i, j, k)``."""
-    total = 0.0
-    for a in range(2):
-        for b in range(2):
-            for c in range(2):
-                weight = 0.125 * (2 - p if a == 0 else p) * (2 - q if b == 0 else q) * (
-                    2 - r if c == 0 else r)
-                if weight > 0.0:
-                    total += weight * values[i + a, j + b, k + c]
-    return total
+def _between(values, i, j, k, out):
+    """Write the trilinear interpolation at the 27 points ``(p, q, r) / 2`` in a cell."""
+    for p in range(0, 3, 2):
+        for q in range(0, 3, 2):
+            first, last = values[i + p // 2, j + q // 2, k], values[i + p // 2, j + q // 2, k + 1]
+            out[p, q, 0], out[p, q, 1], out[p, q, 2] = first, 0.5 * (first + last), last
+        for r in range(3):
+            out[p, 1, r] = 0.5 * (out[p, 0, r] + out[p, 2, r])
+    for q in range(3):
+        for r in range(3):
+            out[1, q, r] = 0.5 * (out[0, q, r] + out[2, q, r])
