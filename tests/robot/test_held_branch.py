@@ -1,8 +1,10 @@
 """The branch in the virtual gripper: its stiffness by differences, its force by statics."""
 
+import itertools
 import json
 import zlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -219,6 +221,21 @@ def test_sliding_in_the_grip_lets_the_force_fall(held):
     held.slide(0.5)
     after = np.linalg.norm(held.wrench(moved, 0.002)[:3])
     assert 0.3 * before < after < 0.7 * before
+
+
+def test_a_picture_that_comes_between_two_questions_is_not_lost(held, monkeypatch):
+    """It was thrown away as a late solution, one scan in ten, and the camera waited for ever."""
+    flange, asked = Controller("ur5e").flange, itertools.count()
+    pipe = held._pipe
+    monkeypatch.setattr(held, "_pipe", SimpleNamespace(
+        send=pipe.send, recv=pipe.recv, poll=lambda: next(asked) % 2 == 1 and pipe.poll(5.0),
+        close=pipe.close))
+    camera = Camera(width=120, height=160, fx=200.0, fy=200.0, cx=60.0, cy=80.0).looking(
+        eye=np.array([0.5, 0.0, 0.1]), target=np.array([0.0, 0.0, 0.1]))
+    held.look(camera.model_dump())
+    for _ in range(4):
+        held.wrench(flange, 0.002)
+    assert held.picture is not None
 
 
 def test_what_gives_way_is_in_series_with_the_branch(held):

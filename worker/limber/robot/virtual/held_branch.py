@@ -274,9 +274,11 @@ class HeldBranch:
         self._view, self.picture = camera, None
 
     def _take_picture(self) -> None:
-        if self._is_looking and self._pipe.poll():
-            self.picture = self._pipe.recv()[1]
-            self._is_looking = self._busy = False
+        if self._is_looking:
+            # Asked once: an answer may come between two questions.
+            if self._pipe.poll():
+                self.picture = self._pipe.recv()[1]
+                self._is_looking = self._busy = False
         elif self._busy and self.state not in ("held", "closing") and self._pipe.poll():
             # A solution for a branch that has been let go.
             self._pipe.recv()
