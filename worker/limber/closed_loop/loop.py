@@ -48,6 +48,8 @@ OPEN_FACTOR = 4.0
 """Between the ends of a modulus' interval: where it is more, `limber suggest-pull` is asked whether
 another pull is worth it for the plan."""
 _MOST_PULLS = 3
+_UNPROVEN = "nor is it proven that none exists"  # of what `limber plan` says without a path
+_MORE_SAMPLES = 450  # about twice the usual
 _FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 _TOUCH_SIGMA_M = 3e-4
@@ -246,14 +248,29 @@ class ClosedLoop:
         # A place that somebody wishes the flower at: where a pull to the other side takes it.
         wish = wish_for(branch, _sideways(place)[1], _TRAVEL_M)
         write_cell(self.cell_file, wish.limited(read_cell(self.cell_file)))
-        self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed",
-                   self.seed, "--deflection", wish.sampled_deflection)
         goal = wish.place if goal is None else goal
-        plan = self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
+        self._sampled(wish)
+        try:
+            plan = self._ways(wish, goal)
+        except WorkError as error:
+            if _UNPROVEN not in str(error):
+                raise
+            # What it advises then, once: where a branch may stand in two shapes, few poses tell
+            # its force coarsely.
+            self.progress.warn(f"plan: {error} Planned again with {_MORE_SAMPLES} poses.")
+            self._sampled(wish, "--samples", _MORE_SAMPLES)
+            plan = self._ways(wish, goal)
+        return _Told(estimated, goal, wish, plan)
+
+    def _sampled(self, wish: Wish, *more: object) -> None:
+        self._part("energy", "energy over grasp poses", "energy", self.branch, "--seed",
+                   self.seed, "--deflection", wish.sampled_deflection, *more)
+
+    def _ways(self, wish: Wish, goal: np.ndarray) -> dict[str, Any]:
+        return self._part("plan", "the flower's way to the light", "plan", self.branch, "--name",
                           PLAN, "--cell", self.cell_file, "--target", FLOWER, "--tip-goal", *goal,
                           "--goal-tolerance", PLANNED_TOLERANCE_M, "--max-force", wish.max_force,
                           "--speed", _PLAN_SPEED_M_S, "--seed", self.seed)
-        return _Told(estimated, goal, wish, plan)
 
     def _executed(self, robot: VirtualRobot) -> tuple[dict[str, Any], Watch]:
         dry = self._part("dry run", "the path checked for the arm", "execute", self.branch,
