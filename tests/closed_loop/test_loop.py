@@ -1,15 +1,18 @@
 """The closed loop's own parts; the whole of it takes minutes and is a row of `scripts/bench robot`.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from limber import cli
+from limber.closed_loop import loop
 from limber.closed_loop.loop import ClosedLoop, comparison
 from limber.closed_loop.places import base_beside, bending_modulus, gripper_at, write_touched
 from limber.closed_loop.watching import Watch
 from limber.commands.robot import _points
-from limber.errors import InputError, NoPathError
+from limber.errors import InputError, NoPathError, WorkError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.robot.arms import arm_named
 from limber.robot.calibration import fit_base
@@ -56,6 +59,37 @@ def test_touched_marks_tell_where_the_base_stands(tmp_path):
     off = matrices(fit.pose) @ middle - (matrices(base) @ middle + np.r_[moved, 0])
     assert np.linalg.norm(off) < 3e-4
     assert np.abs(fit.pose[3:] - base[3:]).max() < 3e-3
+
+
+@pytest.mark.parametrize("proven", [False, True])
+def test_more_poses_are_sampled_where_a_path_is_neither_found_nor_excluded(
+        proven, monkeypatch, tmp_path):
+    """As the planner advises, once; where it has proven that there is none the loop ends."""
+    wish = SimpleNamespace(place=np.zeros(3), sampled_deflection=0.1, max_force=9.0,
+                           limited=lambda cell: cell)
+    for name, value in (("Branch", SimpleNamespace(open=lambda _folder: None)),
+                        ("load_skeleton", lambda _branch: None),
+                        ("_grasp_of", lambda *_: (np.array([0.0, 0.0, 0.3]), np.eye(3)[2])),
+                        ("wish_for", lambda *_: wish), ("read_cell", lambda _path: None),
+                        ("write_cell", lambda *_: None)):
+        monkeypatch.setattr(loop, name, value)
+    parts = []
+
+    def part(_self, name, _title, *arguments):
+        parts.append((name, "--samples" in arguments))
+        if parts.count(("plan", False)) == 1 and name == "plan":
+            raise WorkError("No path: none exists." if proven else f"None, {loop._UNPROVEN}.")
+        return {}
+
+    monkeypatch.setattr(ClosedLoop, "_part", part)
+    if proven:
+        with pytest.raises(WorkError, match="none exists"):
+            ClosedLoop(tmp_path)._planned()
+        assert [name for name, _ in parts] == ["estimate", "energy", "plan"]
+    else:
+        assert ClosedLoop(tmp_path)._planned().goal is wish.place
+        assert parts == [("estimate", False), ("energy", False), ("plan", False),
+                         ("energy", True), ("plan", False)]
 
 
 class Beside:
