@@ -346,32 +346,42 @@ class Guard:
                                   "predicted one [N]", along, wanted)
         limits = settings.limits
         off = filtered - expected
-        force_name = self._name_of(off[:3], expected[:3])
+        before = self._usual_off(off[:3])
         for name, part, allowed, most in (
-                (force_name, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
+                (None, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
                 ("torque unlike the predicted one [N m]", slice(3, 6),
                  settings.largest_torque_error, limits.hard_torque_nm)):
             error = float(np.linalg.norm(off[part]))
             if error > allowed:
                 within = _allowed(off[part], doubt[part, part], allowed, most)
                 if error > within:
-                    return self._stop(name, error, within)
+                    return self._stop(name or self._force_named(off[:3], expected[:3], before),
+                                      error, within)
         return _GO
 
-    def _name_of(self, off: np.ndarray, expected: np.ndarray) -> str:
-        """Return what a force [3] beside the expected one [3] is called: what it most often is."""
-        memory, settings = self._memory, self._settings
+    def _usual_off(self, off: np.ndarray) -> np.ndarray:
+        """Return the usual difference to the expected force [3] up to now; ``off`` enters it."""
+        memory = self._memory
         before = off if memory.usual_off is None else memory.usual_off
-        kept = np.exp(-self._step / settings.loss_time)
+        kept = np.exp(-self._step / self._settings.loss_time)
         memory.usual_off = kept * before + (1 - kept) * off
+        return before
+
+    def _force_named(self, off: np.ndarray, expected: np.ndarray, before: np.ndarray) -> str:
+        """Return what a force [3] beside the expected one [3] is called: what it most often is.
+
+        Args:
+            off: The difference, shape [3].
+            before: What it usually was up to now, shape [3].
+        """
         wanted, missing = float(np.linalg.norm(expected)), -float(off @ expected)
-        if wanted <= settings.least_force:
+        if wanted <= self._settings.least_force:
             return _UNLIKE
-        size = wanted * float(np.linalg.norm(off))
-        at_once = np.linalg.norm(off - before) > 0.5 * np.linalg.norm(off)
-        if at_once and missing > _MOSTLY_AT_ONCE * size:
+        size = float(np.linalg.norm(off))
+        at_once = np.linalg.norm(off - before) > 0.5 * size
+        if at_once and missing > _MOSTLY_AT_ONCE * wanted * size:
             return _FELL
-        return _SHORT if missing > _MOSTLY * size else _UNLIKE
+        return _SHORT if missing > _MOSTLY * wanted * size else _UNLIKE
 
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
         decision = Decision(Verdict.STOP, reason, value, limit)
