@@ -14,6 +14,7 @@ from limber.closed_loop.watching import Watch
 from limber.commands.robot import _points
 from limber.errors import InputError, NoPathError, WorkError
 from limber.geometry.skeleton.skeleton import Skeleton
+from limber.planning.planners.gentle import UNPROVEN
 from limber.robot.arms import arm_named
 from limber.robot.calibration import fit_base
 from limber.robot.cell import Cell
@@ -78,7 +79,7 @@ def test_more_poses_are_sampled_where_a_path_is_neither_found_nor_excluded(
     def part(_self, name, _title, *arguments):
         parts.append((name, "--samples" in arguments))
         if parts.count(("plan", False)) == 1 and name == "plan":
-            raise WorkError("No path: none exists." if proven else f"None, {loop._UNPROVEN}.")
+            raise WorkError("No path: none exists." if proven else f"None, {UNPROVEN}.")
         return {}
 
     monkeypatch.setattr(ClosedLoop, "_part", part)

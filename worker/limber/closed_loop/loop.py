@@ -25,6 +25,7 @@ from limber.geometry.generated import read_truth
 from limber.geometry.skeleton.files import read_swc
 from limber.jobs.process import run_stage
 from limber.plain import plain
+from limber.planning.planners.gentle import UNPROVEN
 from limber.progress import SILENT, Progress
 from limber.robot.arms import arm_named
 from limber.robot.cell import Cell, read_cell, write_cell
@@ -48,7 +49,6 @@ OPEN_FACTOR = 4.0
 """Between the ends of a modulus' interval: where it is more, `limber suggest-pull` is asked whether
 another pull is worth it for the plan."""
 _MOST_PULLS = 3
-_UNPROVEN = "nor is it proven that none exists"  # of what `limber plan` says without a path
 _MORE_SAMPLES = 450  # about twice the usual
 _FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
@@ -253,7 +253,7 @@ class ClosedLoop:
         try:
             plan = self._ways(wish, goal)
         except WorkError as error:
-            if _UNPROVEN not in str(error):
+            if UNPROVEN not in str(error):
                 raise
             # What it advises then, once: where a branch may stand in two shapes, few poses tell
             # its force coarsely.

@@ -15,6 +15,9 @@ from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem
 from limber.progress import SILENT, Progress
 
+UNPROVEN = "nor is it proven that none exists"
+"""Of what is said without a path: more samples may show one. Across processes the words tell."""
+
 
 @dataclass(frozen=True)
 class GentlePath:
@@ -54,7 +57,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     if best[0] is None:
         raise NoPathError(
             f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} was "
-            "found, nor is it proven that none exists.",
+            f"found, {UNPROVEN}.",
             f"The bound says a path costs at least {certificate.lower:.3g} "
             f"(grid of {1e3 * certificate.levels[-1]['spacing_m']:.1f} mm).",
             "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
