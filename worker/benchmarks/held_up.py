@@ -5,6 +5,7 @@ all its processes together. A robot's data is then older than the guard allows, 
 stopped, as it should be; of what was to be measured that says nothing.
 """
 
+import os
 import subprocess
 import sys
 import threading
@@ -12,6 +13,8 @@ import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import TypeVar
+
+import numpy as np
 
 from limber.errors import LimberError
 
@@ -21,16 +24,18 @@ _MOST_AGAIN = 3
 _Result = TypeVar("_Result")
 
 _WATCHING = """
-import sys, time
+import os, sys, time
 from limber.robot.real_time import claim_real_time
+if sys.argv[1:]:
+    os.sched_setaffinity(0, [int(sys.argv[1])])
 claim_real_time(30)
 last = time.monotonic()
 while True:
-    time.sleep(0.002)
+    time.sleep(0.001)
     now = time.monotonic()
-    if now - last > 0.01:
+    if now - last > 0.002:
         try:
-            print(now, now - last, flush=True)
+            print(now, now - last - 0.001, flush=True)
         except BrokenPipeError:
             sys.exit()
     last = now
@@ -38,14 +43,21 @@ while True:
 
 
 class Witness:
-    """A process that wants to run every 2 ms before all others, and notes when it could not."""
+    """A process on each processor that wants to run every 1 ms before all others.
+
+    It notes when it could not, from 1 ms late on.
+    """
 
     def __init__(self) -> None:
-        self._process = subprocess.Popen([sys.executable, "-c", _WATCHING], text=True,
-                                         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
+        self._processes = [
+            subprocess.Popen([sys.executable, "-c", _WATCHING, *processor], text=True,
+                             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
+            for processor in _processors()]
         self._seen: list[tuple[float, float]] = []
-        self._reader = threading.Thread(target=self._read, name="witness", daemon=True)
-        self._reader.start()
+        self._readers = [threading.Thread(target=self._read, args=[process], name="witness",
+                                          daemon=True) for process in self._processes]
+        for reader in self._readers:
+            reader.start()
 
     def __enter__(self) -> "Witness":
         return self
@@ -54,23 +66,35 @@ class Witness:
                  trace: TracebackType | None) -> None:
         self.close()
 
-    def longest(self, since: float) -> float:
-        """Return the longest stand-still [s] that ended after ``since`` [s, monotonic clock]."""
-        return max((seconds for moment, seconds in self._seen if moment > since), default=0.0)
+    def longest(self, since: float, until: float = np.inf) -> float:
+        """Return the longest stand-still of a processor [s] between two moments.
+
+        It ended after ``since`` and began before ``until`` [s, monotonic clock].
+        """
+        return max((seconds for moment, seconds in self._seen
+                    if moment > since and moment - seconds < until), default=0.0)
 
     def close(self) -> None:
-        """End the process."""
-        self._process.kill()
-        self._process.wait()
-        self._reader.join(2.0)
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+        """End the processes."""
+        for process, reader in zip(self._processes, self._readers, strict=True):
+            process.kill()
+            process.wait()
+            reader.join(2.0)
+            assert process.stdout is not None
+            process.stdout.close()
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
+    def _read(self, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
             moment, seconds = map(float, line.split())
             self._seen.append((moment, seconds))
+
+
+def _processors() -> list[list[str]]:
+    """Return the arguments of each watching process; one without, where none can be bound."""
+    if not hasattr(os, "sched_getaffinity"):
+        return [[]]
+    return [[str(processor)] for processor in sorted(os.sched_getaffinity(0))]
 
 
 class Voided:
@@ -99,6 +123,19 @@ class Voided:
                 print(f"{name}: once more, the machine stood still for {1000 * longest:.0f} ms: "
                       f"{error}", flush=True)
         return run()
+
+    def explains(self, since: float, until: float, late: float, name: str) -> bool:
+        """Return whether the machine stood still between two moments for as long as it was late.
+
+        Where it did that is told and counted: the run is to be done again.
+        """
+        longest = self._witness.longest(since, until)
+        if longest < late:
+            return False
+        self.count += 1
+        print(f"{name}: once more, {1000 * late:.1f} ms late where the machine stood still for "
+              f"{1000 * longest:.1f} ms", flush=True)
+        return True
 
     def __str__(self) -> str:
         return f"; {self.count} done again, the machine stood still" if self.count else ""

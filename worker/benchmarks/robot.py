@@ -34,6 +34,7 @@ from limber.robot.expected import ExpectedWrench
 from limber.robot.kinematics import forward, inverse
 from limber.robot.link import RobotLink
 from limber.robot.trajectory import Trajectory, along, densely
+from limber.robot.virtual.launch import VirtualRobot
 
 _ADDRESS = "127.0.0.71"
 
@@ -99,38 +100,69 @@ def _kinematics(setting: Setting, _progress: Progress) -> list[Row]:
                 str(lacking), lacking == 0)]
 
 
+@dataclass(frozen=True)
+class _Stop:
+    """One stop for a force: when it came and how far the arm went on.
+
+    ``since`` and ``until`` [s, monotonic clock]: between them the force came and the stop.
+    """
+
+    latency: float
+    way: float
+    since: float
+    until: float
+
+
 def _stop_time(setting: Setting, _progress: Progress, model: str) -> list[Row]:
     """From the step at which the force goes over the limit until the stop command has come.
 
-    An FT300 tells its force every 10 ms, which is part of it.
+    An FT300 tells its force every 10 ms, which is part of it. A stop that was late by no more
+    than the machine stood still meanwhile is done again, and told with its time.
     """
-    latencies, ways = [], []
+    rate, asked = (125, 0.012) if model == "ur5" else (500, 0.006)
+    stops, late = [], []
     runs = 2 if setting.quick else 20
     with new_robot(_ADDRESS, model, setting.seed) as robot:
-        for _ in range(runs):
-            restored(robot)
-            with RobotLink(cell_for(_ADDRESS, model)) as link:
-                time.sleep(0.2)
-                link.tare()
-                link.start(straight(robot, (0.0, 0.2, 0.0)))
-                time.sleep(1.0)
-                before = robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
-                link.wait("stopped", seconds=5)
-                time.sleep(0.3)
-                after = robot.state
-            # The force acts from the next step on.
-            acts = before["clock"] + 1.0 / (125 if model == "ur5" else 500)
-            stopped = [moment for line in after["log"] if line.endswith(("came", "dashboard"))
-                       and (moment := float(line.split()[0])) > before["clock"]]
-            latencies.append(stopped[0] - acts)
-            ways.append(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))
-    rate, asked = (125, 12) if model == "ur5" else (500, 6)
-    worst = 1000 * max(latencies)
+        while len(stops) < runs:
+            stop = _one_stop(robot, model, 1.0 / rate)
+            over = stop.latency - asked
+            if over > 1e-6 and len(late) < runs and setting.voided.explains(
+                    stop.since, stop.until, over, f"stop at {rate} Hz"):
+                late.append(stop)
+                continue
+            stops.append(stop)
+    worst = max(stop.latency for stop in stops)
+    median = np.median([stop.latency for stop in stops])
+    held_up = "" if not late else (f"; {len(late)} done again, the machine stood still: to "
+                                   f"{1000 * max(stop.latency for stop in late):.1f} ms")
     return [Row(f"force over the hard limit until the stop command, {rate} Hz, worst of {runs}",
-                f"{asked} ms", f"{worst:.1f} ms (median {1000 * np.median(latencies):.1f})",
+                f"{1000 * asked:.0f} ms",
+                f"{1000 * worst:.1f} ms (median {1000 * median:.1f}){held_up}",
                 worst <= asked + 1e-6),
             Row(f"way after the limit at 50 mm/s, {rate} Hz, worst", "reported",
-                f"{1000 * max(ways):.1f} mm", None)]
+                f"{1000 * max(stop.way for stop in stops + late):.1f} mm", None)]
+
+
+def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
+    """Add a force over the limit to a moving arm and wait for the stop."""
+    restored(robot)
+    with RobotLink(cell_for(_ADDRESS, model)) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(robot, (0.0, 0.2, 0.0)))
+        time.sleep(1.0)
+        since = time.monotonic()
+        before = robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
+        came = time.monotonic()
+        link.wait("stopped", seconds=5)
+        time.sleep(0.3)
+        after = robot.state
+    # The force acts from the next step on.
+    acts = before["clock"] + step
+    stopped = min(moment for line in after["log"] if line.endswith(("came", "dashboard"))
+                  and (moment := float(line.split()[0])) > before["clock"])
+    way = float(np.linalg.norm(np.subtract(after["pose"][:3], before["pose"][:3])))
+    return _Stop(stopped - acts, way, since, came + stopped - acts)
 
 
 def _path(setting: Setting, _progress: Progress) -> list[Row]:
