@@ -98,7 +98,7 @@ class Driver:
         self._held_for: np.ndarray | None = None
         self._held_at = np.zeros(6)
         self._tare_until: float | None = None
-        self._batch: list[list[float]] = []
+        self._batch: list[np.ndarray] = []
         self._batch_since = time.monotonic()
         self._last: Sample | None = None
         self._woke, self._listened = -np.inf, time.monotonic()
@@ -294,6 +294,8 @@ class Driver:
             self._judge(self.guard.event(str(error)))
             return
         now, smooth = self._chain.wrench(sample, reading)
+        # First what must not wait for the rest.
+        self._judge(self.guard.feel(now), sample)
         following = self._following
         expected = doubt = sent = None
         if following is not None:
@@ -310,9 +312,10 @@ class Driver:
             decision = self.guard.event(f"the force sensor is silent for {reading.age:.3f} s")
         self._judge(decision, sample)
         pose = pose_of(grasp)
-        self._batch.append([sample.clock, *pose, *now, *smooth, *sample.joints,
-                            *(_NOTHING if expected is None else expected),
-                            *(_NOTHING if doubt is None else doubt[:3, :3][_UPPER])])
+        self._batch.append(np.concatenate((
+            (sample.clock,), pose, now, smooth, sample.joints,
+            _NOTHING if expected is None else expected,
+            _NOTHING if doubt is None else doubt[:3, :3][_UPPER])))
         if self._tare_until is not None and sample.clock >= self._tare_until:
             self._end_tare()
 
@@ -530,7 +533,7 @@ class Driver:
     def _send_batch(self) -> None:
         now = time.monotonic()
         if self._batch and now - self._batch_since >= _BATCH_SECONDS:
-            rows = np.round(np.array(self._batch, float), 7)
+            rows = np.round(np.array(self._batch), 7)
             self.tell(samples=np.where(np.isfinite(rows), rows, None).tolist())
             self._batch, self._batch_since = [], now
 

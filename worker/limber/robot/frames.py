@@ -101,6 +101,15 @@ def pose_between(first: np.ndarray, second: np.ndarray, part: float) -> np.ndarr
 
 
 @compiled
+def length(vector: np.ndarray) -> float:
+    """Return the Euclidean length of a vector [n]."""
+    square = 0.0
+    for k in range(len(vector)):
+        square += vector[k] * vector[k]
+    return math.sqrt(square)
+
+
+@compiled
 def crossed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the cross product of two vectors [3]."""
     return np.array([first[1] * second[2] - first[2] * second[1],

@@ -16,7 +16,7 @@ import numpy as np
 from limber.errors import SafetyStop
 from limber.robot.arms import Arm
 from limber.robot.cell import LimitsEntry, WorkspaceEntry
-from limber.robot.frames import pose_between, turn_between
+from limber.robot.frames import length, pose_between, turn_between
 from limber.robot.kinematics import singularity_distance
 from limber.robot.samples import Sample
 
@@ -209,7 +209,7 @@ class Guard:
                       self._check_expected(wrench, expected, doubt)):
             if check.verdict == Verdict.STOP:
                 return check
-        force = float(np.linalg.norm(wrench[:3]))
+        force = length(wrench[:3])
         if self.state == State.MOVING and force > self._settings.limits.soft_force_n:
             self.state = State.PAUSED
             self.reason = "soft force limit"
@@ -231,8 +231,8 @@ class Guard:
             self._stop("a target that is no pose")
             raise SafetyStop("A target that is no pose.", f"{target}", "")
         limits = self._settings.limits
-        way = float(np.linalg.norm(target[:3] - current[:3]))
-        turn = float(np.linalg.norm(turn_between(current, target)))
+        way = length(target[:3] - current[:3])
+        turn = length(turn_between(current, target))
         part = min(1.0, limits.speed_m_s * seconds / way if way > 0 else 1.0,
                    limits.turn_speed_rad_s * seconds / turn if turn > 0 else 1.0)
         return target if part >= 1.0 else pose_between(current, target, part)
@@ -284,17 +284,17 @@ class Guard:
             return _GO
         if np.isnan(wrench).any():
             return self._stop("a sensor shows no number")
-        force, torque = np.linalg.norm(wrench[:3]), np.linalg.norm(wrench[3:])
+        force, torque = length(wrench[:3]), length(wrench[3:])
         if force > limits.hard_force_n:
-            return self._stop("hard force limit [N]", float(force), limits.hard_force_n)
+            return self._stop("hard force limit [N]", force, limits.hard_force_n)
         if torque > limits.hard_torque_nm:
-            return self._stop("hard torque limit [N m]", float(torque), limits.hard_torque_nm)
+            return self._stop("hard torque limit [N m]", torque, limits.hard_torque_nm)
         return _GO
 
     def _check_place(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
                      ) -> Decision:
         limits, settings = self._settings.limits, self._settings
-        speed = float(np.linalg.norm(sample.speed[:3]))
+        speed = length(sample.speed[:3])
         if speed > 1.5 * limits.speed_m_s + 0.005:
             return self._stop("speed [m/s]", speed, limits.speed_m_s)
         margin = np.minimum(sample.joints - settings.joint_limits[:, 0],
@@ -310,7 +310,7 @@ class Guard:
                 or np.any(grasp > np.array(box.high_m) + 1e-3)):
             return self._stop("the grasp left the workspace")
         if sent is not None and self.state == State.MOVING:
-            off = float(np.linalg.norm(sample.pose[:3] - sent))
+            off = length(sample.pose[:3] - sent)
             if off > settings.off_path:
                 return self._stop("off its path [m]", off, settings.off_path)
         return _GO
@@ -323,7 +323,7 @@ class Guard:
         kept = np.exp(-self._step / settings.filter_time)
         before = wrench if memory.filtered is None else memory.filtered
         memory.filtered = filtered = kept * before + (1 - kept) * wrench
-        force = float(np.linalg.norm(filtered[:3]))
+        force = length(filtered[:3])
         if expected is None:
             # Nothing is predicted while E is being measured: a sudden loss still tells a slip, but
             # not while the branch is let back and pulls the way that the gripper goes.
@@ -336,7 +336,7 @@ class Guard:
                                   max(settings.lost_share * memory.peak, settings.least_force))
             return _GO
         doubt = _NO_DOUBT if doubt is None else doubt
-        wanted = float(np.linalg.norm(expected[:3]))
+        wanted = length(expected[:3])
         if wanted > settings.least_force:
             along = float(filtered[:3] @ expected[:3]) / wanted
             unsure = _DEVIATIONS * float(np.sqrt(max(
@@ -351,7 +351,7 @@ class Guard:
                 (None, slice(0, 3), limits.unexpected_force_n, limits.soft_force_n),
                 ("torque unlike the predicted one [N m]", slice(3, 6),
                  settings.largest_torque_error, limits.hard_torque_nm)):
-            error = float(np.linalg.norm(off[part]))
+            error = length(off[part])
             if error > allowed:
                 within = _allowed(off[part], doubt[part, part], allowed, most)
                 if error > within:
@@ -374,11 +374,11 @@ class Guard:
             off: The difference, shape [3].
             before: What it usually was up to now, shape [3].
         """
-        wanted, missing = float(np.linalg.norm(expected)), -float(off @ expected)
+        wanted, missing = length(expected), -float(off @ expected)
         if wanted <= self._settings.least_force:
             return _UNLIKE
-        size = float(np.linalg.norm(off))
-        at_once = np.linalg.norm(off - before) > 0.5 * size
+        size = length(off)
+        at_once = length(off - before) > 0.5 * size
         if at_once and missing > _MOSTLY_AT_ONCE * wanted * size:
             return _FELL
         return _SHORT if missing > _MOSTLY * wanted * size else _UNLIKE
@@ -398,7 +398,7 @@ def _allowed(off: np.ndarray, covariance: np.ndarray, least: float, most: float)
     """
     squares, axes = np.linalg.eigh(covariance)
     radii = least**2 + np.minimum(_DEVIATIONS**2 * np.maximum(squares, 0.0), most**2)
-    along = axes.T @ (off / np.linalg.norm(off))
+    along = axes.T @ (off / length(off))
     return float(1.0 / np.sqrt((along**2 / radii).sum()))
 
 

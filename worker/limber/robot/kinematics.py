@@ -99,11 +99,8 @@ def singularity_distance(arm: Arm, joints: np.ndarray) -> np.ndarray:
         Shape [..., 3]: wrist, elbow, shoulder.
     """
     joints = np.asarray(joints, float)
-    q2, q3, q4, q5 = (joints[..., k] for k in range(1, 5))
-    elbow, wrist = np.abs(np.sin(q3)), np.abs(np.sin(q5))
-    lever = (arm.a[1] * np.cos(q2) + arm.a[2] * np.cos(q2 + q3)
-             + arm.d[4] * np.sin(q2 + q3 + q4))
-    return np.stack([wrist, elbow, np.abs(lever) / arm.reach], axis=-1)
+    distances = _singularity_distance(arm.table, arm.reach, for_kernels(joints.reshape(-1, 6)))
+    return distances.reshape(*joints.shape[:-1], 3)
 
 
 def matrices(poses: np.ndarray) -> np.ndarray:
@@ -189,6 +186,18 @@ def _jacobian(table: np.ndarray, joints: np.ndarray) -> np.ndarray:
             slopes[n, 2, k] = axis[0] * arm[1] - axis[1] * arm[0]
             slopes[n, 3:, k] = axis
     return slopes
+
+
+@compiled
+def _singularity_distance(table: np.ndarray, reach: float, joints: np.ndarray) -> np.ndarray:
+    distances = np.empty((len(joints), 3))
+    a2, a3, d5 = table[1, 1], table[2, 1], table[4, 0]
+    for n in range(len(joints)):
+        q2, q3, q4, q5 = joints[n, 1], joints[n, 2], joints[n, 3], joints[n, 4]
+        lever = a2 * math.cos(q2) + a3 * math.cos(q2 + q3) + d5 * math.sin(q2 + q3 + q4)
+        distances[n, 0], distances[n, 1] = abs(math.sin(q5)), abs(math.sin(q3))
+        distances[n, 2] = abs(lever) / reach
+    return distances
 
 
 @compiled

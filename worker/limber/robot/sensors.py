@@ -256,7 +256,7 @@ class WrenchChain:
         self._recent.append(now)
         if len(self._recent) > self.count:
             self._recent.popleft()
-        return now, np.mean(self._recent, axis=0)
+        return now, sum(self._recent) / len(self._recent)
 
     def between(self, sample: Sample, reading: Reading) -> np.ndarray:
         """Return the wrench of a reading that came after ``sample``, shape [6]; it is not

@@ -27,6 +27,7 @@ MARKER_PORT = 63400
 CAMERA_PORT = 63401
 """Simulated depth camera: an image for each camera that is sent."""
 
+_FT300_SECONDS = 1 / 100
 _MARKER_SECONDS = 1 / 30
 _MARKER_SIGMA_M = 0.5e-3
 
@@ -193,10 +194,14 @@ class Server:
 
     async def _serve_ft300(self, _reader: asyncio.StreamReader,
                            writer: asyncio.StreamWriter) -> None:
+        due = time.perf_counter()
         while not writer.is_closing():
             fields = " , ".join(f"{value:.4f}" for value in self.controller.ft300_reading)
             self.send(writer, f"( {fields} )".encode())
-            await asyncio.sleep(0.01)
+            # Held up it leaves readings out and keeps its beat.
+            behind = time.perf_counter() - due
+            due += _FT300_SECONDS * (1 + behind // _FT300_SECONDS)
+            await asyncio.sleep(due - time.perf_counter())
 
 
     async def _serve_markers(self, _reader: asyncio.StreamReader,
