@@ -13,13 +13,14 @@ from limber.robot import rtde
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.dashboard import answer
 from limber.robot.virtual.launch import VirtualRobot
-from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, Server, _RtdeConnection
+from limber.robot.virtual.server import FT300_PORT, RTDE_PORT, Server, _RtdeClient
 
 
-class Writer:
+class Wire(asyncio.Transport):
     """Keeps what a connection sends."""
 
     def __init__(self):
+        super().__init__()
         self.sent = bytearray()
 
     def is_closing(self) -> bool:
@@ -29,14 +30,19 @@ class Writer:
         self.sent += data
 
 
+def connected(server: Server) -> _RtdeClient:
+    client = _RtdeClient(server)
+    client.connection_made(Wire())
+    return client
+
+
 @pytest.fixture
 def connection():
-    server = Server(Controller("ur5e"), "127.0.0.1")
-    return _RtdeConnection(server, Writer())
+    return connected(Server(Controller("ur5e"), "127.0.0.1"))
 
 
 def replies(connection) -> list[tuple[int, bytes]]:
-    return rtde.split_frames(connection.writer.sent)
+    return rtde.split_frames(connection.transport.sent)
 
 
 def test_only_protocol_version_2_is_spoken(connection):
@@ -59,12 +65,12 @@ def test_names_of_later_versions_are_not_found():
 
 
 def test_an_input_register_has_one_writer(connection):
-    other = _RtdeConnection(connection._server, Writer())
+    other = connected(connection._server)
     connection.take(rtde.INPUT_SETUP, b"input_int_register_0")
     other.take(rtde.INPUT_SETUP, b"input_int_register_0,speed_slider_mask")
     assert replies(connection) == [(ord("I"), b"\1INT32")]
     assert replies(other) == [(ord("I"), b"\0IN_USE,UINT32")]
-    connection.release()
+    connection.connection_lost(None)
     other.take(rtde.INPUT_SETUP, b"input_int_register_0")
     assert replies(other) == [(ord("I"), b"\1INT32")]
 

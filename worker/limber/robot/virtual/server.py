@@ -10,6 +10,7 @@ import selectors
 import struct
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -55,8 +56,8 @@ class Server:
         self.silent = False
         self.lost_seconds = 0.0
         self._servers: list[asyncio.Server] = []
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._streams: list[_RtdeConnection] = []
+        self.transports: set[asyncio.Transport] = set()
+        self.streams: list[_RtdeClient] = []
         self.owners: dict[str, object] = {}
         self._one_picture = asyncio.Lock()
 
@@ -67,14 +68,17 @@ class Server:
             WorkError: one is taken.
         """
         ports: dict[int, Callable[[Any, Any], Awaitable[None]]] = {
-            RTDE_PORT: self._serve_rtde, SCRIPT_PORT: self._serve_scripts,
-            DASHBOARD_PORT: self._serve_dashboard}
+            SCRIPT_PORT: self._serve_scripts}
         if self.controller.ft300 is not None:
             ports[FT300_PORT] = self._serve_ft300
         if self.controller.load.seen():
             ports[MARKER_PORT] = self._serve_markers
             ports[CAMERA_PORT] = self._serve_camera
+        loop = asyncio.get_running_loop()
         try:
+            for port, client in ((RTDE_PORT, _RtdeClient), (DASHBOARD_PORT, _DashboardClient)):
+                self._servers.append(await loop.create_server(
+                    partial(client, self), self.address, port))
             for port, serve in ports.items():
                 self._servers.append(await asyncio.start_server(
                     self._guarded(serve), self.address, port))
@@ -94,8 +98,8 @@ class Server:
 
     def cut(self) -> None:
         """Cut every connection, without a word."""
-        for writer in list(self._writers):
-            writer.transport.abort()
+        for transport in list(self.transports):
+            transport.abort()
 
     async def run(self) -> None:
         """Step the controller by the wall clock until cancelled."""
@@ -124,25 +128,25 @@ class Server:
         else:
             action()
 
-    def send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
+    def send(self, to: asyncio.StreamWriter | asyncio.Transport, data: bytes) -> None:
         """Send, late where there is a delay, never where silent."""
         if self.silent:
             return
-        self.later(lambda: None if writer.is_closing() else writer.write(data))
+        self.later(lambda: None if to.is_closing() else to.write(data))
 
     def _publish(self) -> None:
         values = None
-        for stream in self._streams:
+        for stream in self.streams:
             if stream.is_due(self.controller):
                 values = values or self.controller.outputs()
-                if stream.writer.transport.get_write_buffer_size() > _SENDS_BEHIND:
-                    stream.writer.transport.abort()
+                if stream.transport.get_write_buffer_size() > _SENDS_BEHIND:
+                    stream.transport.abort()
                     continue
-                self.send(stream.writer, stream.output.packed(values))
+                self.send(stream.transport, stream.output.packed(values))
 
     def _guarded(self, serve: Callable[[Any, Any], Awaitable[None]]) -> Callable:
         async def body(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            self._writers.add(writer)
+            self.transports.add(writer.transport)
             try:
                 await serve(reader, writer)
             except (ConnectionError, asyncio.IncompleteReadError):
@@ -152,25 +156,9 @@ class Server:
                 # The robot ends. Passed on, asyncio's streams would print it as a fault of ours.
                 return
             finally:
-                self._writers.discard(writer)
+                self.transports.discard(writer.transport)
                 writer.transport.abort()
         return body
-
-    async def _serve_rtde(self, reader: asyncio.StreamReader,
-                          writer: asyncio.StreamWriter) -> None:
-        stream = _RtdeConnection(self, writer)
-        self._streams.append(stream)
-        data = bytearray()
-        try:
-            while chunk := await reader.read(65536):
-                data += chunk
-                for command, body in rtde.split_frames(data):
-                    self.later(lambda command=command, body=body: stream.take(command, body))
-        except ValueError as error:
-            self.controller.say(f"RTDE connection dropped: {error}")
-        finally:
-            self._streams.remove(stream)
-            stream.release()
 
     async def _serve_scripts(self, reader: asyncio.StreamReader,
                              writer: asyncio.StreamWriter) -> None:
@@ -181,16 +169,6 @@ class Server:
             while (stop := _end_of_script(text)) is not None:
                 script, text = text[:stop], text[stop:]
                 self.later(lambda script=script: self.controller.load_script(script))
-
-    async def _serve_dashboard(self, reader: asyncio.StreamReader,
-                               writer: asyncio.StreamWriter) -> None:
-        self.send(writer, f"{GREETING}\n".encode())
-        while line := await reader.readline():
-            text = line.decode("utf-8", "replace")
-
-            def reply(text: str = text) -> None:
-                self.send(writer, f"{answer(self.controller, text)}\n".encode())
-            self.later(reply)
 
     async def _serve_ft300(self, _reader: asyncio.StreamReader,
                            writer: asyncio.StreamWriter) -> None:
@@ -237,21 +215,84 @@ class Server:
             self.send(writer, json.dumps(told).encode() + b"\n" + picture)
 
 
-class _RtdeConnection:
+class _Client(asyncio.Protocol):
+    """One client whose words are taken as they come.
+
+    A stream's reader would leave them for the loop's next turn, which is part of a stop's time.
+    """
+
+    def __init__(self, server: Server):
+        self._server = server
+        self._data = bytearray()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self._server.transports.add(transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._data += data
+        self.read(self._data)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._server.transports.discard(self.transport)
+        if error is not None:
+            # The client is gone; that is its right.
+            self._server.controller.say("a connection was closed")
+
+    def read(self, data: bytearray) -> None:
+        """Take from ``data`` what is whole."""
+        raise NotImplementedError
+
+
+class _DashboardClient(_Client):
+    """One client of the dashboard: a line, an answer."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._server.send(self.transport, f"{GREETING}\n".encode())
+
+    def read(self, data: bytearray) -> None:
+        *lines, rest = data.split(b"\n")
+        data[:] = rest
+        for line in lines:
+            self._server.later(partial(self._reply, line.decode("utf-8", "replace")))
+
+    def _reply(self, text: str) -> None:
+        self._server.send(self.transport, f"{answer(self._server.controller, text)}\n".encode())
+
+
+class _RtdeClient(_Client):
     """One client of the RTDE port: its recipes and whether data flows."""
 
-    def __init__(self, server: Server, writer: asyncio.StreamWriter):
-        self.writer = writer
-        self._server = server
+    def __init__(self, server: Server):
+        super().__init__(server)
         self.output: rtde.Recipe | None = None
         self._inputs: dict[int, rtde.Recipe] = {}
-        self._every, self._started, self._last = 1, False, 0
+        self._every, self._started = 1, False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self._server.streams.append(self)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        super().connection_lost(error)
+        self._server.streams.remove(self)
+        self._release()
+
+    def read(self, data: bytearray) -> None:
+        try:
+            for command, body in rtde.split_frames(data):
+                self._server.later(partial(self.take, command, body))
+        except ValueError as error:
+            self._server.controller.say(f"RTDE connection dropped: {error}")
+            self.transport.abort()
 
     def is_due(self, controller: Controller) -> bool:
         return (self._started and self.output is not None
                 and controller.step_count % self._every == 0)
 
-    def release(self) -> None:
+    def _release(self) -> None:
         """Give back the input registers that this client wrote."""
         owners = self._server.owners
         for name in [name for name, owner in owners.items() if owner is self]:
@@ -264,7 +305,7 @@ class _RtdeConnection:
             return
         reply = self._reply(command, body)
         if reply is not None:
-            self._server.send(self.writer, rtde.frame(command, reply))
+            self._server.send(self.transport, rtde.frame(command, reply))
 
     def _reply(self, command: int, body: bytes) -> bytes | None:
         controller = self._server.controller
