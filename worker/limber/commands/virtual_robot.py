@@ -31,7 +31,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
     command that it does not know ends the program and is logged.
     """
     from limber.robot.cell import read_cell
-    from limber.robot.real_time import claim_real_time
+    from limber.robot.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
     from limber.robot.virtual.controller import Controller
     from limber.robot.virtual.held_branch import HeldBranch
     from limber.robot.virtual.launch import serve
@@ -50,7 +50,7 @@ def command(run: Run, branch_folder: Path | None, cell_file: Path | None, model:
             centre=tool.centre_of_mass_m if tool else (0.0, 0.0, 0.0),
             ft300=cell.sensor.kind == "ft300" if cell else not model.endswith("e"))
         controller.gripper_output = tool.close_output if tool else 0
-        real_time = claim_real_time()
+        real_time = claim_real_time(VIRTUAL_ROBOT_PRIORITY)
         server = serve(controller, address, seconds=seconds, say=run.say)
     return {"model": controller.arm.name, "address": address, "steps": controller.step_count,
             "real_time": real_time, "lost_seconds": server.lost_seconds}

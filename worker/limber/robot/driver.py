@@ -44,6 +44,7 @@ _PROGRAM_SECONDS = 2.0
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
 _LONG_STEP_SECONDS = 0.004
+_LOOP_PRIORITY = 22
 _HELD_UP_SECONDS = 0.02
 _GRACE_SECONDS = 0.015
 _NOTHING = np.full(6, np.nan)
@@ -90,6 +91,8 @@ class Driver:
         # Now: where it has just compiled this takes longer than the watchdog would wait.
         spare_what_is_loaded()
         self._control = self._connect(address)
+        # Before ur-rtde's own threads, which have what was claimed before they began.
+        claim_real_time(_LOOP_PRIORITY)
         self._following: Following | None = None
         self._gone: Trajectory | None = None
         self._stopped_at: float | None = None

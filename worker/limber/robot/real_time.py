@@ -3,6 +3,9 @@
 import gc
 import os
 
+VIRTUAL_ROBOT_PRIORITY = 25
+"""Before the driver it is driven by: a real controller has a computer of its own."""
+
 
 def claim_real_time(priority: int = 20) -> bool:
     """Ask for round-robin real-time scheduling; returns whether it was granted.

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from limber.errors import LimberError
-from limber.robot.real_time import claim_real_time
+from limber.robot.real_time import VIRTUAL_ROBOT_PRIORITY, claim_real_time
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.held_branch import BranchSetting, HeldBranch
 from limber.robot.virtual.launch import serve
@@ -32,7 +32,7 @@ def main() -> int:
         controller = Controller(options.model, joints=options.joints, mass=options.mass,
                                 centre=tuple(options.centre), seed=options.seed,
                                 ft300=options.ft300, load=load)
-        claim_real_time()
+        claim_real_time(VIRTUAL_ROBOT_PRIORITY)
         serve(controller, options.address, control=True)
     except LimberError as error:
         print(f"error: {error}", file=sys.stderr)
