@@ -12,6 +12,7 @@ by the next target within the same step. Nothing here waits for a motion.
 import json
 import os
 import queue
+import select
 import signal
 import sys
 import threading
@@ -215,6 +216,9 @@ class Driver:
                 self._look(sample)
             if samples:
                 self._last = samples[-1]
+                # What came while they were judged need not wait for the next target as well.
+                if any(select.select(self._sensor.connections, [], [], 0.0)):
+                    self._feel(self._last)
             elif self._last is not None:
                 if not self._has_just_woken:
                     self._judge(self.guard.silence(time.monotonic() - self._last.arrived))
