@@ -14,6 +14,7 @@ from limber.geometry.cloud.camera import Camera, depth_to_cloud
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.mechanics.sensitivities import grasp_slopes
+from limber.robot.cell import Cell
 from limber.robot.kinematics import inverted, matrices
 from limber.robot.virtual.controller import Controller
 from limber.robot.virtual.depth_camera import scanned, views_around
@@ -48,6 +49,26 @@ def setting(beam, tmp_path_factory) -> BranchSetting:
     base[:3] = np.r_[middle, TIP[2]] - gripper[:3, 3]
     point = (float(middle[0]), float(middle[1]), 0.2)
     return BranchSetting(path, tuple(base), grasp, points=(point,), compliance=0.0)
+
+
+def test_a_true_modulus_swings_between_the_control_points(beam, tmp_path):
+    """It keeps to what is given at them and is off by turns between them."""
+    places = np.array([[0.005, 0.005, z] for z in (0.05, 0.15, 0.25)])
+    axis = SimpleNamespace(nodes=np.array([[0, 0, 0], [0, 0, 0.32]]), main_path=lambda: [0, 1])
+    truth = SimpleNamespace(mesh=beam, control_points=places, young=[8e7, 4e7, 2e7],
+                            skeleton=axis, gravity=(0.0, 0.0, 0.0))
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6})
+    young = []
+    for wave in (0.0, 0.2):
+        BranchSetting.of_truth(truth, cell, tmp_path / "truth.vtu", wave=wave)
+        young.append(TetMesh.read(tmp_path / "truth.vtu").cell_data["young"])
+    swing = np.log(young[1] / young[0])
+    heights = beam.centroids[:, 2]
+    assert np.abs(swing).max() < 0.21
+    for place, least, most in ((0.05, -0.05, 0.05), (0.1, 0.1, 0.2), (0.15, -0.05, 0.05),
+                               (0.2, -0.2, -0.1), (0.25, -0.05, 0.05)):
+        near = swing[np.abs(heights - place) < 0.006]
+        assert len(near) and least < near.mean() < most
 
 
 def model_of(beam) -> BranchModel:

@@ -265,6 +265,26 @@ def test_a_tracker_on_the_base_is_turned_into_the_branchs_frame():
     assert frames[1][1] == pytest.approx(np.array([[0.1, 0, 0]]))
 
 
+def test_resting_points_tell_their_noise():
+    """A tracker of 0.3 mm is said to have 0.3 mm; one that smooths has at least 0.1 mm."""
+    rng = np.random.default_rng(4)
+    place = np.array([[0.1, 0.2, 0.3], [0.2, 0.1, 0.4]])
+    for count, sigma, told in ((200, 3e-4, pytest.approx(3e-4, rel=0.1)), (200, 1e-6, 1e-4),
+                               (5, 3e-4, None)):
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            stream = MarkerStream("127.0.0.1", server.getsockname()[1], np.zeros(6))
+            theirs, _ = server.accept()
+            with theirs:
+                for number in range(count):
+                    points = place + sigma * rng.standard_normal(place.shape)
+                    theirs.sendall(json.dumps({"t_s": number / 30, "points_m": points.tolist()}
+                                              ).encode() + b"\n")
+                points, noise = stream.at_rest()
+            stream.close()
+        assert points == pytest.approx(place, abs=4 * sigma / np.sqrt(count))
+        assert noise == told
+
+
 def test_its_schema_is_plain(capsys):
     from limber.stages.registry import stage_schema
 

@@ -181,7 +181,8 @@ def test_the_gripper_weighs_what_the_payload_does_not_say():
             readings.append(controller.outputs()["actual_TCP_force"])
         return np.mean(readings, axis=0)
     noise = 5 * traits.force_sigma / np.sqrt(400) + 0.02
-    assert mean_force()[:3] == pytest.approx([0, 0, -0.8 * 9.80665], abs=noise)
+    told = -0.8 * 9.80665 * controller.sensor.gain
+    assert mean_force()[:3] == pytest.approx([0, 0, told], abs=noise)
     registers.run(PAYLOAD, 0.8, 0, 0, 0.06)
     assert mean_force()[:3] == pytest.approx([0, 0, 0], abs=noise)
 
@@ -200,8 +201,21 @@ def test_force_is_reported_in_the_bases_axes_about_the_tools_centre():
         controller.step()
         readings.append(controller.outputs()["actual_TCP_force"])
     lever = -(controller.flange[:3, :3] @ [0, 0, 0.1])
-    expected = np.r_[10.0, 0, 0, np.cross(lever, [10.0, 0, 0])]
+    expected = controller.sensor.gain * np.r_[10.0, 0, 0, np.cross(lever, [10.0, 0, 0])]
     assert np.mean(readings, axis=0) == pytest.approx(expected, abs=0.04)
+
+
+def test_a_sensors_gain_is_off_by_some_hundredths_and_stays():
+    load = np.array([0, 0, 50.0, 0, 0, 0])
+    gains = []
+    for seed in range(200):
+        sensor = ForceSensor(E_SERIES, np.random.default_rng(seed))
+        sensor.zero()
+        gains.append(sensor.gain)
+        if seed < 5:
+            readings = np.array([sensor.read(load, 0.002) for _ in range(500)])
+            assert readings[:, 2].mean() == pytest.approx(50 * sensor.gain, abs=0.05)
+    assert np.std(gains) == pytest.approx(E_SERIES.gain_sigma, rel=0.15)
 
 
 def test_sensor_noise_zeroing_drift_and_saturation():

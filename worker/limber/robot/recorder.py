@@ -14,6 +14,8 @@ from limber.recordings.recording import POSE_COLUMNS, WRENCH_COLUMNS, SensorEntr
 from limber.robot.cell import Cell
 from limber.robot.kinematics import inverted, matrices, pose_vectors
 
+_FRAMES_FOR_NOISE = 15
+_LEAST_NOISE_M = 1e-4  # a tracker that smooths its points hides their noise
 HEADER = ",".join(("t_s", *POSE_COLUMNS, *WRENCH_COLUMNS))
 
 
@@ -77,9 +79,15 @@ class PullRecorder:
                               float(np.nanmax(np.linalg.norm(wrench[:, :3], axis=1))))
 
 
-def known_noise(cell: Cell) -> SensorEntry:
-    """What a cell says of its force sensor's single readings."""
+def known_noise(cell: Cell, position_sigma: float | None = None) -> SensorEntry:
+    """What a cell says of its force sensor's single readings, and what the resting points told.
+
+    Args:
+        position_sigma: Noise of a tracked point [m]; None: as is usual.
+    """
+    told = {} if position_sigma is None else {"position_sigma_m": position_sigma}
     return SensorEntry(
+        **told,
         force_sigma_n=cell.sensor.force_sigma_n, torque_sigma_nm=cell.sensor.torque_sigma_nm,
         force_range_n=cell.sensor.force_range_n)
 
@@ -153,6 +161,25 @@ class MarkerStream:
                 points = points @ self._base[:3, :3].T + self._base[:3, 3]
             frames.append((float(content["t_s"]), points))
         return frames
+
+    def at_rest(self) -> tuple[np.ndarray, float | None]:
+        """Return where the points have rested up to now, and how much one of them is noisy.
+
+        Returns:
+            Their means [m], shape [n, 3], and the standard deviation of a coordinate of one frame
+            [m], or None where too few frames came to tell it.
+
+        Raises:
+            WorkError: no points come.
+        """
+        frames = self.read(1.0)
+        if not frames:
+            raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
+        seen = np.array([points for _, points in frames])
+        if len(seen) < _FRAMES_FOR_NOISE:
+            return seen.mean(axis=0), None
+        return seen.mean(axis=0), max(float(np.sqrt(seen.var(axis=0, ddof=1).mean())),
+                                      _LEAST_NOISE_M)
 
     def close(self) -> None:
         """Close the connection."""

@@ -287,18 +287,16 @@ def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, 
     from limber.robot.recorder import known_errors, known_noise
     from limber.stages.record_way import GRASP_RADIUS_M
 
-    rest = None
+    rest = noise = None
     if tracker is not None and marker_lines is not None:
-        frames = tracker.read(1.0)
-        if not frames:
-            raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
-        rest = tuple(tuple(map(float, point)) for point in np.mean([f[1] for f in frames], axis=0))
+        points, noise = tracker.at_rest()
+        rest = tuple(tuple(map(float, point)) for point in points)
         names = (f"m{k}_{axis}_m" for k in range(len(rest)) for axis in "xyz")
         marker_lines.append(",".join(("t_s", *names)))
     entry = PullEntry(
         observation="markers" if rest else "none", grasp=GraspEntry(
             point_m=tuple(map(float, point)), radius_m=GRASP_RADIUS_M),
-        sensor=known_noise(cell),
+        sensor=known_noise(cell, noise),
         calibration=known_errors(cell, seconds, tare_sigma=tared["sigma"]),
         rest_points_m=rest,
         source=f"limber record, {cell.arm.name}, {cell.sensor.kind}; tare within "

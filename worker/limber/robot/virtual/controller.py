@@ -25,6 +25,7 @@ from limber.robot.virtual.sensor import (
     ForceSensor,
 )
 
+_TRACKER_SIGMA_M = 1e-3
 HOME = (0.0, -1.57, 1.57, -1.57, -1.57, 0.0)
 
 
@@ -175,6 +176,8 @@ class Controller:
         self.sensor = ForceSensor(CB3_ESTIMATE if self.arm.series == "cb3" else E_SERIES, rng)
         self.ft300 = ForceSensor(FT300, rng) if ft300 else None
         self.ft300_reading = np.zeros(6)
+        self.tracker_off = _TRACKER_SIGMA_M * rng.standard_normal(3)
+        """By how much the simulated tracker's frame lies beside the base's [m], shape [3]."""
         self.load: Load = load or Nothing()
         self.fault = SensorFault()
         self.step_count, self.clock_offset = 0, 0.0

@@ -63,16 +63,24 @@ class BranchSetting:
 
     @classmethod
     def of_truth(cls, truth: Any, cell: Any, path: Path, *, poisson: float = 0.35,
-                 density: float = 900.0) -> "BranchSetting":
+                 density: float = 900.0, wave: float = 0.0) -> "BranchSetting":
         """Return the setting of a :class:`~limber.estimation.virtual_pull.TrueBranch` in a cell.
 
         Its mesh is written to ``path``. The seen points are the control points and the tip.
+
+        Args:
+            wave: How far log E swings to and fro between the control points about the straight
+                course that a fit takes it to have.
         """
         from limber.mechanics.young_field import young_weights
 
         mesh, count = truth.mesh, truth.mesh.tet_count
+        weights = young_weights(mesh, truth.control_points)
+        # 0 at the control points, largest in the middle between two of them, by turns up and down.
+        bumps = 4.0 * weights[:, :-1] * weights[:, 1:]
+        swing = wave * bumps @ (-1.0) ** np.arange(bumps.shape[1])
         mesh.with_data(cell_data={
-            "young": young_weights(mesh, truth.control_points) @ np.asarray(truth.young, float),
+            "young": np.exp(swing) * (weights @ np.asarray(truth.young, float)),
             "poisson": np.full(count, poisson), "density": np.full(count, density)}).write(path)
         tip = truth.skeleton.nodes[truth.skeleton.main_path()[-1]]
         points = [*truth.control_points, tip]

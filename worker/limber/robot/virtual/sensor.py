@@ -16,6 +16,7 @@ class SensorTraits:
         force_sigma, torque_sigma: White noise of a sample [N], [N m].
         force_bias, torque_bias: Reading without load before it is zeroed, each axis at random
             [N], [N m].
+        gain_sigma: By how much a sensor's gain is off, one for all it reads: relative.
         drift_n_per_minute: Of the force along z after zeroing.
         force_range, torque_range: Where a reading saturates [N], [N m].
         estimated: Whether it is computed from motor currents (CB3): slow errors of newtons.
@@ -25,6 +26,7 @@ class SensorTraits:
     torque_sigma: float = 0.005
     force_bias: float = 3.0
     torque_bias: float = 0.1
+    gain_sigma: float = 0.02
     drift_n_per_minute: float = 0.8
     force_range: float = 100.0
     torque_range: float = 10.0
@@ -39,7 +41,11 @@ FT300 = SensorTraits(force_sigma=0.1, torque_sigma=0.005, force_bias=2.0, torque
 
 
 class ForceSensor:
-    """One sensor: true wrench in, reading out, both in the sensor's frame."""
+    """One sensor: true wrench in, reading out, both in the sensor's frame.
+
+    Attributes:
+        gain: What it makes of one newton.
+    """
 
     def __init__(self, traits: SensorTraits, rng: np.random.Generator):
         self.traits = traits
@@ -52,6 +58,7 @@ class ForceSensor:
         self._range = np.r_[np.full(3, traits.force_range), np.full(3, traits.torque_range)]
         self._sigma = np.r_[np.full(3, traits.force_sigma), np.full(3, traits.torque_sigma)]
         self._load = np.zeros(6)
+        self.gain = 1.0 + traits.gain_sigma * float(rng.standard_normal())
 
     def read(self, wrench: np.ndarray, seconds: float) -> np.ndarray:
         """Return a reading, ``seconds`` after the last one, shape [6] in N and N m."""
@@ -70,6 +77,6 @@ class ForceSensor:
             kept = np.exp(-seconds)
             spread = np.r_[np.full(3, 2.0), np.full(3, 0.3)] * np.sqrt(1 - kept**2)
             self._slow = kept * self._slow + spread * self._rng.standard_normal(6)
-        reading = self._load + self._bias + self._slow
+        reading = self.gain * self._load + self._bias + self._slow
         reading[2] += self._drift
         return reading

@@ -188,7 +188,8 @@ class Server:
         last = -1.0
         while not writer.is_closing():
             points = np.array(self.controller.load.seen())
-            points = points + _MARKER_SIGMA_M * rng.standard_normal(points.shape)
+            points = (points + self.controller.tracker_off
+                      + _MARKER_SIGMA_M * rng.standard_normal(points.shape))
             seen_at = self.controller.clock
             if seen_at > last + 1e-9:
                 line = json.dumps({"t_s": seen_at, "frame": "base", "points_m": points.tolist()})
