@@ -217,7 +217,8 @@ class Driver:
             if samples:
                 self._last = samples[-1]
                 # What came while they were judged need not wait for the next target as well.
-                if any(select.select(self._sensor.connections, [], [], 0.0)):
+                beside = self._sensor.connections
+                if beside and select.select(beside, [], [], 0.0)[0]:
                     self._feel(self._last)
             elif self._last is not None:
                 if not self._has_just_woken:
