@@ -7,9 +7,9 @@ import pytest
 from tests.subjects.paper_branches import Bench, measured
 
 from limber.estimation.online.exact import FullBranch, Here
-from limber.estimation.online.filter import OnlineEstimator, OnlineFrame
+from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator, OnlineFrame
 from limber.estimation.settings import EstimateSettings
-from limber.mechanics.reduced.model import ReducedSettings, build_reduced
+from limber.mechanics.reduced.model import ReducedModel, ReducedSettings, build_reduced
 from limber.mechanics.reduced.training import TrainingSettings
 from limber.recordings.alignment import frames_of
 
@@ -108,3 +108,27 @@ def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, fu
     for step in range(30):
         state = estimator.update(replace(rest, time=99.0 + step))
     assert state.idle
+
+
+def test_no_frame_takes_longer_than_a_frame_may(pull, full, monkeypatch):
+    """Far off the training states are sought from several starts: in time, or after the pull. A
+    second frame is taken up where time is left alone.
+    """
+    told, solve = [], ReducedModel.solve_static
+
+    def counted(*arguments, **named):
+        state = solve(*arguments, **named)
+        told.append(state.iterations)
+        return state
+
+    monkeypatch.setattr(ReducedModel, "solve_static", counted)
+    reduced = reduced_around(full, 2 * TRUTH, 1.3)
+    told.clear()
+    _, states = followed(reduced, full, pull, None)
+    assert FRAME_ITERATIONS / 2 < max(told) <= FRAME_ITERATIONS
+    assert len(told) > 1.5 * len(states)
+    monkeypatch.setattr("limber.estimation.online.filter.BUDGET_SECONDS", 0.0)
+    told.clear()
+    followed(reduced, full, pull, None)
+    # One before the first frame, for what is compiled when it is called.
+    assert len(told) == len(states) + 1

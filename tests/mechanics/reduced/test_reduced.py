@@ -1,5 +1,7 @@
 """The reduced model: exact on its subspace, linear in Young's modulus, near the full model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from limber.mechanics.reduced.model import (
     build_reduced,
     reduce_snapshots,
 )
+from limber.mechanics.reduced.state import ReducedStaticSettings
 from limber.mechanics.reduced.training import TrainingSettings
 
 YOUNG = np.array([1.2e8, 0.8e8])
@@ -236,6 +239,23 @@ def test_what_lies_outside_is_not_trusted(trained, grasp):
     assert not far.trusted and far.doubt
     soft = reduced.with_young(YOUNG / 20).solve_static(grasp.rest_pose + [0.01, 0, 0, 0, 0, 0])
     assert not soft.trusted and "Young" in soft.doubt
+
+
+def test_a_search_ends_with_its_iterations(trained, grasp):
+    """A state beyond the training is sought from other starts too; cut short, the first counts."""
+    reduced, _ = trained
+    pose = grasp.rest_pose + [0.02, 0.01, 0.0, 0, 0, 0]
+    doubted = ReducedStaticSettings(novelty_limit=0.5 * reduced.solve_static(pose).novelty)
+    first = reduced.solve_static(pose, settings=replace(doubted, start_count=1))
+    assert first.converged
+    assert reduced.solve_static(pose, settings=doubted).iterations > first.iterations
+    short = reduced.solve_static(
+        pose, settings=replace(doubted, iteration_limit=first.iterations))
+    assert short.converged and short.iterations == first.iterations
+    assert np.array_equal(short.coordinates, first.coordinates)
+    shorter = reduced.solve_static(
+        pose, settings=replace(doubted, iteration_limit=first.iterations - 1))
+    assert not shorter.converged and shorter.iterations == first.iterations - 1
 
 
 def test_file_holds_the_model(trained, grasp, tmp_path):

@@ -26,8 +26,9 @@ from limber.recordings.recording import GraspEntry
 
 STEP_LIMIT = 0.7
 """Largest change of a log E by one frame."""
-BUDGET_SECONDS = 0.033
-"""An old frame is linearised again only where that fits into the time of a frame."""
+BUDGET_SECONDS = 0.028
+"""An old frame is linearised again only where that fits into a frame's 33 ms, which end with the
+intervals."""
 ENOUGH_DEVIATION = 0.02
 """Standard deviation of every log E at which another pull adds nothing that would matter: half a
 percent in a radius does as much."""
@@ -37,6 +38,10 @@ COVERED = 0.1
 """Part of the way that lies between frames of the full model at the end."""
 QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
 """A pose that takes more is out of the basis' reach, and another basis is on its way."""
+FRAME_ITERATIONS, NEAR_ITERATIONS = 16, 6
+"""Of Newton, while frames come: at most for a frame; at least for one whose state is known, at
+moduli a little different. Both take 4 as a rule; searches for a state that the training knows
+better took up to 41, longer than a frame."""
 FINAL_FRAMES = 300
 """So many frames at most are linearised again when the pull is over."""
 STALE = 0.25
@@ -152,6 +157,8 @@ class OnlineEstimator:
         self._merged = _Known(np.zeros((count, count)), np.zeros(count))
         self._turn = self.frame_count = self.refresh_count = 0
         self._last: ReducedState | None = None
+        # What is compiled at its first call is not to hold up the first frame.
+        reduced.solve_static(reduced.poses[0], settings=QUICK)
         self._exact = exact
         self._corrections: list[_Correction] = []
         self._asked: tuple[_Kept, Future] | None = None
@@ -190,7 +197,9 @@ class OnlineEstimator:
         """Take a frame in; one reduced solution, and a second where time allows."""
         began = time.perf_counter()
         self._collect()
-        kept = self._linearised(frame, self._last)
+        own_began = time.perf_counter()
+        kept = self._linearised(frame, self._last, _within(FRAME_ITERATIONS))
+        own = time.perf_counter() - own_began
         self.frame_count += 1
         self._since_basis += 1
         if kept is None:
@@ -204,10 +213,13 @@ class OnlineEstimator:
         self._keep(kept)
         self._step()
         self._ask()
-        if self._retry and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
-            self._try_again()
-        elif len(self._kept) > 1 and 2.2 * (time.perf_counter() - began) < BUDGET_SECONDS:
-            self._relinearise()
+        # A second one takes as long as this very frame's, but for the iterations.
+        left = BUDGET_SECONDS - (time.perf_counter() - began) - (own - kept.state.seconds)
+        fitting = int(min(left / kept.state.seconds * kept.state.iterations, FRAME_ITERATIONS))
+        if self._retry and fitting >= 2 * NEAR_ITERATIONS:
+            self._try_again(_within(fitting))
+        elif len(self._kept) > 1 and fitting >= NEAR_ITERATIONS:
+            self._relinearise(_within(fitting))
             self._step()
         return self._state(frame.time, kept.residual, kept.state.trusted)
 
@@ -218,7 +230,7 @@ class OnlineEstimator:
         if self._exact is not None:
             self._await()
             while self._retry:
-                self._try_again()
+                self._try_again(QUICK)
             # A basis that knows these moduli and poses first, then its corrections.
             for _ in range(2):
                 if not (self._is_away() or self._lost or self._untrusted):
@@ -226,7 +238,7 @@ class OnlineEstimator:
                 self._making = self._exact.basis(self._spread_poses(), self.log_young.copy())
                 self._await()
                 while self._retry:
-                    self._try_again()
+                    self._try_again(QUICK)
             for _ in range(3 * int(1 / COVERED)):
                 if not self._ask(whole=True):
                     break
@@ -235,10 +247,10 @@ class OnlineEstimator:
         last = self._kept[-1]
         return self._state(last.frame.time, last.residual, last.state.trusted)
 
-    def _try_again(self) -> None:
+    def _try_again(self, settings: ReducedStaticSettings) -> None:
         """Take up a frame that the basis before did not know."""
         frame = self._retry.pop(0)
-        found = self._linearised(frame, None)
+        found = self._linearised(frame, None, settings)
         if found is None:
             self._lost.append(frame)
         else:
@@ -257,7 +269,7 @@ class OnlineEstimator:
             before, kept, state = self.log_young.copy(), [], None
             for index in chosen:
                 frame = frames[index]
-                found = self._linearised(frame, states.get(id(frame)) or state)
+                found = self._linearised(frame, states.get(id(frame)) or state, QUICK)
                 if found is not None:
                     state = states[id(frame)] = found.state
                     kept.append(replace(found, normal=weight * found.normal,
@@ -303,7 +315,8 @@ class OnlineEstimator:
         (kept, future), self._asked = self._asked, None
         found = None if future.exception() is not None else future.result()
         # Compared at the moduli that the full model was solved with.
-        reduced = None if found is None else self._answer(kept.frame, kept.state, found.log_young)
+        reduced = None if found is None else self._answer(
+            kept.frame, kept.state, found.log_young, _within(FRAME_ITERATIONS))
         if reduced is None:
             return
         rows, slopes = _stacked(found)
@@ -360,19 +373,21 @@ class OnlineEstimator:
                 sum(part * known.slopes for part, known in zip(share, chosen, strict=True)))
 
     def _answer(self, frame: OnlineFrame, start: ReducedState | None, log_young: np.ndarray,
+                settings: ReducedStaticSettings,
                 ) -> tuple[ReducedState, np.ndarray, np.ndarray] | None:
         """The reduced model's state, rows of points and force, and their derivatives."""
         model = self.reduced.with_young(np.exp(log_young))
         state = model.solve_static(pose_on(self.reduced.grasp, self._entry, frame.pose),
-                                   start=start, settings=QUICK)
+                                   start=start, settings=settings)
         if not state.converged:
             return None
         slopes = model.sensitivities(state)
         return (state, np.r_[self._observe @ state.coordinates, state.reaction_force],
                 np.vstack([self._observe @ slopes.coordinates, slopes.reaction_force]))
 
-    def _linearised(self, frame: OnlineFrame, start: ReducedState | None) -> _Kept | None:
-        found = self._answer(frame, start, self.log_young)
+    def _linearised(self, frame: OnlineFrame, start: ReducedState | None,
+                    settings: ReducedStaticSettings) -> _Kept | None:
+        found = self._answer(frame, start, self.log_young, settings)
         if found is None:
             return None
         state, rows, slopes = found
@@ -401,10 +416,10 @@ class OnlineEstimator:
         self._merged.normal += gone.normal
         self._merged.gradient += gone.gradient - gone.normal @ gone.centre
 
-    def _relinearise(self) -> None:
+    def _relinearise(self, settings: ReducedStaticSettings) -> None:
         self._turn = (self._turn + 1) % (len(self._kept) - 1)
         old = self._kept[self._turn]
-        again = self._linearised(old.frame, old.state)
+        again = self._linearised(old.frame, old.state, settings)
         if again is not None:
             self._kept[self._turn] = again
 
@@ -443,6 +458,10 @@ class OnlineEstimator:
             return False
         return bool(np.max(1 - widths[-1] / widths[-1 - len(widths) // 10]) < IDLE_GAIN
                     and widths[-1].max() < IDLE_DEVIATION)
+
+
+def _within(iterations: int) -> ReducedStaticSettings:
+    return replace(QUICK, iteration_limit=iterations)
 
 
 def _stacked(found: ExactFrame) -> tuple[np.ndarray, np.ndarray]:

@@ -218,13 +218,15 @@ class ReducedModel:
         load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
         best, iterations = None, 0
         for at_pose, q in self._starts(pose, start)[:settings.start_count]:
-            found = self._follow(at_pose, q, pose, load, settings)
+            found = self._follow(at_pose, q, pose, load, settings,
+                                 settings.iteration_limit - iterations)
             iterations += found.iterations
             if best is not None and found.agrees(best):
                 break  # the same from two starts: unusual, but no accident of the way there
             if best is None or (found.ranking(settings) < best.ranking(settings)):
                 best = found
-            if best.converged and best.novelty < settings.novelty_limit:
+            if ((best.converged and best.novelty < settings.novelty_limit)
+                    or iterations >= settings.iteration_limit):
                 break
         return self._state(best, pose, load, iterations, began, settings)
 
@@ -278,17 +280,20 @@ class ReducedModel:
         return [own, *near] if far[0] <= 2 * far[1] else [near[0], own, *near[1:]]
 
     def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
-                settings: ReducedStaticSettings) -> "_Found":
-        """Newton to the pose; halves the way where that fails."""
+                settings: ReducedStaticSettings, most: int) -> "_Found":
+        """Newton to the pose in ``most`` iterations; halves the way where that fails."""
         iterations, reached, step = 0, 0.0, 1.0
         while True:
             part = min(1.0, reached + step)
             goal = pose if part == 1.0 else pose_between(at_pose, pose, part)
-            found = self._newton(q, self.held.at(goal), load, settings)
+            found = self._newton(q, self.held.at(goal), load, settings,
+                                 min(settings.max_iterations, most - iterations))
             iterations += found.iterations
             sound = found.converged and found.novelty < 4 * settings.novelty_limit
             if sound and part == 1.0:
                 return replace(found, iterations=iterations)
+            if iterations >= most:
+                return replace(found, converged=False, iterations=iterations)
             if sound:
                 q, reached = found.q, part
                 continue
@@ -297,10 +302,10 @@ class ReducedModel:
                 return replace(found, converged=False, iterations=iterations)
 
     def _newton(self, q: np.ndarray, held: np.ndarray, load: np.ndarray,
-                settings: ReducedStaticSettings) -> "_Found":
+                settings: ReducedStaticSettings, most: int) -> "_Found":
         count, q = self.basis.lift_count, q.copy()
         move, increment = held - q[:count], None
-        for iteration in range(settings.max_iterations):
+        for iteration in range(most):
             energy, force, tangent = self.tangent(q, increment)
             right = load[count:] - force[count:]
             if move is not None:
@@ -316,7 +321,7 @@ class ReducedModel:
                 return _Found(q, stable, novelty, iteration + 1,
                               self.energy(q) - float(load @ q))
             move = None
-        return _Found(q, False, np.inf, settings.max_iterations, np.inf)
+        return _Found(q, False, np.inf, most, np.inf)
 
     def _state(self, found: "_Found", pose: np.ndarray, load: np.ndarray, iterations: int,
                began: float, settings: ReducedStaticSettings) -> ReducedState:

@@ -37,6 +37,8 @@ class ReducedStaticSettings:
         start_count: How many starts are tried, the given state included.
         novelty_limit: Largest coordinate relative to the training's beyond which the state is
             taken for false and sought again from other starts.
+        iteration_limit: Newton iterations of the whole search; the best that was found by then
+            counts.
     """
 
     tolerance: float = 1e-10
@@ -44,6 +46,7 @@ class ReducedStaticSettings:
     max_halvings: int = 4
     start_count: int = 4
     novelty_limit: float = 1.5
+    iteration_limit: int = 10_000
 
 
 @dataclass(frozen=True)
