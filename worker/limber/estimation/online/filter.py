@@ -38,7 +38,7 @@ COVERED = 0.1
 """Part of the way that lies between frames of the full model at the end."""
 QUICK = ReducedStaticSettings(start_count=2, max_halvings=2)
 """A pose that takes more is out of the basis' reach, and another basis is on its way."""
-FRAME_ITERATIONS, NEAR_ITERATIONS = 16, 6
+FRAME_ITERATIONS, NEAR_ITERATIONS = 12, 6
 """Of Newton, while frames come: at most for a frame; at least for one whose state is known, at
 moduli a little different. Both take 4 as a rule; searches for a state that the training knows
 better took up to 41, longer than a frame."""
