@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError, WorkError
+from limber.planning.field import energy_field
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
 from limber.planning.field.radial import RadialInterpolant
@@ -39,6 +40,22 @@ def test_held_out_error_tells_the_true_error(ridge, ridge_field):
                           ridge_field.force(fresh.positions))
     for name in ("energy_error", "force_error"):
         assert 0.2 < ridge_field.errors[name] / true[name] < 5.0
+
+
+def test_a_fit_is_chosen_for_most_poses_and_not_for_the_stiffest(ridge, monkeypatch):
+    """One that is wrong at the five stiffest of 150 poses alone is better than one that is three
+    times as wrong at all others."""
+    samples = ridge.samples()
+    stiff = np.argsort(samples.energies)[-5:]
+
+    def left_out(some, _chart, choice, _face):
+        off = np.full(len(some.poses), 0.01 if choice.kernel == "quintic" else 0.03)
+        off[stiff] = 0.5 if choice.kernel == "quintic" else 0.01
+        return error_measures(some, (1.0 + off) * some.energies,
+                              (1.0 + off[:, None]) * some.forces), np.zeros((len(some.poses), 4))
+
+    monkeypatch.setattr(energy_field, "left_out_errors", left_out)
+    assert fit_field(samples).energy_fit.kernel == "quintic"
 
 
 def test_left_out_errors_are_those_of_fits_without_the_sample(ridge):
