@@ -27,3 +27,17 @@ def test_a_stop_is_done_again_only_where_the_machine_was_away_for_as_long(witnes
     assert not voided.explains(0.9, 1.1, 0.006, "stop") and voided.count == 0
     assert voided.explains(0.9, 1.1, 0.004, "stop") and voided.count == 1
     assert "4.0 ms late where the machine stood still for 5.0 ms" in capsys.readouterr().out
+
+
+def test_a_pause_long_before_a_failure_explains_nothing(witness, monkeypatch):
+    def fails():
+        raise AssertionError("it failed")
+    monkeypatch.setattr("benchmarks.held_up.time.monotonic", iter([0.0, 20.0]).__next__)
+    with pytest.raises(AssertionError):
+        Voided(witness).again(fails, "a loop")
+    moments = iter([0.0, 8.0, 0.0, 40.0])
+    monkeypatch.setattr("benchmarks.held_up.time.monotonic", moments.__next__)
+    voided = Voided(witness)
+    with pytest.raises(AssertionError):
+        voided.again(fails, "a loop")
+    assert voided.count == 1

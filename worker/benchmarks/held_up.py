@@ -18,6 +18,8 @@ from limber.errors import LimberError
 
 HELD_UP_SECONDS = 0.03
 """From here on a loop that may be silent for 50 ms can come to be: chosen."""
+_MEANWHILE_SECONDS = 10.0
+"""A failure is told at most so long after what made it: a loop of minutes has seen many pauses."""
 _MOST_AGAIN = 3
 _Result = TypeVar("_Result")
 
@@ -117,7 +119,8 @@ class Voided:
             try:
                 return run()
             except (AssertionError, LimberError) as error:
-                longest = self._witness.longest(began)
+                longest = self._witness.longest(
+                    max(began, time.monotonic() - _MEANWHILE_SECONDS))
                 if longest < HELD_UP_SECONDS:
                     raise
                 self.count += 1
