@@ -202,7 +202,7 @@ def state_of(server: Server) -> dict[str, Any]:
             "tool_speed": controller.tool_speed.tolist(), "safety": controller.safety_mode.name,
             "mode": controller.robot_mode.name, "program": controller.runtime_state.name,
             "remote": controller.remote, "slider": controller.slider,
-            "payload": controller.payload,
+            "payload": controller.payload, "sensor_gain": controller.sensor.gain,
             "watchdog_s": controller.watchdog[0] if controller.watchdog else None,
             "outputs": controller.digital_outputs,
             **controller.load.report(), "lost_seconds": server.lost_seconds,
