@@ -124,7 +124,8 @@ def _stop_time(setting: Setting, _progress: Progress, model: str) -> list[Row]:
     runs = 2 if setting.quick else 20
     with new_robot(_ADDRESS, model, setting.seed) as robot:
         while len(stops) < runs:
-            stop = _one_stop(robot, model, 1.0 / rate)
+            stop = setting.voided.again(partial(_one_stop, robot, model, 1.0 / rate),
+                                        f"stop at {rate} Hz")
             over = stop.latency - asked
             if over > 1e-6 and len(late) < runs and setting.voided.explains(
                     stop.since, stop.until, over, f"stop at {rate} Hz"):
@@ -144,7 +145,11 @@ def _stop_time(setting: Setting, _progress: Progress, model: str) -> list[Row]:
 
 
 def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
-    """Add a force over the limit to a moving arm and wait for the stop."""
+    """Add a force over the limit to a moving arm and wait for the stop.
+
+    Raises:
+        AssertionError: something else stopped it.
+    """
     restored(robot)
     with RobotLink(cell_for(_ADDRESS, model)) as link:
         time.sleep(0.2)
@@ -154,7 +159,8 @@ def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
         since = time.monotonic()
         before = robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
         came = time.monotonic()
-        link.wait("stopped", seconds=5)
+        event = link.wait("stopped", seconds=5)
+        assert event["reason"].startswith("hard force limit"), event["reason"]
         time.sleep(0.3)
         after = robot.state
     # The force acts from the next step on.
