@@ -12,9 +12,10 @@ from limber.closed_loop.loop import ClosedLoop, comparison
 from limber.closed_loop.places import base_beside, bending_modulus, gripper_at, write_touched
 from limber.closed_loop.watching import Watch
 from limber.commands.robot import _points
-from limber.errors import InputError, NoPathError, WorkError
+from limber.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.planning.planners.gentle import UNPROVEN
+from limber.progress import Progress
 from limber.robot.arms import arm_named
 from limber.robot.calibration import fit_base
 from limber.robot.cell import Cell
@@ -163,3 +164,33 @@ def test_what_is_compared_fits_a_terminal():
     assert ["pulls", "2"] in tables["Whether that is enough"]
     assert ["way after it", "2.0 mm"] in tables["Safety"]
     assert [row[0] for row in tables["The flower"]] == ["", "flower's goal", "where it came to"]
+
+
+def test_a_stop_tells_how_long_the_virtual_robot_was_held_up(tmp_path, monkeypatch):
+    """A real controller never is: what stopped the arm may have been that."""
+    class Robot:
+        process = SimpleNamespace(poll=lambda: None)
+
+        def __init__(self, *_arguments):
+            self.state = {"lost_seconds": 0.072}
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_exception):
+            pass
+
+    def stopped(*_arguments):
+        raise SafetyStop("no data from the robot")
+
+    warned = []
+    progress = Progress()
+    monkeypatch.setattr(progress, "warn", warned.append)
+    monkeypatch.setattr("limber.closed_loop.loop.VirtualRobot", Robot)
+    mesh = SimpleNamespace(mesh=tmp_path / "truth.vtu")
+    for name, value in (("_grown", None), ("_cell", None), ("_setting", mesh)):
+        monkeypatch.setattr(ClosedLoop, name, lambda *_, value=value: value)
+    monkeypatch.setattr(ClosedLoop, "_reconstructed", stopped)
+    with pytest.raises(SafetyStop, match="no data"):
+        ClosedLoop(tmp_path / "loop", progress=progress).run()
+    assert warned == ["stopped; until then the virtual robot itself was held up for 72 ms in all."]

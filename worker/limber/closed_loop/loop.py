@@ -137,10 +137,18 @@ class ClosedLoop:
                         encoding="utf-8")
         with VirtualRobot(self.model, self.address,
                           ["--branch", file, "--seed", self.seed]) as robot:
-            moved = self._reconstructed(truth, cell)
-            told = self._told(robot)
-            executed, watch = self._executed(robot)
-            stopped = self._overloaded(robot, executed)
+            try:
+                moved = self._reconstructed(truth, cell)
+                told = self._told(robot)
+                executed, watch = self._executed(robot)
+                stopped = self._overloaded(robot, executed)
+            except SafetyStop:
+                # A real controller is never held up: what this one lost may be what stopped it.
+                if robot.process.poll() is None:
+                    held_up = 1000 * robot.state["lost_seconds"]
+                    self.progress.warn("stopped; until then the virtual robot itself was held up "
+                                       f"for {held_up:.0f} ms in all.")
+                raise
         return self._compared(truth, moved, told, executed, watch, stopped)
 
     # Parts
