@@ -53,8 +53,7 @@ _MORE_SAMPLES = 450  # about twice the usual
 _FRACTIONS = (0.5, 0.67, 0.8, 0.92)  # of the main path, where a further pull may hold it
 _GRASP_POSE = (0.0, 0.0, 0.15, 0.0, 0.0, 0.0)
 _TOUCH_SIGMA_M = 3e-4
-_POISSON, _DENSITY = 0.35, 900.0  # as a fit is told them
-_POISSON_SIGMA, _DENSITY_SIGMA, _WAVE_SIGMA = 0.05, 0.1, 0.12  # how far the branch is from that
+_POISSON_SIGMA, _DENSITY_SIGMA, _WAVE_SIGMA = 0.05, 0.1, 0.12  # from what a fit is told
 _SCAN_DISTANCE_M, _SCAN_VIEWS = 0.45, 8
 _PULL_SPEED_M_S = 0.02
 _PLAN_SPEED_M_S = 0.03
@@ -166,11 +165,11 @@ class ClosedLoop:
 
     def _setting(self, truth: TrueBranch, cell: Cell) -> BranchSetting:
         """Return the branch as it is: unlike what a fit is told, by as much as it allows for."""
-        rng = np.random.default_rng([self.seed, 8])
-        poisson = float(np.clip(rng.normal(_POISSON, _POISSON_SIGMA), 0.2, 0.47))
+        rng, told = np.random.default_rng([self.seed, 8]), VirtualPullSettings()
+        poisson = float(np.clip(rng.normal(told.poisson, _POISSON_SIGMA), 0.2, 0.47))
         return BranchSetting.of_truth(
             truth, cell, self.folder / "truth.vtu", poisson=poisson,
-            density=_DENSITY * (1 + _DENSITY_SIGMA * float(rng.standard_normal())),
+            density=told.density * (1 + _DENSITY_SIGMA * float(rng.standard_normal())),
             wave=_WAVE_SIGMA * float(rng.standard_normal()))
 
     def _cell(self, truth: TrueBranch) -> Cell:

@@ -181,7 +181,6 @@ class Server:
             due += _FT300_SECONDS * (1 + behind // _FT300_SECONDS)
             await asyncio.sleep(due - time.perf_counter())
 
-
     async def _serve_markers(self, _reader: asyncio.StreamReader,
                              writer: asyncio.StreamWriter) -> None:
         rng = np.random.default_rng(self.controller.step_count)
@@ -196,7 +195,6 @@ class Server:
                 self.send(writer, f"{line}\n".encode())
                 last = seen_at
             await asyncio.sleep(_MARKER_SECONDS)
-
 
     async def _serve_camera(self, reader: asyncio.StreamReader,
                             writer: asyncio.StreamWriter) -> None:
