@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 _COUNTED = """
 import gc
 import limber.robot.driver
@@ -20,3 +22,22 @@ def test_a_search_for_garbage_no_longer_goes_through_what_is_loaded():
     before, after = map(int, counted)
     assert before > 20_000
     assert after < 1_000
+
+
+_KEPT = """
+import limber.robot.driver
+from limber.robot.real_time import spare_what_is_loaded
+kept = spare_what_is_loaded()
+lines = dict(line.split(":") for line in open("/proc/self/status") if line.startswith("Vm"))
+print(kept, lines["VmLck"].split()[0], lines["VmSize"].split()[0])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is locked on Linux only")
+def test_what_is_loaded_stays_in_memory():
+    """Else the first motion after a minute's rest waits for the disk."""
+    kept, locked, whole = subprocess.run(
+        [sys.executable, "-c", _KEPT], capture_output=True, text=True, check=True).stdout.split()
+    if kept == "False":
+        pytest.skip("this user may not lock so much memory")
+    assert int(locked) > 0.9 * int(whole)

@@ -39,6 +39,9 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
     if not facts["real_time"]:
         run.progress.warn("No real-time priority: other programs can hold the loop up, which ends "
                           "in a stop.")
+    if not facts["kept_in_memory"]:
+        run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`): what it has "
+                          "not used for a while may come from the disk, which ends in a stop.")
     pose = np.array(facts["pose"])
     from limber.robot.kinematics import forward, matrices
 

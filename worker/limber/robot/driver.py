@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,7 @@ class Driver:
         self.guard = self._new_guard()
         self._warm_up()
         # Now: where it has just compiled this takes longer than the watchdog would wait.
-        spare_what_is_loaded()
+        self.facts["kept_in_memory"] = spare_what_is_loaded()
         self._control = self._connect(address)
         # Before ur-rtde's own threads, which have what was claimed before they began.
         claim_real_time(_LOOP_PRIORITY)
@@ -133,6 +134,8 @@ class Driver:
             guard.state = State.MOVING
             guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
             pose_of(self._base @ frame_of(sample.pose))
+        # Loaded now, to be kept in memory with the rest.
+        import_module("rtde_control")
 
     def _check(self) -> dict[str, Any]:
         """Refuse a robot that is not what the cell says or cannot be moved; returns its facts."""
