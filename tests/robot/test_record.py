@@ -285,6 +285,34 @@ def test_resting_points_tell_their_noise():
         assert noise == told
 
 
+def _resting(*frames):
+    """What a tracker's resting points are told as that sends ``frames``."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        stream = MarkerStream("127.0.0.1", server.getsockname()[1], np.zeros(6))
+        theirs, _ = server.accept()
+        with theirs:
+            theirs.sendall(b"".join(json.dumps({"t_s": number / 30, "points_m": points}).encode()
+                                    + b"\n" for number, points in enumerate(frames)))
+            try:
+                return stream.at_rest()[0]
+            finally:
+                stream.close()
+
+
+def test_a_point_that_is_hidden_now_and_then_still_rests_somewhere():
+    here, there = [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]
+    points = _resting([here, there], [None, there], [here, [None, None, None]])
+    assert points == pytest.approx(np.array([here, there]))
+
+
+@pytest.mark.parametrize("frames, said", [
+    ([[[0.1, 0, 0], None]] * 3, "does not see point 1"),
+    ([[[0.1, 0, 0], [0.2, 0, 0]], [[0.1, 0, 0]]], "another number in 1 of 2 frames")])
+def test_points_that_do_not_rest_anywhere_are_refused(frames, said):
+    with pytest.raises(WorkError, match=said):
+        _resting(*frames)
+
+
 def test_its_schema_is_plain(capsys):
     from limber.stages.registry import stage_schema
 

@@ -121,7 +121,8 @@ class MarkerStream:
     """Tracked points from another program: JSON lines ``{"t_s", "points_m"}`` over TCP.
 
     Times are on the robot's clock. With ``"frame": "base"`` the points are in the robot's base
-    frame, else in the branch's.
+    frame, else in the branch's. A point that is not seen is null; a frame with another number of
+    points than the first is left out, since it does not say which is which.
 
     Args:
         base: The robot's base in the branch's frame [m, rad], shape [6].
@@ -139,6 +140,8 @@ class MarkerStream:
                             "The pull would be recorded blind.",
                             "Start the tracker, or record without --markers.") from error
         self._data = b""
+        self._count: int | None = None
+        self.left_out = 0
 
     def read(self, timeout: float = 0.0) -> list[tuple[float, np.ndarray]]:
         """Return the frames that have come: time [s], points [n, 3] in the branch's frame.
@@ -156,7 +159,12 @@ class MarkerStream:
         frames = []
         for line in lines:
             content = json.loads(line)
-            points = np.array(content["points_m"], float)
+            points = np.array([[np.nan] * 3 if point is None else point
+                               for point in content["points_m"]], float).reshape(-1, 3)
+            self._count = len(points) if self._count is None else self._count
+            if len(points) != self._count:
+                self.left_out += 1
+                continue
             if content.get("frame") == "base":
                 points = points @ self._base[:3, :3].T + self._base[:3, 3]
             frames.append((float(content["t_s"]), points))
@@ -170,16 +178,26 @@ class MarkerStream:
             [m], or None where too few frames came to tell it.
 
         Raises:
-            WorkError: no points come.
+            WorkError: no points come, one of them is never seen, or their number changes.
         """
         frames = self.read(1.0)
         if not frames:
             raise WorkError("The tracker sends no points.", "", "Check that it sees the branch.")
+        if self.left_out:
+            raise WorkError(f"The tracker sends {self._count} points, and another number in "
+                            f"{self.left_out} of {len(frames) + self.left_out} frames.",
+                            "Which of them is which cannot be told.",
+                            "Let it send null for a point that it does not see.")
         seen = np.array([points for _, points in frames])
-        if len(seen) < _FRAMES_FOR_NOISE:
-            return seen.mean(axis=0), None
-        return seen.mean(axis=0), max(float(np.sqrt(seen.var(axis=0, ddof=1).mean())),
-                                      _LEAST_NOISE_M)
+        unseen = np.flatnonzero(np.isnan(seen).any(axis=2).all(axis=0))
+        if len(unseen):
+            raise WorkError(f"The tracker does not see point {', '.join(map(str, unseen))} (from "
+                            "0) while the branch rests.", "Where it rests would not be known.",
+                            "Turn the tracker or the branch, or take the point out.")
+        means = np.nanmean(seen, axis=0)
+        if np.isfinite(seen).all(axis=2).sum(axis=0).min() < _FRAMES_FOR_NOISE:
+            return means, None
+        return means, max(float(np.sqrt(np.nanvar(seen, axis=0, ddof=1).mean())), _LEAST_NOISE_M)
 
     def close(self) -> None:
         """Close the connection."""
