@@ -31,8 +31,8 @@ def spare_what_is_loaded() -> bool:
 
     A whole search goes through all that the libraries loaded: 20 to 70 ms in a loop that must
     not pause for 50. After this it goes through what came since, which is little. And a system
-    takes back the pages of code that was not used for a minute, as that for a motion while the arm
-    stands: the first who needs it waits for the disk, which was 70 ms.
+    may take back the pages of code that was not used for a minute, as that for a motion while the
+    arm stands: the first who needs it waits for the disk.
 
     Returns:
         Whether the pages stay; Linux grants it to root and to users who may lock so much memory.
