@@ -5,7 +5,7 @@ from tests.subjects.paper_branches import measured
 
 from benchmarks.truth import _efficient
 from benchmarks.truth_branch import drawn_truth, exact_pull
-from benchmarks.truth_trials import SETTINGS, bounds, fitting_subject
+from benchmarks.truth_trials import FIRST_PULL, FIRST_TURN, SETTINGS, bounds, fitting_subject
 from limber.estimation.objective import Objective
 from limber.estimation.preparation import forwards_of, parameter_space
 
@@ -23,7 +23,8 @@ def test_a_known_form_leaves_less_open():
     """Of one drawn branch and pull; less of each modulus and of any mixture of them."""
     truth = drawn_truth(np.random.default_rng(3))
     subject = fitting_subject(truth)
-    forwards = forwards_of([measured(exact_pull(truth, 0, 0.0), 4)], subject, SETTINGS)
+    pull = measured(exact_pull(truth, 0, FIRST_PULL, FIRST_TURN), 4)
+    forwards = forwards_of([pull], subject, SETTINGS)
     objective = Objective(forwards, parameter_space(subject, forwards, SETTINGS))
     as_fitted, of_known_form = bounds(truth, objective, subject)
     assert np.all(np.linalg.eigvalsh(as_fitted - of_known_form) > -1e-9)

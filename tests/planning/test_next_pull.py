@@ -13,12 +13,14 @@ from limber.estimation.next_pull import (
     ExpectedPull,
     Known,
     PullChoice,
-    _of_moduli,
+    _of_field,
     expected_pull,
     suggest,
 )
 from limber.estimation.settings import EstimateSettings
 from limber.planning.chance import Exposure, Surface
+from limber.recordings.calibration import EXACT
+from limber.recordings.recording import SensorEntry
 from limber.stages.loading import load_subject
 from limber.stages.suggest_pull import SuggestPullSettings, suggest_pull, verdict
 from limber.store import Branch
@@ -32,7 +34,7 @@ def subject(planned_branch):
 def test_information_adds_up_as_gauss_has_it():
     """Two unknowns, one of them no modulus; a repeat error that both moduli share."""
     jacobian = np.array([[2.0, 0.0, 1.0], [0.0, 3.0, 1.0], [0.0, 0.0, 4.0]])
-    found = np.linalg.inv(_of_moduli(jacobian, 2, 0.1))
+    found = np.linalg.inv(_of_field(jacobian, 2, 0, 0.1))
     wanted = np.linalg.inv(jacobian.T @ jacobian)[:2, :2] + 0.01
     assert np.allclose(found, wanted)
     known = Known(np.diag([0.04, 0.09]), 0.01 * np.eye(2))
@@ -53,6 +55,41 @@ def test_a_longer_pull_tells_more_and_strains_more(subject):
         assert np.linalg.norm(pull.end - pull.point) == pytest.approx(reach * 0.8 * 0.5, rel=0.1)
     after = known.after(pulls[1].information)
     assert (np.diag(after.total) < np.diag(known.total)).all()
+
+
+def test_what_pulls_tell_of_the_form_of_the_field_adds_up():
+    """Two pulls that see log E with its form, each with another sign: together they part both."""
+    jacobians = [np.array([[10.0, 10.0 * sign]]) for sign in (1, -1)]
+    once, elsewhere = (_of_field(each, 1, 1, 0.0) for each in jacobians)
+    first = Known.nothing(1, 1).after(once)
+    again, there = (first.after(each).total[0, 0] for each in (once, elsewhere))
+    assert first.total[0, 0] == pytest.approx(1.0, rel=0.4)
+    assert again > 0.9 * first.total[0, 0] and there < 0.01 * first.total[0, 0]
+
+
+def test_a_pull_elsewhere_tells_more_than_the_same_again(subject):
+    """A second pull at the same place leaves open how the modulus runs between; it is not taken
+    for a new look at it."""
+    known, start = Known.nothing(2, len(subject.field.names)), subject.start
+    exact = Cell(SensorEntry(position_sigma_m=1e-5, force_sigma_n=1e-3), EXACT)
+    first, elsewhere = (expected_pull(PullChoice(place, 0.5, 0.1), subject, start, known, exact)
+                        for place in (0.92, 0.5))
+    after = known.after(first.information)
+    again, there = (after.gain(after.after(each.information)) for each in (first, elsewhere))
+    assert there > again > 0.0
+
+
+def test_an_estimate_without_finite_intervals_is_as_none():
+    """Else: covariance of moduli and form as it has them, what pulls cannot narrow apart."""
+    found = {"groups": [0, 0], "parameters": ["E1=E2", "poisson", "form"],
+             "covariance": np.diag([0.04, 0.01, 0.25]).tolist(),
+             "young_pa": [1e9, 1e9], "young_interval_sensor_pa": None,
+             "young_interval_pa": (1e9 * np.exp(np.outer([1, 1], [-0.392, 0.392]))).tolist()}
+    known = Known.estimated(found)
+    assert np.allclose(known.measured, [[0.04, 0.04, 0], [0.04, 0.04, 0], [0, 0, 0.25]], rtol=2e-4)
+    assert np.allclose(known.common, 0, atol=1e-5)
+    found["covariance"][0][0] = None
+    assert np.allclose(Known.estimated(found).measured, Known.nothing(2, 1).measured)
 
 
 def test_no_pull_within_the_strain_is_said(subject, monkeypatch):

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.subjects.paper_branches import PaperBranch
 
 from limber.estimation.gripper_path import MotionWanted, moved
+from limber.estimation.next_pull import PullChoice
 from limber.geometry.skeleton.control_points import control_points
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.model import BranchModel
@@ -121,11 +122,12 @@ def drawn_cell(rng: np.random.Generator, calibration: CalibrationEntry) -> Cell:
                 calibration.camera_sigma_rad * rng.standard_normal(3))
 
 
-def exact_pull(truth: Truth, number: int, phase: float) -> Pull:
-    """What happens in one pull, without any error of measurement."""
+def exact_pull(truth: Truth, number: int, choice: PullChoice, turn: float = 0.0) -> Pull:
+    """What happens in one pull, without any error of measurement; its force turns by ``turn``."""
     branch = truth.branch
     skeleton, mesh = branch.skeleton, truth.model.mesh
-    point, radius = skeleton.point_at(0.92), float(skeleton.radius_at(0.92))
+    point = skeleton.point_at(choice.fraction)
+    radius = float(skeleton.radius_at(choice.fraction))
     points = control_points(skeleton, FRACTIONS)
     entry = PullEntry(
         gravity_m_s2=GRAVITY, source="truth", rest_points_m=tuple(map(tuple, points.tolist())),
@@ -133,8 +135,9 @@ def exact_pull(truth: Truth, number: int, phase: float) -> Pull:
     grasp = grasp_on(mesh, entry.grasp)
     states = np.linspace(0.0, 6.0, STATES)
     made = moved(truth.model, grasp, MotionWanted(
-        kind="pull", point=point, axis=point - skeleton.nodes[0], travel=0.37 * branch.length,
-        turn=2.0, phase=phase, times=states, weight=np.zeros(3)))
+        kind="pull", point=point, axis=point - skeleton.nodes[0],
+        travel=choice.reach * choice.fraction * branch.length, turn=turn, phase=choice.phase,
+        times=states, weight=np.zeros(3)))
     operator = point_operator(mesh, points)
     seen = np.array([points + (operator @ each.ravel()).reshape(-1, 3)
                      for each in made.displacements])

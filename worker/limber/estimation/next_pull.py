@@ -3,18 +3,21 @@
 The pull is made on the branch as it is estimated, without noise, and put into the very problem that
 a fit would solve: its derivatives, with errors of cell and sensors eliminated, are the information
 that such a pull holds (Fisher's; Pukelsheim 2006, Optimal Design of Experiments, 3). Added to what
-the pulls so far have told it gives the covariance to expect. What every pull of this scan has in
-common, the errors of shape and mesh, no pull takes away.
+the pulls so far have told it gives the covariance to expect. How the modulus runs between the
+control points is one for all pulls: one at the same place tells little more of it, one elsewhere
+does. What every pull of this scan has in common, the errors of shape and mesh, no pull takes away.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from limber.errors import LimberError, WorkError
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.objective import Objective
-from limber.estimation.parameters import LINK_DEVIATION, Values
+from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
 from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.subject import Subject
@@ -34,6 +37,8 @@ from limber.recordings.recording import (
 
 UNKNOWN_SCALE = 1.15
 """Deviation of the common log E before anything is measured: a factor of ten within its 95 %."""
+_FIRM = 1e-4
+"""Share of the variance by which moduli of one group may differ."""
 _PROBE_REACH = 0.15  # of the arc length: at which places and directions are compared
 _REACHES = (0.05, 0.1, 0.25, 0.35)  # then tried for the best of them
 _DIRECTIONS = 4
@@ -44,28 +49,50 @@ _SECONDS = 6.0
 
 @dataclass(frozen=True)
 class Known:
-    """Covariance of log E at the control points, [K, K] each.
+    """Covariance of log E at the K control points and of the form of their field, F numbers.
 
     Attributes:
-        measured: Of what pulls tell: another one makes it smaller.
-        common: Of what all pulls of this scan have in common.
+        measured: Of what pulls tell, shape [K + F, K + F]: another one makes it smaller.
+        common: Of log E, what all pulls of this scan have in common, shape [K, K].
     """
 
     measured: np.ndarray
     common: np.ndarray
 
     @classmethod
-    def nothing(cls, count: int) -> "Known":
-        """Before any pull: moduli within a factor of ten, neighbours alike as on branches."""
+    def nothing(cls, count: int, form_count: int = 0) -> "Known":
+        """Before any pull: moduli within a factor of ten, neighbours alike as on branches, the
+        form of their field within its deviations."""
         apart = 0.5 * LINK_DEVIATION**2 * np.eye(count)
-        return cls(UNKNOWN_SCALE**2 + apart, np.zeros((count, count)))
+        return cls(block_diag(UNKNOWN_SCALE**2 + apart, np.eye(form_count)),
+                   np.zeros((count, count)))
+
+    @classmethod
+    def estimated(cls, found: dict[str, Any]) -> "Known":
+        """What the content of an ``estimate.json`` tells; nothing without finite intervals."""
+        groups = list(found["groups"])
+        form = [k for k, name in enumerate(found["parameters"]) if name.startswith("form")]
+        wanted, count = groups + form, len(groups)
+        measured = np.array(found["covariance"], float)[np.ix_(wanted, wanted)]
+        measured[:count, :count] += _FIRM * np.diag(np.diag(measured)[:count])
+        interval, sensor = (np.array(found.get(name) or found["young_interval_pa"], float)
+                            for name in ("young_interval_pa", "young_interval_sensor_pa"))
+        if not np.isfinite([*measured.ravel(), *interval.ravel(), *sensor.ravel()]).all():
+            return cls.nothing(count, len(form))
+        whole, told = (np.log(each[:, 1] / each[:, 0]) / (2 * 1.96) for each in (interval, sensor))
+        # Of a soft piece the interval is wider than the covariance says, and a pull can narrow it.
+        wider = np.r_[told / np.sqrt(np.diag(measured)[:count]), np.ones(len(form))]
+        return cls(measured * np.outer(wider, wider),
+                   np.diag(np.maximum(whole**2 - told**2, 0.0)))
 
     @property
     def total(self) -> np.ndarray:
-        return self.measured + self.common
+        """Of log E, shape [K, K]."""
+        count = len(self.common)
+        return self.measured[:count, :count] + self.common
 
     def after(self, information: np.ndarray) -> "Known":
-        """Return what is known with a pull of this information [K, K] besides."""
+        """Return what is known with a pull of this information [K + F, K + F] besides."""
         measured = np.linalg.inv(np.linalg.inv(self.measured) + information)
         return replace(self, measured=0.5 * (measured + measured.T))
 
@@ -107,7 +134,8 @@ class ExpectedPull:
         point, end: Of the grasp before and after [m], shape [3].
         peak_force: Of the gripper [N].
         peak_strain: Largest principal strain anywhere in the branch.
-        information: Of log E at the control points, shape [K, K].
+        information: Of log E at the control points and the form of their field,
+            shape [K + F, K + F].
         bits: What it tells beyond what is known.
     """
 
@@ -202,7 +230,10 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
     if evaluation is None:
         raise WorkError("The pull's forces lead nowhere.", "Its branch finds no rest under them.",
                         "Choose another pull.")
-    information = _of_moduli(evaluation.jacobian, space.group_count, cell.calibration.repeat_sigma)
+    told = evaluation.jacobian[:len(evaluation.jacobian) - space.own_row_count]
+    form_count = len(known.measured) - space.group_count
+    information = _of_field(np.vstack([told, _own_rows(space, space.group_count + form_count)]),
+                            space.group_count, form_count, cell.calibration.repeat_sigma)
     strain = max(float(np.abs(strain_state(at.model, u).principal_strain).max())
                  for u in displacements)
     return ExpectedPull(choice, pull.poses[0, :3], pull.poses[-1, :3],
@@ -210,17 +241,26 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
                         information, known.gain(known.after(information)))
 
 
-def _of_moduli(jacobian: np.ndarray, count: int, repeat_sigma: float) -> np.ndarray:
-    """Return the information of the first ``count`` free values, the others being unknown too."""
-    whole = jacobian.T @ jacobian
-    cross = whole[:count, count:]
-    found = whole[:count, :count]
+def _own_rows(space: ParameterSpace, known_count: int) -> np.ndarray:
+    """What is known beforehand of all but the first free values, of which the pulls so far tell."""
+    rows, _ = space.own_rows()
+    return rows[~rows[:, :known_count].any(axis=1)]
+
+
+def _of_field(jacobian: np.ndarray, count: int, form_count: int, repeat_sigma: float) -> np.ndarray:
+    """Return the information of log E and form, the first free values, all others being unknown.
+
+    Shape [count + form_count] twice.
+    """
+    whole, kept = jacobian.T @ jacobian, count + form_count
+    cross = whole[:kept, kept:]
+    found = whole[:kept, :kept]
     if cross.size:
-        found = found - cross @ np.linalg.solve(whole[count:, count:], cross.T)
+        found = found - cross @ np.linalg.solve(whole[kept:, kept:], cross.T)
     # One recording's stiffness differs from another's: an error that all moduli share.
-    along = found.sum(axis=1)
+    along = found[:, :count].sum(axis=1)
     if repeat_sigma > 0.0:
-        found = found - np.outer(along, along) / (repeat_sigma**-2 + along.sum())
+        found = found - np.outer(along, along) / (repeat_sigma**-2 + along[:count].sum())
     return 0.5 * (found + found.T)
 
 

@@ -33,7 +33,6 @@ FILE = "suggested_pull.json"
 _CONFIDENCE = 0.95  # of plans that were made without one
 _MATTERS = 1.05  # so much more of a limit may be used: then a pull changes what a plan may do
 _USED = 0.95  # of a limit, with the confidence: a plan that comes nearer is held back by it
-_FIRM = 1e-4  # share of the variance by which moduli of one group may differ
 
 
 class SuggestPullInputs(BranchInputs):
@@ -117,25 +116,15 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
 
     if not branch.has("estimate.json"):
         subject = load_subject(branch, EstimateSettings(gravity=settings.gravity))
-        return subject, subject.start, Known.nothing(len(subject.control_points))
+        form = () if subject.field is None else subject.field.names
+        return subject, subject.start, Known.nothing(len(subject.control_points), len(form))
     found = read_estimate(branch.path("estimate.json"))
     subject = load_estimated_subject(branch, found, gravity=settings.gravity)
     values = replace(
         subject.start, young=np.array(found.get("young_mesh_pa") or found["young_pa"], float),
         poisson=found["poisson"], density=found.get("density") or subject.start.density,
         form=tuple(found.get("field_form") or ()))
-    groups = found["groups"]
-    measured = np.array(found["covariance"], float)[np.ix_(groups, groups)]
-    measured = measured + _FIRM * np.diag(np.diag(measured))
-    interval, sensor = (np.array(found.get(name) or found["young_interval_pa"], float)
-                        for name in ("young_interval_pa", "young_interval_sensor_pa"))
-    if not np.isfinite([*measured.ravel(), *interval.ravel(), *sensor.ravel()]).all():
-        return subject, values, Known.nothing(len(values.young))
-    whole, told = (np.log(each[:, 1] / each[:, 0]) / (2 * 1.96) for each in (interval, sensor))
-    # Of a soft piece the interval is wider than the covariance says, and a pull can narrow it.
-    wider = told / np.sqrt(np.diag(measured))
-    return subject, values, Known(measured * np.outer(wider, wider),
-                                  np.diag(np.maximum(whole**2 - told**2, 0.0)))
+    return subject, values, Known.estimated(found)
 
 
 def _cell(branch: Branch) -> Cell:
