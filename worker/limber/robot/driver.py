@@ -25,6 +25,7 @@ import numpy as np
 
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
+from limber.robot.connecting import WATCHDOG_HZ, checked, connect, require
 from limber.robot.expected import ExpectedWrench
 from limber.robot.frames import frame_of, pose_of, turn_between
 from limber.robot.guard import PLAYING, Decision, Guard, GuardSettings, State, Verdict
@@ -34,8 +35,6 @@ from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
 from limber.robot.trajectory import Trajectory
 from limber.robot.words import Words
 
-WATCHDOG_HZ = 10.0
-"""The controller ends the program when it hears nothing for a tenth of a second."""
 PARENT_SECONDS = 1.0
 """The parent says something at least this often, or the robot stops."""
 
@@ -85,14 +84,14 @@ class Driver:
         address = cell.robot.address
         self._stream = SampleStream(address)
         self._dashboard = Dashboard(address)
-        self.facts = self._check()
+        self.facts = checked(cell, self._stream, self._dashboard)
         self._sensor: ForceTorqueSensor = open_sensor(cell)
         self._chain = WrenchChain(cell, count=5 if self._stream.rate > 200 else 3)
         self.guard = self._new_guard()
         self._warm_up()
         # Now: where it has just compiled this takes longer than the watchdog would wait.
         self.facts["kept_in_memory"] = spare_what_is_loaded()
-        self._control = self._connect(address)
+        self._control, self._io = connect(cell, self._stream.rate)
         # Before ur-rtde's own threads, which have what was claimed before they began.
         claim_real_time(_LOOP_PRIORITY)
         self._following: Following | None = None
@@ -136,71 +135,6 @@ class Driver:
             pose_of(self._base @ frame_of(sample.pose))
         # Loaded now, to be kept in memory with the rest.
         import_module("rtde_control")
-
-    def _check(self) -> dict[str, Any]:
-        """Refuse a robot that is not what the cell says or cannot be moved; returns its facts."""
-        version = ".".join(map(str, self._stream.version[:3]))
-        series = "cb3" if self._stream.version[0] == 3 else "e"
-        arm = self.cell.arm
-        if series != arm.series:
-            raise InputError(f"The controller is version {version}, the cell says {arm.name}.",
-                             "They are of different series, with different arms.",
-                             "Correct robot.model in the cell file.")
-        calibrated = self.cell.robot.version
-        if calibrated and calibrated.split(".")[:2] != version.split(".")[:2]:
-            raise InputError(f"The controller is version {version}, the cell was calibrated with "
-                             f"{calibrated}.", "Another version may have other settings of tool, "
-                             "kinematics and safety.", "Calibrate again, or, having compared them, "
-                             "correct robot.version in the cell file.")
-        facts = {"address": self.cell.robot.address, "version": version,
-                 "model": self._dashboard.ask("get robot model"),
-                 "serial": self._dashboard.ask("get serial number"),
-                 "remote": self._dashboard.ask("is in remote control"),
-                 "rate_hz": self._stream.rate, "real_time": claim_real_time()}
-        known = facts["model"].lower()
-        if known.startswith("ur") and known != arm.name.rstrip("e"):
-            raise InputError(f"The robot says that it is a {facts['model']}, the cell {arm.name}.",
-                             "Reach and limits would be those of another arm.",
-                             "Correct robot.model in the cell file.")
-        if facts["remote"] == "false":
-            raise SafetyStop("The robot is not in remote control.",
-                             "It would not take a program from here.",
-                             "Switch it to remote control on the pendant.")
-        samples = self._stream.read(1.0)
-        if not samples:
-            raise WorkError("The robot sends no data.", "", "Restart its controller.")
-        sample = samples[-1]
-        if sample.safety_mode != 1 or sample.robot_mode != 7:
-            raise SafetyStop(f"The robot is not ready: safety mode {sample.safety_mode}, robot "
-                             f"mode {sample.robot_mode}.", "Nothing here releases a stop or "
-                             "switches an arm on.", "Do it on the pendant, having looked.")
-        if sample.slider <= 0.0:
-            raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
-                             "Raise it on the pendant.")
-        facts |= {"pose": sample.pose.tolist(), "joints": sample.joints.tolist(),
-                  "slider": sample.slider}
-        return facts
-
-    def _connect(self, address: str) -> Any:
-        from rtde_control import RTDEControlInterface
-
-        control = RTDEControlInterface(address, self._stream.rate)
-        self._io = None
-        if self.cell.tool.gripper == "digital_output":
-            from rtde_io import RTDEIOInterface
-
-            # Made now: later the watchdog would not wait for it.
-            self._io = RTDEIOInterface(address)
-        self._require(control.setTcp(list(self.cell.tool.grasp_pose)), "set its tool")
-        self._require(control.setPayload(self.cell.tool.mass_kg or 0.0,
-                                         list(self.cell.tool.centre_of_mass_m)), "set its payload")
-        self._require(control.setWatchdog(WATCHDOG_HZ), "start its watchdog")
-        return control
-
-    def _require(self, done: bool, what: str) -> None:
-        if not done:
-            raise WorkError(f"The robot did not {what}.", "It returned no success.",
-                            "See its log; restart the program.")
 
     # The loop
 
@@ -451,7 +385,7 @@ class Driver:
                 self._look(sample)
                 self._last = sample
         # Each program begins without one.
-        self._require(self._control.setWatchdog(WATCHDOG_HZ), "start its watchdog")
+        require(self._control.setWatchdog(WATCHDOG_HZ), "start its watchdog")
 
     def _move(self, step: float) -> None:
         """Send the next target, ``step`` [s] of the controller's time after the last one."""
@@ -515,7 +449,7 @@ class Driver:
             raise InputError("The cell's gripper is not driven from here.",
                              f"tool.gripper is {self.cell.tool.gripper}.",
                              "Close and open it by hand.")
-        self._require(self._io.setStandardDigitalOut(self.cell.tool.close_output, close),
+        require(self._io.setStandardDigitalOut(self.cell.tool.close_output, close),
                       "drive its gripper")
         self.tell(event="gripper", closed=close)
 
