@@ -194,3 +194,37 @@ def test_a_stop_tells_how_long_the_virtual_robot_was_held_up(tmp_path, monkeypat
     with pytest.raises(SafetyStop, match="no data"):
         ClosedLoop(tmp_path / "loop", progress=progress).run()
     assert warned == ["stopped; until then the virtual robot itself was held up for 72 ms in all."]
+
+
+@pytest.mark.parametrize("reason", ["hard force limit [N]", None])
+def test_a_stop_before_the_overload_is_not_taken_for_its_work(tmp_path, monkeypatch, reason):
+    """The branch folder then still holds the result of the way before, which nothing stopped."""
+    around = ClosedLoop(tmp_path)
+
+    def stopped(*_arguments):
+        raise SafetyStop("no data from the robot")
+
+    class Watching:
+        def __init__(self, *_arguments, **_options):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_exception):
+            pass
+
+    told = SimpleNamespace(result={"stop_reason": reason})
+    monkeypatch.setattr(around, "_part", stopped)
+    monkeypatch.setattr(around, "_armed", lambda executed: [])
+    monkeypatch.setattr(loop, "Watch", Watching)
+    monkeypatch.setattr(loop, "read_cell", lambda file: SimpleNamespace(
+        limits=SimpleNamespace(hard_force_n=30.0)))
+    monkeypatch.setattr(loop.Branch, "open", lambda folder: SimpleNamespace(
+        manifest=SimpleNamespace(stages={f"execute:{loop.PLAN}": told})))
+    robot = SimpleNamespace(ask=lambda *_arguments, **_values: {})
+    if reason is None:
+        with pytest.raises(SafetyStop, match="no data"):
+            around._overloaded(robot, {"start_joints_rad": []})
+    else:
+        assert around._overloaded(robot, {"start_joints_rad": []})[0] == reason

@@ -304,15 +304,21 @@ class ClosedLoop:
         robot.ask("stand", joints=executed["start_joints_rad"])
         limit = read_cell(self.cell_file).limits.hard_force_n
         overload = np.array([0.0, 0.0, limit + _OVERLOAD_N, 0.0, 0.0, 0.0])
+        stopped: SafetyStop | None = None
         with Watch(robot, overload=overload) as watch:
             try:
                 self._part("overload", "the path again, with an overload", "execute", self.branch,
                            *self._armed(executed))
-            except SafetyStop:
-                told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
-                return told["stop_reason"], watch
-        raise WorkError("The overload stopped nothing.", f"{overload[2]:.0f} N were added to the "
-                        "sensor while the branch was led.", "See the robot's log.")
+            except SafetyStop as stop:
+                stopped = stop
+        if stopped is None:
+            raise WorkError("The overload stopped nothing.", f"{overload[2]:.0f} N were added to "
+                            "the sensor while the branch was led.", "See the robot's log.")
+        told = Branch.open(self.branch).manifest.stages[f"execute:{PLAN}"].result
+        if told["stop_reason"] is None:
+            # Something else stopped it before it moved; what is told is of the way before.
+            raise stopped
+        return told["stop_reason"], watch
 
     def _armed(self, dry: dict[str, Any]) -> list[object]:
         return ["--cell", self.cell_file, "--name", PLAN, "--speed", _PLAN_SPEED_M_S, "--arm",
