@@ -10,6 +10,7 @@ from limber.planning.cost import STEP, CostWeights
 from limber.planning.field.energy_field import EnergyField, FieldArrays
 from limber.planning.goals import (
     Goal,
+    GoalOverLimitsError,
     GraspGoal,
     allowed_points,
     goal_points,
@@ -18,12 +19,12 @@ from limber.planning.goals import (
 )
 from limber.planning.limits import UNITS, Limits
 from limber.planning.planners.detour import DetourPath, plan_detour
-from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.gentle import UNPROVEN, GentlePath, plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, found_again, plan_path
-from limber.planning.problem import GentleProblem
+from limber.planning.problem import GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
 
@@ -106,21 +107,28 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     """
     limits = limits or limits_of(field, settings)
     _check_start(field, start, limits)
-    goals = goal_points(goal, field, limits, seed=settings.seed)
+    nobody: GoalOverLimitsError | None = None
+    try:
+        goals = goal_points(goal, field, limits, seed=settings.seed)
+    except GoalOverLimitsError as error:
+        # Drawn poses miss a narrow valley: cells find a way into it, or prove that there is none.
+        goals, nobody = np.empty((0, 3)), error
     # Scales by the goal's centre, not by a random point in it: costs of two seeds compare.
     weighed = CostWeights.between(field, start, goal.centre(field),
                                   deformation=settings.deformation_weight,
                                   distance=settings.distance_weight)
     trees = _trees(limits, field, start, goal, goals, settings, weighed,
-                   {} if before is None else before.trees, progress.part(0.0, 0.5))
+                   {} if before is None else before.trees,
+                   progress.part(0.0, 0.5)) if nobody is None else {}
     problem = GentleProblem(field, limits, weighed.weights, start, goal)
     known = [path.points for path in trees.values()]
-    detour = None
-    if settings.max_detour is None:
-        gentle = plan_gentle(problem, known, progress=progress.part(0.5, 1.0))
-    else:
-        detour = _detour(problem, known, settings, progress.part(0.5, 1.0))
-        gentle = detour.found
+    try:
+        gentle, detour = _gentle(problem, known, settings, progress.part(0.5, 1.0))
+    except NoWayError as error:
+        if nobody is None or UNPROVEN in error.seen:
+            raise
+        raise NoWayError(nobody.seen, f"{nobody.why} {error.why}", nobody.fix) from error
+    if detour is not None:
         weighed = replace(weighed, distance=detour.weight * weighed.distance)
         problem = replace(problem, weights=weighed.weights)
     if settings.planner == "d-rrt-star":
@@ -144,6 +152,15 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         compared[f"{name}, not smoothed"] = path.raw
     return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
                     detour=detour, trees=trees)
+
+
+def _gentle(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
+            progress: Progress) -> tuple[GentlePath, DetourPath | None]:
+    """Return the gentlest path, and what a limit on its length did."""
+    if settings.max_detour is None:
+        return plan_gentle(problem, known, progress=progress), None
+    detour = _detour(problem, known, settings, progress)
+    return detour.found, detour
 
 
 def _detour(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,

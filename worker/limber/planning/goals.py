@@ -20,6 +20,10 @@ from limber.planning.resolve import SolvedPoses
 _MILLIMETRES = 30.0  # times the sampled region's size: nobody asks for what is so far off
 
 
+class GoalOverLimitsError(NoPathError):
+    """None of the poses that were drawn in the goal region keeps the limits."""
+
+
 class Goal(Protocol):
     """A region of grasp positions."""
 
@@ -131,7 +135,8 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
     """Return allowed grasp positions in the goal region, at most ``count``, shape [n, 3].
 
     Raises:
-        NoPathError: there is none; says whether the region is out of reach or a limit forbids it.
+        NoPathError: the region is out of reach. GoalOverLimitsError: none was drawn that keeps the
+            limits; in a narrow valley one may.
     """
     points = goal.guess(field, count, np.random.default_rng(seed))
     reached = points[goal.distance(field, points) <= goal.tolerance]
@@ -140,9 +145,9 @@ def goal_points(goal: Goal, field: EnergyField, limits: FieldArrays, *, count: i
         raise _out_of_reach(goal, field, seed)
     allowed = trusted[allowed_points(trusted, limits)]
     if len(allowed) == 0:
-        raise NoPathError(
+        raise GoalOverLimitsError(
             f"No pose in the goal region keeps the limits: {over_limits(field, trusted, limits)}.",
-            "All of the region was sampled.",
+            f"{len(trusted)} poses in it were drawn.",
             "Raise the limit (--max-energy, --max-force and others, the workspace), or choose a "
             "goal nearer to the rest pose.")
     return np.ascontiguousarray(allowed)

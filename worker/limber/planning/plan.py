@@ -28,7 +28,9 @@ from limber.planning.full_check import broken_on_full_model, field_error, learnt
 from limber.planning.goals import Goal, GraspGoal, TargetGoal, default_goal, hemisphere_goal
 from limber.planning.limits import Limits
 from limber.planning.motion_check import check_motion
+from limber.planning.narrows import Narrows, asked_in_doubt, said_after
 from limber.planning.planners.tree_search import SearchTree
+from limber.planning.problem import NoWayError
 from limber.planning.regions import Ball, BoxRegion, Region, View
 from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.planning.search_files import CostToGo
@@ -76,7 +78,9 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     A plan that breaks a limit on the full model, or that the branch cannot follow, is not passed
     on: the states found there join the field's samples and it is planned anew, at most
     ``settings.replans`` times. So is one along which the field is too far off to have been the
-    gentlest; the last of those is passed on with a warning. And so is a motion that breaks a limit
+    gentlest; the last of those is passed on with a warning. Where no path keeps the limits on the
+    field, and its error leaves that in doubt, the states along the way that comes nearest join the
+    samples likewise (:mod:`limber.planning.narrows`). And so is a motion that breaks a limit
     by the branch's inertia, however slow it was tried.
 
     Cancelled (or by Ctrl-C) while the bound closes, it takes the best path so far, which is checked
@@ -98,12 +102,26 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
     rounds: list[dict[str, Any]] = []
     pair = baseline = moving = None
     planned_limits, aim, risks = limits, goal, []
+    narrows: list[Narrows] = []
     for number in range(settings.replans + 1):
         ahead = progress.part(number / (settings.replans + 1), (number + 1) / (
             settings.replans + 1))
         began = perf_counter()
-        before, pair = pair, plan_within(field, start, aim, settings, planned_limits,
-                                         before=pair, progress=ahead.part(0.0, 0.3))
+        is_last = number == settings.replans
+        try:
+            before, pair = pair, plan_within(field, start, aim, settings, planned_limits,
+                                             before=pair, progress=ahead.part(0.0, 0.3))
+        except NoWayError as none:
+            doubt_there = None if is_last else asked_in_doubt(
+                field, grasp_model, start, aim, planned_limits, ahead.part(0.3, 1.0))
+            if doubt_there is None:
+                raise (said_after(none, len(narrows), narrows[-1].told) if narrows
+                       else none) from none
+            narrows.append(doubt_there)
+            progress.warn(f"{none.seen} Poses are added where the energy field's error leaves that "
+                          f"in doubt: {doubt_there.told}.")
+            field = refit(field, doubt_there.learnt)
+            continue
         planned = perf_counter()
         stopped = pair.certificate.stopped
         if stopped:  # the best so far is checked all the same: else it could not be kept
@@ -124,7 +142,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
             planned_limits = planned_limits.tightened(
                 {name: _RESERVE * share for name, share in risks[-1].excess.items() if share > 1.0})
         off = field_error(field, plan.solved)
-        is_last = stopped or number == settings.replans
+        is_last = is_last or stopped
         is_near = is_last or off <= settings.field_error / 100.0
         if settings.inertia and not broken and is_near and limits.asked():
             moving = check_motion(

@@ -4,11 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from limber.errors import NoPathError
 from limber.planning.cost import EdgeWeights, arc_lengths, resample
 from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
 from limber.planning.goals import Goal
 
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
+
+
+class NoWayError(NoPathError):
+    """No path from the start to the goal keeps the limits on the field: proven, or none found."""
 
 
 @dataclass(frozen=True)
@@ -55,3 +60,11 @@ class GentleProblem:
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
         return float(self.goal.distance(self.energy_field, point[None])[0]) - self.goal.tolerance
+
+
+def no_way(problem: GentleProblem, proof: str) -> NoWayError:
+    """Return what is said where no path exists, and how that is proven."""
+    return NoWayError(
+        f"No path exists: with{problem.limits_in_words() or ' poses that the branch accepts'} no "
+        "way leads from the start to the goal.", proof,
+        "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")

@@ -116,5 +116,6 @@ class PlanSettings(Settings):
         "square); where it is more, the states found are added to the field and it is planned "
         "anew."))
     replans: int = Field(3, ge=0, le=10, description=(
-        "How often at most to plan anew, where the full model breaks a limit or the field is off."))
+        "How often at most to plan anew, where the full model breaks a limit, the field is off, or "
+        "its error leaves in doubt that no path keeps the limits."))
     seed: int = Field(0, ge=0, description="Of both planners.")

@@ -34,7 +34,7 @@ from limber.planning.bound.subsolution import (
     widened,
 )
 from limber.planning.field.energy_field import LOADS
-from limber.planning.problem import GentleProblem
+from limber.planning.problem import GentleProblem, NoWayError, no_way
 from limber.planning.search_files import CostToGo
 from limber.progress import SILENT, Progress
 
@@ -413,12 +413,8 @@ def _descent(grid: _Grid, u: np.ndarray, cell: np.ndarray) -> np.ndarray:
     return grid.points(np.array(way) + 0.5)
 
 
-def _separated(problem: GentleProblem, grid: _Grid, open_cells: np.ndarray) -> NoPathError:
-    what = problem.limits_in_words()
+def _separated(problem: GentleProblem, grid: _Grid, open_cells: np.ndarray) -> NoWayError:
     share = 100.0 * open_cells.mean()
-    return NoPathError(
-        f"No path exists: with{what or ' poses that the branch accepts'} no way leads from the "
-        "start to the goal.",
-        f"Proven on a grid of {1e3 * grid.spacing:.1f} mm: cells where motion is surely not "
-        f"allowed separate the two ({share:.0f} % of the region's box is open).",
-        "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")
+    return no_way(problem, f"Proven on a grid of {1e3 * grid.spacing:.1f} mm: cells where motion "
+                  f"is surely not allowed separate the two ({share:.0f} % of the region's box is "
+                  "open).")

@@ -93,6 +93,12 @@ class TrustRegion:
             outside |= _surely_refused(centres, halves, self.accepted, self.rejected)
         return outside
 
+    def plane_least(self, middles: np.ndarray, halves: np.ndarray) -> np.ndarray:
+        """Return how far boxes about ``middles`` [n, 3] in flattened coordinates, with half edges
+        ``halves`` [3] along them, are above the plane that is highest at their middle [m], [n]."""
+        heights, top = _heights(_rows(middles), self.planes)
+        return heights - np.abs(self.planes[top, :3]) @ halves
+
     def height_and_slope(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return heights [m], shape [n], and their gradients to the point, [n, 3]."""
         heights, top = _heights(self.chart.map(_rows(points)), self.planes)

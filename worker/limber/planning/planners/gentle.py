@@ -1,18 +1,19 @@
 """The gentlest path with its certificate: eikonal descent, refinement, bound.
 
 Each grid of the certificate shows the cheapest way on it; refined, it is a path. The first paths
-that are tried are the straight line and what other planners found.
+that are tried are the straight line and what other planners found; where none of them keeps the
+limits, a way by cells that do, if there is one (:mod:`limber.planning.bound.separation`).
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from limber.errors import NoPathError
 from limber.planning.bound.certificate import ENOUGH, Certificate, certify
+from limber.planning.bound.separation import Verdict, judge
 from limber.planning.cost import arc_lengths
 from limber.planning.planners.refine import refine
-from limber.planning.problem import GentleProblem
+from limber.planning.problem import GentleProblem, NoWayError, no_way
 from limber.progress import SILENT, Progress
 
 UNPROVEN = "nor is it proven that none exists"
@@ -36,9 +37,10 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     below which the bound is refined no further.
 
     Raises:
-        NoPathError: it is proven that there is none, or none was found; says which.
+        NoWayError: it is proven that there is none, or none was found; says which.
     """
     best: list = [None, np.inf]
+    verdicts: list[Verdict] = []
 
     def improve(rough: np.ndarray | None) -> float:
         if rough is None:
@@ -51,17 +53,28 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
             points, cost = refine(path, problem)
             if cost < best[1]:
                 best[:] = points, cost
+        if best[0] is None and rough is None:
+            verdicts.append(judge(problem))
+            if verdicts[0].proven:
+                raise no_way(problem, f"Proven on {_grid(verdicts[0])}: cells where motion is "
+                             "surely not allowed separate the two.")
+            if verdicts[0].way is not None:
+                return improve(verdicts[0].way)
+        elif best[0] is None and rough is not verdicts[0].way:
+            # Coarser cells than those that left it open will not settle it.
+            raise NoWayError(
+                f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} "
+                f"was found, {UNPROVEN}.", f"It is open on {_grid(verdicts[0])}.",
+                "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
         return best[1]
 
     certificate = certify(problem, improve, enough=enough, progress=progress)
-    if best[0] is None:
-        raise NoPathError(
-            f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} was "
-            f"found, {UNPROVEN}.",
-            f"The bound says a path costs at least {certificate.lower:.3g} "
-            f"(grid of {1e3 * certificate.levels[-1]['spacing_m']:.1f} mm).",
-            "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
     return GentlePath(best[0], best[1], certificate)
+
+
+def _grid(verdict: Verdict) -> str:
+    along, off = 1e3 * verdict.edges[0], 1e3 * verdict.edges[2]
+    return f"a grid of {along:.1f} mm along and {off:.2g} mm off the shell that the grasp moves on"
 
 
 def _straight(problem: GentleProblem) -> np.ndarray:

@@ -1,0 +1,133 @@
+"""Narrow places: found or excluded by cells, and asked of the full model where the field errs."""
+
+
+import numpy as np
+import pytest
+
+from limber.planning import plan as planning
+from limber.planning.bound.separation import judge
+from limber.planning.compare import plan_within
+from limber.planning.cost import CostWeights, resample
+from limber.planning.field.chart import Chart
+from limber.planning.field.energy_field import EnergyField, GraspSamples, fit_field
+from limber.planning.goals import GraspGoal
+from limber.planning.limits import Limits
+from limber.planning.narrows import asked_in_doubt
+from limber.planning.planners.easiest import easiest_way
+from limber.planning.planners.gentle import plan_gentle
+from limber.planning.problem import GentleProblem, NoWayError
+from limber.planning.settings import PlanSettings
+from limber.progress import Progress
+
+RADIUS = 0.2  # [m] of the shell about the origin
+ALONG, OFF = 20.0, 4e4  # [N/m] along the shell and off it: it yields a two thousandth as easily
+GOAL = GraspGoal((0.06, 0.0, float(np.sqrt(RADIUS**2 - 0.06**2))), 0.004)
+HELD = ALONG * RADIUS * (np.arcsin(0.06 / RADIUS) - 0.02)  # [N] nearly, where the goal begins
+
+
+@pytest.fixture(scope="module")
+def shell_field():
+    """A stiff shell: a spring along it about the rest pose and a far stiffer one off it."""
+    generator = np.random.default_rng(4)
+    chart = Chart.about(np.zeros(3), RADIUS, np.array([0.0, 0.0, RADIUS]))
+    flat = np.concatenate([np.zeros((1, 3)), generator.uniform(-0.1, 0.1, (250, 3))])
+    flat[1:, 2] = 0.004 * generator.uniform(-1.0, 1.0, 250)
+    points = chart.curved(flat)
+    slope = flat * [ALONG, ALONG, OFF]
+    nothing = np.zeros((len(points), 3))
+    return fit_field(GraspSamples(
+        np.hstack([points, nothing]), 0.5 * (flat * slope).sum(axis=1),
+        chart.pull_back(points, slope), 1.5 * points, np.ones(len(points)), np.empty((0, 6)),
+        np.full(len(points), 0.01)), np.zeros(3), RADIUS)
+
+
+def problem_on(field, **limits):
+    weights = CostWeights.between(field, field.rest, GOAL.centre(field), deformation=1.0,
+                                  distance=1.5).weights
+    return GentleProblem(field, field.limited(**limits), weights, field.rest.copy(), GOAL)
+
+
+def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_field):
+    """In a valley a twentieth of a millimetre wide, where the goal asks for a force near the limit;
+    poses drawn in the goal say of neither that it can be kept."""
+    held = np.linalg.norm(shell_field.force(np.array([GOAL.position])))
+    wide = problem_on(shell_field, max_force=1.05 * held)
+    way = judge(wide).way
+    assert way is not None and np.linalg.norm(way[-1] - GOAL.position) <= GOAL.tolerance
+    assert np.linalg.norm(shell_field.force(resample(way, 0.001)), axis=1).max() < 1.1 * held
+    found = plan_gentle(wide, enough=1e6)
+    assert found.cost == wide.cost(found.points) < np.inf
+    none = problem_on(shell_field, max_force=0.8 * held)
+    assert judge(none).proven
+    with pytest.raises(NoWayError, match=r"No path exists.*Proven on a grid"):
+        plan_gentle(none)
+
+
+def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
+    """Its worst force is less than the straight line's, and no more than a free path's; with a
+    limit above it nothing is over."""
+    start, goal = np.array([-0.06, -0.06, 0.0]), GraspGoal((0.1, 0.1, 0.0), 0.01)
+    weights = CostWeights.between(ridge_field, start, goal.centre(ridge_field), deformation=1.0,
+                                  distance=1.5).weights
+    free = plan_gentle(GentleProblem(ridge_field, ridge_field.limited(), weights, start, goal),
+                       enough=0.1).points
+    line = start + np.linspace(0.0, 1.0, 100)[:, None] * (goal.centre(ridge_field) - start)
+    limit = 2.0
+    way = easiest_way(ridge_field, ridge_field.limited(max_force=limit), start, goal)
+
+    def worst(points):
+        return np.linalg.norm(ridge_field.force(resample(points, 0.001)), axis=1).max() / limit
+    assert way.worst < 0.9 * worst(line) and way.worst < 1.03 * worst(free)
+    assert np.linalg.norm(way.points[-1] - goal.position) <= goal.tolerance
+
+
+@pytest.fixture
+def narrow(planned_branch):
+    """The small branch's field, a goal on it, and the force that the goal takes."""
+    field = EnergyField.read(planned_branch / "energy.npz")
+    goal = planning.default_goal(field, 0.01)
+    return field, goal, float(np.linalg.norm(field.force(np.array([goal.position])), axis=1)[0])
+
+
+def test_poses_are_asked_where_the_fields_error_leaves_it_in_doubt(narrow, small_model):
+    """Those of the way that comes nearest, by the full model; none where the limit is far off."""
+    field, goal, held = narrow
+    found = asked_in_doubt(field, small_model, field.rest, goal,
+                           Limits(force=held * (1.0 + 1e-6)))
+    assert 1 <= len(found.learnt.poses) <= 12 and "N, at (" in found.told
+    again = small_model.follow(found.learnt.poses[:1, :3], small_model.rest.displacement)[0]
+    assert np.allclose(again.reaction_force, found.learnt.forces[0], rtol=1e-3, atol=1e-3 * held)
+    assert asked_in_doubt(field, small_model, field.rest, goal, Limits(force=0.1 * held)) is None
+
+
+@pytest.mark.usefixtures("coarse_bound")
+@pytest.mark.parametrize("blind", [1, 4])
+def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(
+        blind, narrow, small_model, monkeypatch):
+    """Planned anew with what the full model says; after the stated number of times it is said that
+    no path was found, and what the way that comes nearest takes."""
+    field, goal, held = narrow
+    counts = []
+
+    def excluded(known, *arguments, **options):
+        counts.append(len(known.samples.poses))
+        if len(counts) <= blind:
+            raise NoWayError("No path exists.", "Proven on a grid.", "Raise the limit.")
+        return plan_within(known, *arguments, **options)
+
+    monkeypatch.setattr(planning, "plan_within", excluded)
+    warnings = []
+    settings = PlanSettings(goal=goal.position, goal_tolerance=goal.tolerance, iterations=300,
+                            max_force=1.3 * held, inertia=False, replans=2)
+
+    def made():
+        return planning.plan_motion(field, small_model, settings, workers=1,
+                                    progress=Progress(on_warning=warnings.append))
+    if blind == 1:
+        found = made()
+        assert np.linalg.norm(found.plan.solved.forces, axis=1).max() <= 1.3 * held
+        assert counts[1] > counts[0] and "Poses are added where" in warnings[0]
+    else:
+        with pytest.raises(NoWayError, match=r"No path exists.*Poses were added .* of .* N, at \("):
+            made()
+        assert len(counts) <= 3

@@ -1,0 +1,141 @@
+"""The way to the goal that goes least over the limits, where no path keeps them.
+
+The planners follow the cost, and know of limits only that they forbid. Here what counts is how far
+over its limit the worst pose of a way is: on a grid over the trusted region, along the shell that
+the samples follow and as dense across it as they are, the least that lets start and goal hang
+together. Where that is within the field's error, it is there that the field must be known better.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import label
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from limber.planning.cost import resample
+from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
+from limber.planning.goals import Goal
+
+_ALONG, _ACROSS = 64, 48  # points of the grid along the shell, each way, and off it
+_FINE = 0.001  # [m] between points of the way
+_HALVINGS = 24  # of the least excess
+_NEAR = np.ones((3, 3, 3))
+_REFUSED = 10.0  # of its limit, as which a pose near one counts that the branch model refused
+_DEARER = 30.0  # times the length counts where a pose is as much over its limit as the limit is
+
+
+@dataclass(frozen=True)
+class EasiestWay:
+    """A way ``points`` [n, 3] from the start into the goal; ``worst`` is the most that anything is
+    of its limit along it, 1 and less where all limits are kept."""
+
+    points: np.ndarray
+    worst: float
+
+
+def easiest_way(field: EnergyField, limits: FieldArrays, start: np.ndarray, goal: Goal,
+                ) -> EasiestWay | None:
+    """Return the way from ``start`` [3]; None where none stays among the samples, limits or not."""
+    chart, places = _grid(field)
+    shape = places.shape[:3]
+    points = chart.curved(places.reshape(-1, 3))
+    shares = _shares(field, limits, points).reshape(shape)
+    known = np.isfinite(shares)
+    if not known.any():
+        return None
+    away = np.full(shape, np.inf)
+    away[known] = goal.distance(field, points[known.ravel()])
+    ends = away <= max(goal.tolerance, float(away.min()))
+    apart = np.linalg.norm(points - start, axis=1).reshape(shape)
+    begin = np.unravel_index(int(np.where(known, apart, np.inf).argmin()), shape)
+    level = _least_level(shares, begin, ends)
+    if level is None:
+        return None
+    numbers = _shortest(shares, places, level, begin, ends)
+    # Along the shell: chords lie well off it.
+    flat = np.concatenate([chart.map(start), chart.map(points[numbers])])
+    way = chart.curved(resample(flat, _FINE))
+    return EasiestWay(way, float(max(_shares(field, limits, way).max(), 0.0)))
+
+
+def _grid(field: EnergyField) -> tuple:
+    """Return the plain chart, and places [a, a, c, 3] in it."""
+    region = field.region
+    chart = region.chart.plain
+    flat = chart.map(region.accepted)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    off = np.quantile(flat[:, 2], np.linspace(0.0, 1.0, _ACROSS)) if chart.radius > 0.0 else (
+        np.linspace(low[2], high[2], _ALONG))
+    ticks = [np.linspace(low[0], high[0], _ALONG), np.linspace(low[1], high[1], _ALONG),
+             np.unique(off)]
+    return chart, np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
+
+
+def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.ndarray:
+    """Return the most that anything is of its limit at ``points`` [n, 3], shape [n]; infinite
+    outside the samples' hull and the workspace."""
+    out = np.full(len(points), np.inf)
+    within = field.region.height(points) <= 0.0
+    within &= ((points >= limits.low) & (points <= limits.high)).all(axis=1)
+    inside = points[within]
+    shares = np.where(field.region.contains(inside), 0.0, _REFUSED)
+    if limits.max_energy < np.inf:
+        shares = np.maximum(shares, field.energy(inside) / limits.max_energy)
+    if limits.max_force < np.inf:
+        size = np.linalg.norm(field.force(inside), axis=1)
+        shares = np.maximum(shares, size / limits.max_force)
+    for name, limit in zip(LOADS, limits.max_loads, strict=True):
+        if limit < np.inf:
+            shares = np.maximum(shares, np.abs(field.load(inside, name)) / limit)
+    out[within] = shares
+    return out
+
+
+def _least_level(shares: np.ndarray, begin: tuple, ends: np.ndarray) -> float | None:
+    """Return the least level at which places no higher lead from ``begin`` to one of ``ends``."""
+    def leads(level: float) -> bool:
+        together = label(shares <= level, _NEAR)[0]
+        return together[begin] > 0 and bool((together[ends] == together[begin]).any())
+
+    low, high = 0.0, float(shares[np.isfinite(shares)].max())
+    if not leads(high):
+        return None
+    if leads(1.0):
+        return 1.0
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if leads(middle) else (middle, high)
+    return high
+
+
+def _shortest(shares: np.ndarray, places: np.ndarray, level: float, begin: tuple,
+              ends: np.ndarray) -> np.ndarray:
+    """Return the numbers of the places on the shortest way that goes over no ``level``; the part
+    over its limit counts as longer."""
+    open_places = np.flatnonzero(shares.ravel() <= level)
+    number = np.full(shares.size, -1)
+    number[open_places] = np.arange(len(open_places))
+    number = number.reshape(shares.shape)
+    dear = 1.0 + _DEARER * np.maximum(shares - 1.0, 0.0)
+    rows, columns, lengths = [], [], []
+    for step in [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)
+                 if (i, j, k) > (0, 0, 0)]:
+        here = tuple(slice(max(0, -s), n - max(0, s)) for s, n in zip(step, shares.shape,
+                                                                      strict=True))
+        there = tuple(slice(max(0, s), n - max(0, -s)) for s, n in zip(step, shares.shape,
+                                                                       strict=True))
+        both = (number[here] >= 0) & (number[there] >= 0)
+        rows.append(number[here][both])
+        columns.append(number[there][both])
+        apart = np.linalg.norm(places[here][both] - places[there][both], axis=1)
+        lengths.append(apart * np.maximum(dear[here][both], dear[there][both]))
+    graph = coo_matrix((np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))),
+                       shape=(len(open_places),) * 2).tocsr()
+    away, before = dijkstra(graph, directed=False, indices=number[begin], return_predecessors=True)
+    reached = number[ends & (number >= 0)]
+    at = int(reached[np.argmin(away[reached])])
+    way = [at]
+    while before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    return open_places[way[::-1]]
