@@ -30,6 +30,9 @@ _PATCH = 0.1  # of the largest leaf's area, up to which a piece is a patch of a 
 # Up to half of it, a piece is one if it is so thick for its width: blades come to 0.14, stretches
 # of stem and fork to 0.34 and more.
 _STRETCH, _THICK = 0.5, 0.25
+# Thickness over width, of stretches that are a piece's own width long, up to which it is a blade:
+# blades come to 0.26, stretches of branch that are flat for the noise alone to 0.49 and more.
+_BLADE, _ACROSS, _PLACES = 0.4, 0.6, 40
 _NEAR = 3.0  # spacings, up to which points hang together
 _AGREE = 0.5  # of the neighbours, that make a point one of a leaf
 
@@ -155,9 +158,22 @@ def _pieces(points: np.ndarray, on_leaf: np.ndarray, reach: float) -> list[Leaf]
         members = np.flatnonzero(label == piece)
         # The median: at a leaf's edge neighbours are missing on one side.
         leaves.append(Leaf(own[members], len(members) * float(np.median(area[members]))))
+    leaves = [leaf for leaf in leaves if _is_blade(points[leaf.points], leaf.area)]
     largest = max((leaf.area for leaf in leaves), default=0.0)
     return [leaf for leaf in leaves if leaf.area > _PATCH * largest and (
         leaf.area > _STRETCH * largest or _thickness(points[leaf.points]) < _THICK)]
+
+
+def _is_blade(points: np.ndarray, area: float) -> bool:
+    """Whether a piece [n, 3] of such an area [m^2] is thin wherever it is as long as it is wide.
+
+    As a whole a bent strip may be as wide as its bow is high.
+    """
+    along = np.linalg.eigh(np.cov(points.T))[1][:, 2]
+    tree, reach = cKDTree(points), _ACROSS * area / max(float(np.ptp(points @ along)), 1e-300)
+    around = tree.query_ball_point(points[::max(len(points) // _PLACES, 1)], reach)
+    thick = [_thickness(points[near]) for near in around if len(near) >= _LEAST]
+    return not thick or float(np.median(thick)) < _BLADE
 
 
 def _thickness(points: np.ndarray) -> float:
