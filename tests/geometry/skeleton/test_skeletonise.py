@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.scan_cases import round_case
 from benchmarks.scan_scores import score
 from limber.errors import Cancelled, InputError
 from limber.geometry.generated import generate_branch
@@ -38,6 +39,13 @@ def test_generated_truth_is_found_again(view, radius_limit):
     assert scored["forks_false"] <= (0 if view == "round" else 1)
     assert abs(scored["length_error"]) < 0.05
     assert result.noise == pytest.approx(0.001, rel=0.25)
+
+
+def test_a_foot_does_not_reach_out_of_the_points():
+    """One of the bench's cases: its first two nodes had been left a radius below all points."""
+    case = round_case(905117005)
+    root = skeletonise(case.points).skeleton.nodes[0]
+    assert np.linalg.norm(root - case.truth.nodes[0]) < 0.5 * case.truth.radius[0]
 
 
 def test_attraction_may_grow():

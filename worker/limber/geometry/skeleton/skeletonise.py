@@ -343,7 +343,7 @@ def _fit(skeleton: Skeleton, points: np.ndarray, settings: SkeletonSettings, dia
     fit = fit_axes(skeleton, points, rounds=rounds, settled=noisy and not late, seen=fit.seen,
                    along_sight=camera, progress=progress.part(0.8, 1.0))
     pruned += strands + late
-    ended = _ends_within(fit.skeleton, points)
+    ended = _ends_within(_without_bare_ends(fit.skeleton, points), points)
     # Where leaves swell or starve the axes, what lies beside a blank tells nothing of it either.
     beside = _beside(fit)
     if beside <= LEAF_SHARE:
