@@ -32,13 +32,17 @@ def test_blocks_are_the_sums_of_outer_products() -> None:
     count = 50
     segment, share, weight = rng.integers(0, 3, count), rng.uniform(size=count), rng.uniform(
         size=count)
-    normal, gradient = rng.normal(size=(count, 3)), rng.normal(size=(count, 8))
+    normal, across, gradient = (rng.normal(size=(count, width)) for width in (3, 3, 8))
     low, high = rng.uniform(size=count), rng.uniform(size=count)
-    block, right = normal_blocks(segment, share, low, high, normal, gradient, weight, 3)
+    block, right = normal_blocks(segment, share, low, high, normal, across, gradient,
+                                 weight, 3)
     row = np.column_stack([-(1 - share)[:, None] * normal, -low, -share[:, None] * normal, -high])
+    none = np.zeros(count)
+    side = np.column_stack([-(1 - share)[:, None] * across, none, -share[:, None] * across, none])
     for s in range(3):
         own = segment == s
-        np.testing.assert_allclose(block[s], (row[own] * weight[own, None]).T @ row[own])
+        np.testing.assert_allclose(block[s], (row[own] * weight[own, None]).T @ row[own]
+                                   + (side[own] * weight[own, None]).T @ side[own])
         np.testing.assert_allclose(right[s], weight[own] @ gradient[own])
 
 

@@ -7,14 +7,16 @@ from benchmarks.scan_cases import one_sided_case
 from benchmarks.scan_scores import cylinder_volume, seen_part
 from limber.geometry.skeleton.radii import noisy_rings
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
-from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides
+from limber.geometry.skeleton.radii.noisy_rings import mean_places, seen_sides, weighted_aims
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 
 def _points(radius: float, noise: float, half: bool, count: int = 6000, seed: int = 0):
     rng = np.random.default_rng(seed)
-    angle = rng.uniform(-np.pi / 2, np.pi / 2, count) if half else rng.uniform(0, 2 * np.pi, count)
+    # One side is seen up to where generated scans see it: within 6 degrees of grazing.
+    reach = np.arccos(0.1) if half else np.pi
+    angle = rng.uniform(-reach, reach, count)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle),
                        rng.uniform(0, 0.5, count)], axis=1)
     return points + rng.normal(0, noise, points.shape)
@@ -37,6 +39,31 @@ def test_radius_under_noise_has_no_bias(half: bool, share: float) -> None:
     inner = fit.skeleton.radius[5:-5]
     assert np.median(inner) == pytest.approx(0.006, rel=0.06)
     assert fit.noise == pytest.approx(share * 0.006, rel=0.08)
+
+
+@pytest.mark.parametrize("radius", [0.7, 1.0, 2.0, 4.0])
+def test_points_lie_at_their_aims_on_average(radius: float) -> None:
+    """A third of a circle, noise 1, and weights that end 3 noises and 0.9 of the radius off it."""
+
+    def limit(thick):
+        return 0.9 * thick + 3
+
+    rng = np.random.default_rng(3)
+    turn = rng.uniform(-1, 1, 400_000)
+    true = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    points = radius * true + rng.normal(size=true.shape)
+    distance = np.linalg.norm(points, axis=1)
+    out = points / distance[:, None]
+    weight = np.clip(1 - ((distance - radius) / limit(radius))**2, 0, None)**2
+    mean, near = weighted_aims(np.array([radius]), 1.0, limit)
+
+    def average(values):
+        return np.average(values, weights=weight, axis=0)
+
+    assert average((points * true).sum(axis=1)) == pytest.approx(mean.radius[0], abs=0.01)
+    assert average(points - mean.axis * true) == pytest.approx(0, abs=0.01)
+    assert average(distance) == pytest.approx(near.radius[0], abs=0.01)
+    assert average((distance[:, None] - near.axis) * out) == pytest.approx(0, abs=0.01)
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -66,6 +93,61 @@ def test_a_strip_of_a_half_hidden_branch_is_no_thin_branch() -> None:
     points = np.stack([0.006 * np.cos(angle), 0.006 * np.sin(angle), z], axis=1)[seen]
     fit = fit_axes(_axis(0.006), points + rng.normal(0, 0.001, points.shape), rounds=30)
     assert fit.skeleton.radius[5:-5].min() > 0.85 * 0.006
+
+
+def test_a_side_comes_to_one_radius_wherever_it_starts() -> None:
+    """Noise of a third of the radius: steps twice as far as they should be ended at 0.83 and at
+    1.00 of it by turns."""
+    rng = np.random.default_rng(1)
+    angle = rng.uniform(-noisy_rings._GRAZING, noisy_rings._GRAZING, 3000)
+    points = np.stack([0.006 * np.cos(angle), 0.006 * np.sin(angle), rng.uniform(0, 0.5, 3000)],
+                      axis=1) + rng.normal(0, 0.002, (3000, 3))
+    told = fit_axes(_axis(0.006), points, uncertainty=False).seen
+    assert told.one_sided
+    found = []
+    for aside, rounds in ((0.0, 12), (-0.0012, 12), (-0.0012, 13)):
+        start = _axis(0.006)
+        fit = fit_axes(start.moved(start.nodes + [aside, 0, 0]), points, rounds=rounds,
+                       settled=True, seen=told, uncertainty=False)
+        found.append(float(np.median(fit.skeleton.radius[5:-5])))
+    assert found == pytest.approx([0.006] * 3, rel=0.06)
+    assert np.ptp(found) < 0.01 * 0.006
+
+
+def _twig_beside_a_stem(radius: float, noise: float, half: bool, per_radius: float, seed: int):
+    """Points of a stem of 9 mm that tells noise and side, and of a twig with so many points a
+    radius of its length; and their axes."""
+    rng, length = np.random.default_rng(seed), 0.2
+    places, axes = [], []
+    for thick, beside, count in ((0.009, 0.0, 1400), (radius, 0.08, per_radius * length / radius)):
+        reach = noisy_rings._GRAZING if half else np.pi
+        angle = rng.uniform(-reach, reach, int(count))
+        places.append(np.stack([thick * np.cos(angle), beside + thick * np.sin(angle),
+                                rng.uniform(0, length, len(angle))], axis=1))
+        along = np.arange(0, length, thick)
+        axes.append(np.stack([0 * along, 0 * along + beside, along], axis=1))
+    points, stem = np.vstack(places), len(axes[0])
+    parent = np.concatenate([np.arange(stem) - 1, [0], stem + np.arange(len(axes[1]) - 1)])
+    thick = np.repeat([0.009, radius], [stem, len(axes[1])])
+    return (Skeleton.from_edges(np.vstack(axes), parent, thick),
+            points + rng.normal(0, noise, points.shape))
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("noise", [0.001, 0.002, 0.003])
+@pytest.mark.parametrize("per_radius", [3, 8])
+def test_a_twig_of_few_points_is_as_thick_as_it_is(half, noise, per_radius) -> None:
+    """A radius of 3 mm, noise up to as much: half as thick again with 3 points a radius, and a
+    quarter as thick with 8, both with intervals that did not hold it."""
+    found, held = [], []
+    for seed in range(3):
+        axes, points = _twig_beside_a_stem(0.003, noise, half, per_radius, seed)
+        fit = fit_axes(axes, points, rounds=24).skeleton
+        inner = (fit.nodes[:, 1] > 0.04) & (np.abs(fit.nodes[:, 2] - 0.1) < 0.08)
+        found.append(np.median(fit.radius[inner]) / 0.003)
+        held.append(np.mean(np.abs(fit.radius - 0.003)[inner] < 1.96 * fit.radius_sigma[inner]))
+    assert np.mean(found) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(held) > 0.7
 
 
 def test_twigs_as_thin_as_the_noise_do_not_take_it_for_radius() -> None:
@@ -145,18 +227,18 @@ def test_a_flat_stem_is_not_taken_for_half_a_ring(monkeypatch) -> None:
     assert whole == pytest.approx(0.005, rel=0.1)
     monkeypatch.setattr(noisy_rings, "_BENT_LEAST", 0.0)
     half = np.median(fit_axes(_axis(0.004), points, rounds=30).skeleton.radius[5:-5])
-    assert half > 1.1 * whole
+    assert half > 1.05 * whole
 
 
 def test_scatter_that_is_known_to_be_along_the_sight_moves_no_radius() -> None:
     """A camera's scatter of more than the radius, and a fit that starts thin.
 
-    Not told that it is a camera's, it comes out a quarter too thick; on a tree of many twigs such
-    fits collapsed to a fifth.
+    Not told that it is a camera's, it comes out a tenth off; on a tree of many twigs such fits
+    collapsed to a fifth.
     """
     points = _points(0.005, 0.0, True)
     points[:, 0] += np.random.default_rng(5).laplace(0, 0.0057, len(points))
     radius = [np.median(fit_axes(_axis(0.002), points, rounds=18, along_sight=known)
                         .skeleton.radius[5:-5]) for known in (True, False)]
     assert radius[0] == pytest.approx(0.005, rel=0.05)
-    assert abs(radius[1] - 0.005) > 0.0005
+    assert abs(radius[1] - 0.005) > 2 * abs(radius[0] - 0.005)

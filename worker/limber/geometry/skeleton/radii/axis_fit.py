@@ -8,6 +8,7 @@ the branch settle.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sparse
@@ -18,11 +19,15 @@ from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, ma
 from limber.geometry.skeleton.radii.fit_kernels import normal_blocks
 from limber.geometry.skeleton.radii.noisy_rings import (
     SCATTERED_ALONG_SIGHT,
+    Aims,
     SeenSides,
     across_sight,
+    held_across,
     mean_places,
+    place_doubt,
     seen_sides,
     side_doubt,
+    weighted_aims,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
@@ -103,26 +108,33 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         # Wide at first, since a one-sided scan starts with its axis far off; then as the noise is.
         noise = max(_robust_sigma(match.residual, match.thick), 1e-4 * floor)
         spread = noise if settled else max(noise, 0.6 * spread)
-        weight = _tukey(match.residual, _limit(spread, noise, match.thick))
         # While axes are still far off, the misfit is no noise that smoothing could help against.
         trusted = noise if settled or number > rounds // 2 else 0.0
-        place = match.normal
+        limit = partial(_limit, spread, noise, 0.0 if along_sight else trusted)
+        weight = _tukey(match.residual, limit(match.thick))
+        place, aims, across = match.normal, Aims(match.thick, match.thick), None
         if trusted:
             now, axis, sharpness, stout = _sides(
                 skeleton.parent, nodes, match, weight, noise, known)
             place = mean_places(match.normal, axis, sharpness, stout, now)
+            if not now.along_sight:
+                aims, nearest = weighted_aims(match.thick, noise, limit)
             if now.one_sided:
                 if even is None:
                     # Told once, of axes that the nearest places have led to: a strip makes a thin
                     # cylinder of its own, all of whose side it seems to show.
                     even = _evenly_seen(skeleton, nodes, radius, match, weight,
                                         across_sight(match.normal, axis, now), noise)
-                place = np.where(even[match.segment, None], place, match.normal)
-        system = _system(skeleton, nodes, radius, match, weight, trusted, place)
+                whole = even[match.segment]
+                place = np.where(whole[:, None], place, match.normal)
+                aims = Aims(np.where(whole, aims.axis, nearest.axis),
+                            np.where(whole, aims.radius, nearest.radius))
+            if not now.along_sight:
+                across = held_across(match.normal, axis, place, stout)
+        system = _system(skeleton, nodes, radius, match, weight, trusted, place, aims, across)
         step = system.solve()
-        limit = 0.5 * radius
         size = np.linalg.norm(step[:, :3], axis=1)
-        shrink = np.minimum(1.0, limit / np.maximum(size, 1e-300))
+        shrink = np.minimum(1.0, 0.5 * radius / np.maximum(size, 1e-300))
         nodes = nodes + step[:, :3] * shrink[:, None]
         radius = radius + np.clip(step[:, 3], -0.4 * radius, 0.8 * radius)
         nodes, radius = _near_start(skeleton, nodes, radius)
@@ -136,16 +148,20 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     sigma, state = skeleton.radius_sigma, skeleton.radius_state
     if uncertainty:
         sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))
-        sigma = np.hypot(sigma, side_doubt(seen, radius, noise))
+        sigma = np.hypot(sigma * place_doubt(seen, radius, noise), side_doubt(seen, radius, noise))
         state = np.where(pooled, MEASURED, INTERPOLATED).astype(np.int8)
     fitted = replace(skeleton, nodes=nodes, radius=np.maximum(radius, 0.1 * floor),
                      radius_sigma=sigma, radius_state=state)
     return AxisFit(fitted, match.segment, match.residual, noise, seen)
 
 
-def _limit(spread: float, noise: float, radius: np.ndarray) -> np.ndarray:
-    """Residual [m] from which a point belongs to something else, shape [m]."""
-    return np.minimum(_TUKEY * spread, 0.9 * radius + 3 * np.minimum(noise, radius))
+def _limit(spread: float, noise: float, trusted: float, radius: np.ndarray) -> np.ndarray:
+    """Residual [m] from which a point belongs to something else, shape [m].
+
+    Noise that is not trusted yet widens none by more than its radius.
+    """
+    return np.minimum(_TUKEY * spread,
+                      0.9 * radius + 3 * np.maximum(trusted, np.minimum(noise, radius)))
 
 
 def _sides(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray, noise: float,
@@ -166,9 +182,8 @@ def _evenly_seen(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, matc
     Where a point comes from is weighed by which sides were seen. Of a strip along a branch whose
     rest is hidden, or of a few points, that makes a cylinder as thin as the strip is wide: measured
     from the truth as start, twigs with under 7 points a radius of length shrank to 0.8 of theirs,
-    and hidden stems to a third. There the nearest places are the better guess (0.95), unless noise
-    is as wide as the branch: it widens them by up to a half. So where it is, points from farther
-    along speak.
+    and hidden stems to a third. There the nearest places are the better guess (0.95). Where noise
+    is as wide as the branch they tell little of it, and points from farther along speak.
     """
     sums = np.stack([np.bincount(match.segment, weight * value, len(nodes))
                      for value in (np.ones(len(across)), across, across**2)], axis=1)
@@ -353,8 +368,9 @@ class _System:
 
 
 def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Match,
-            weight: np.ndarray, noise: float, place: np.ndarray | None = None) -> _System:
-    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place)
+            weight: np.ndarray, noise: float, place: np.ndarray | None = None,
+            aims: Aims | None = None, across: np.ndarray | None = None) -> _System:
+    data, right, per_node = _data_terms(skeleton.parent, nodes, match, weight, place, aims, across)
     smooth = _smoothness(skeleton, nodes, radius, per_node, noise)
     state = np.column_stack([nodes, radius]).ravel()
     anchor = _anchor(skeleton, nodes, per_node)
@@ -363,25 +379,30 @@ def _system(skeleton: Skeleton, nodes: np.ndarray, radius: np.ndarray, match: Ma
 
 
 def _data_terms(parent: np.ndarray, nodes: np.ndarray, match: Match, weight: np.ndarray,
-                place: np.ndarray | None = None,
+                place: np.ndarray | None = None, aims: Aims | None = None,
+                across: np.ndarray | None = None,
                 ) -> tuple[sparse.csc_matrix, np.ndarray, np.ndarray]:
     """Normal equations of the residuals in (x, y, z, r) of both ends, and weight a node.
 
     Args:
         place: Mean direction of each point's true place (:mod:`noisy_rings`), shape [m, 3]; None:
             the nearest place on the circle is the true one.
+        aims: How far out the points should lie; None: at the radius.
+        across: How firmly points hold the axis across their own direction, shape [m, 3]; None: not.
     """
     count = len(nodes)
+    aims = Aims(match.thick, match.thick) if aims is None else aims
+    across = np.zeros_like(match.normal) if across is None else across
     place = match.normal if place is None else place
     low = np.where(match.own_radius, 0.0, 1 - match.share)
     high = np.where(match.own_radius, 1.0, match.share)
     distance = match.residual + match.thick
-    pull = distance[:, None] * match.normal - match.thick[:, None] * place
-    grow = distance * np.einsum("mj,mj->m", match.normal, place) - match.thick
+    pull = distance[:, None] * match.normal - aims.axis[:, None] * place
+    grow = distance * np.einsum("mj,mj->m", match.normal, place) - aims.radius
     gradient = np.column_stack([
         (1 - match.share)[:, None] * pull, low * grow, match.share[:, None] * pull, high * grow])
-    block, right = normal_blocks(match.segment, match.share, low, high, match.normal, gradient,
-                                 weight, count)
+    block, right = normal_blocks(match.segment, match.share, low, high, match.normal, across,
+                                 gradient, weight, count)
     ends = np.arange(1, count)
     index = (4 * np.stack([parent[ends], ends], axis=1)[:, :, None] + np.arange(4)).reshape(-1, 8)
     rows = np.repeat(index, 8, axis=1).ravel()

@@ -54,8 +54,8 @@ def nearest_of(points: np.ndarray, near: np.ndarray, parent: np.ndarray, own_rad
 
 @njit(cache=True)
 def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high: np.ndarray,
-                  normal: np.ndarray, gradient: np.ndarray, weight: np.ndarray, count: int,
-                  ) -> tuple[np.ndarray, np.ndarray]:
+                  normal: np.ndarray, across: np.ndarray, gradient: np.ndarray,
+                  weight: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sums over each cylinder's points of the normal equations in (x, y, z, r) of both ends.
 
     Args:
@@ -64,6 +64,7 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
         low: Derivative of the radius there in the lower node's, shape [m].
         high: In the upper node's, shape [m].
         normal: Unit vector from the axis to the point, shape [m, 3].
+        across: How firmly each holds the axis across that, as a vector, shape [m, 3].
         gradient: What each asks of both ends, shape [m, 8].
         weight: How far it counts, shape [m].
         count: Number of cylinders.
@@ -72,7 +73,7 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
         Matrices, shape [count, 8, 8], and right sides, shape [count, 8].
     """
     block, right = np.zeros((count, 8, 8)), np.zeros((count, 8))
-    row = np.empty(8)
+    row, side = np.empty(8), np.zeros(8)
     for i in range(len(segment)):
         w, s = weight[i], segment[i]
         if w == 0.0:
@@ -80,11 +81,13 @@ def normal_blocks(segment: np.ndarray, share: np.ndarray, low: np.ndarray, high:
         for k in range(3):
             row[k] = -(1 - share[i]) * normal[i, k]
             row[4 + k] = -share[i] * normal[i, k]
+            side[k] = -(1 - share[i]) * across[i, k]
+            side[4 + k] = -share[i] * across[i, k]
         row[3], row[7] = -low[i], -high[i]
         for a in range(8):
             right[s, a] += w * gradient[i, a]
             for b in range(a, 8):
-                block[s, a, b] += w * row[a] * row[b]
+                block[s, a, b] += w * (row[a] * row[b] + side[a] * side[b])
     for s in range(count):
         for a in range(8):
             for b in range(a):

@@ -8,9 +8,11 @@ places that a point may come from, weighted by how much of each side was seen (C
 Linear Regression, 2010, chapter 6, has the models); its gradient needs the mean direction of these
 places alone."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import i0e, i1e
 
 from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle
 
@@ -31,6 +33,10 @@ _SIGHT_LEAST = 0.75
 _GRAZING, _GRAZING_SIGMA = np.deg2rad(81.0), np.deg2rad(4.0)
 _GRAZING_MOVES, _ARC_HIDDEN = 0.55, 0.12  # share of the radius a radian; noise over radius
 _LEAST_SEEN = 0.01
+# Of a circle's fitted radius, the variance over that which sharp points leave is 1 + so many times
+# (noise / radius)^2: Fisher's information of points with open places, at 0.3 to 3 noises a radius,
+# all around a circle and on half of one.
+_OPEN_PLACES, _OPEN_SIDE = 1.0, 2.2
 _RING_LOST = 12.0  # square of radius over noise, under which a ring's middle is not seen empty
 _FLAT = 0.10  # relative difference of scatter across and along the sight that is one side's
 _FLAT_SURE = 4.0  # standard deviations
@@ -38,6 +44,8 @@ _FLAT_SURE = 4.0  # standard deviations
 # of it tells an arc from what is flat but not bent, as an elliptic stem is.
 _BENT, _BENT_LEAST, _BENT_SURE = 0.0913, 0.5, 2.0
 _DIRECTIONS, _SAMPLE = 120, 2000
+_RADII = np.geomspace(0.05, 12.0, 48)  # in standard deviations of the noise, up to where it tells
+_DISTANCES = 300
 _ANGLE = 2 * np.pi * (np.arange(_PLACES) + 0.5) / _PLACES
 
 
@@ -162,6 +170,84 @@ def side_doubt(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
         return np.zeros_like(radius)
     hidden = np.minimum(noise / np.maximum(radius, 1e-300) / _ARC_HIDDEN, 1.0)
     return _GRAZING_MOVES * _GRAZING_SIGMA * hidden * radius
+
+
+def place_doubt(seen: SeenSides, radius: np.ndarray, noise: float) -> np.ndarray:
+    """Times as large as of points with known places a radius's standard deviation is, shape [n]."""
+    if seen.along_sight:
+        return np.ones_like(radius)
+    open_places = _OPEN_SIDE if seen.one_sided else _OPEN_PLACES
+    return np.sqrt(1 + open_places * (noise / np.maximum(radius, 1e-300))**2)
+
+
+@dataclass(frozen=True)
+class Aims:
+    """How far from the axis points should lie on average [m], shape [m] each.
+
+    Attributes:
+        axis: As what moves the axis has them.
+        radius: As what moves the radius has them.
+    """
+
+    axis: np.ndarray
+    radius: np.ndarray
+
+
+def weighted_aims(radius: np.ndarray, noise: float,
+                  limit: Callable[[np.ndarray], np.ndarray]) -> tuple[Aims, Aims]:
+    """How far out points should lie of whom the farther ones count less.
+
+    Noise puts more points outside of a thin branch than inside, and farther: weights that fall with
+    the distance from the surface take so much from its radius that at one noise it came out at half
+    of it, and at two noises at nine tenths. What is asked of points is therefore what they come to
+    with those weights where the radius is right (the consistency of M-estimates, after Fisher).
+    Whichever sides were seen, that is the same: it holds for each place on the circle by itself.
+
+    Args:
+        radius: True one of each point [m], shape [m].
+        noise: Standard deviation of the points [m].
+        limit: Residual [m] from which a point has no weight (Tukey's biweight), of radii [m].
+
+    Returns:
+        Where mean places are taken for the true ones, and where the nearest are.
+    """
+    thick = _RADII[:, None]
+    reach = limit(_RADII * noise)[:, None] / noise
+    residual = reach * np.linspace(-1, 1, _DISTANCES)
+    distance = np.maximum(thick + residual, 0.0)
+    bessel = i0e(distance * thick)
+    share = (1 - (residual / reach)**2)**2 * distance * bessel * np.exp(-residual**2 / 2)
+    toward = i1e(distance * thick) / bessel  # mean cosine of the angle to the true place
+    outward = (share * toward * distance).sum(axis=1)
+    total = share.sum(axis=1)
+    mean, near = outward / total, (share * distance).sum(axis=1) / total
+    along = outward / (share * toward).sum(axis=1)
+
+    def of(aim: np.ndarray) -> np.ndarray:
+        past = np.maximum(radius / (noise * _RADII[-1]), 1.0)
+        return radius + noise * np.interp(radius / noise, _RADII, aim - _RADII) / past
+
+    return Aims(of(mean), of(mean)), Aims(of(along), of(near))
+
+
+def held_across(out: np.ndarray, axis: np.ndarray, place: np.ndarray, stout: np.ndarray,
+                ) -> np.ndarray:
+    """How firmly points hold the axis across their own direction, as vectors, shape [m, 3].
+
+    A point whose place is known along the circle says nothing of that; where noise hides it, or
+    the seen side ends, it does. Left out of the equations, their steps went twice as far as they
+    should and back again: one-sided radii came out right or a sixth too thin by turns.
+
+    Args:
+        out: Unit vectors from the axis to the points, shape [m, 3].
+        axis: Unit vectors along the axis at each, shape [m, 3].
+        place: Mean direction of each point's true place, shape [m, 3].
+        stout: Square of radius over noise, shape [m].
+    """
+    known = np.clip(1 - stout * (1 - np.einsum("mj,mj->m", place, place)), 0.0, 1.0)
+    # A place that is taken for certain is one that is not looked for.
+    known[np.einsum("mj,mj->m", place, out) >= 1 - 1e-12] = 0.0
+    return np.sqrt(known)[:, None] * np.cross(axis, out)
 
 
 def mean_places(out: np.ndarray, axis: np.ndarray, sharpness: np.ndarray, stout: np.ndarray,
