@@ -40,12 +40,13 @@ def recorded_stream(seed: int, seconds: float, address: str) -> list[Row]:
             lost_by_robot = robot.state["lost_seconds"]
         if killed is not None:
             record(branch.folder, path, "stream", RecordSettings(), RecordOptions(recover=True))
-        rows = read_stream(Branch.open(branch.folder).path("pulls/stream/robot.csv"))
+        kept = Branch.open(branch.folder)
+        rows = read_stream(kept.path("pulls/stream/robot.csv"))
+        ended = kept.manifest.stages["record:stream"].result["ended"]
     times, places = rows.times, rows.values[:, :3]
     steps = np.diff(times)
     lost = int(np.round(steps / 0.002).sum() - len(steps))
     if killed is None:
-        ended = Branch.open(branch.folder).manifest.stages["record:stream"].result["ended"]
         return [Row(f"500 Hz recorded for {seconds:.0f} s: samples lost", "0", f"{lost} of "
                     f"{len(times)}, but stopped after {times[-1]:.0f} s: {ended} (load of the "
                     f"machine {os.getloadavg()[1]:.1f})", False)]
