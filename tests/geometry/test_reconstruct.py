@@ -12,7 +12,7 @@ from limber.errors import Cancelled, InputError
 from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import generate_branch
 from limber.geometry.mesh_surface import MeshSurfaceSettings
-from limber.geometry.reconstruct import ReconstructSettings
+from limber.geometry.reconstruct import ReconstructSettings, reconstruct_cloud
 from limber.geometry.skeleton.files import read_swc
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import solve_static
@@ -228,3 +228,15 @@ def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
     if step != "reconstructed":
         assert not (target / "mesh.vtu").exists()
         assert not (target / "skeleton.swc").exists()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_leafy_plants_leaves_are_cut_off(shared_data, seed):
+    """Of few points of a seedling whose leaves outweigh its stem, too: a few fat rods that explain
+    most of them do not pass for wood."""
+    scan = read_points(shared_data / "tomato_maize" / "tomato_03-05.xyz")
+    chosen = np.random.default_rng(seed).permutation(len(scan))[:1500]
+    made = reconstruct_cloud(scan.subset(chosen), ReconstructSettings(unit="mm"))
+    assert made.numbers["leaf_count"] == 2
+    assert 0.7 < made.cloud.attributes["leaf"].mean() < 0.8
+    assert made.numbers["radius_max_m"] < 0.002

@@ -1,18 +1,14 @@
 """What is refused as no plant, and what is not."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from limber.errors import InputError
-from limber.geometry.cloud.files import read_points
 from limber.geometry.skeleton.plausibility import shows_round
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
-
-DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 
 
 def test_rods_that_leaves_became_show_nothing_round() -> None:
@@ -23,18 +19,6 @@ def test_rods_that_leaves_became_show_nothing_round() -> None:
     assert shows_round(result)
     result.noise = 0.004
     assert not shows_round(result)
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_a_leafy_plant_is_told_not_refused(seed: int) -> None:
-    """Few points of a seedling whose leaves outweigh its stem make a skeleton and a warning."""
-    path = DATA / "tomato_maize" / "tomato_03-05.xyz"
-    if not path.is_file():
-        pytest.skip("no ../shared/data")
-    points = read_points(path).points / 1000
-    chosen = np.random.default_rng(seed).permutation(len(points))[:1500]
-    result = skeletonise(points[chosen])
-    assert any("no round axis" in text for text in result.warnings)
 
 
 @pytest.mark.parametrize("shape", ["rough ball", "half ball", "heap", "can"])

@@ -24,7 +24,7 @@ from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.control_points import FRACTIONS
 from limber.geometry.skeleton.edits import Edit, edited
 from limber.geometry.skeleton.found import FoundSkeleton
-from limber.geometry.skeleton.plausibility import check_explained, shows_round, unexplained_share
+from limber.geometry.skeleton.plausibility import check_explained, unexplained_share
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.radii.silhouette import within_silhouette, without_hidden_twigs
 from limber.geometry.skeleton.skeleton import INTERPOLATED, LIMITED, Skeleton
@@ -43,8 +43,8 @@ Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Takes in a skeleton as it was found, and all that the search for it came to."""
 
 _LEAVES_ASKED = 0.2  # share of points on no round axis, from which leaves are looked for
-# Share of leaves that tells them where points scatter too much to show what is round: of bare
-# branches seen from one side up to 0.11 is flat, of leafy seedlings 0.6 and more.
+# Share of leaves that tells them by shape alone: of bare branches seen from one side up to 0.11 is
+# flat, of leafy seedlings 0.6 and more.
 _MOSTLY = 0.3
 
 
@@ -157,7 +157,9 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
         return found, prepared, []
     if _may_be_leafy(found, prepared, settings):
         wood, leaves = without_leaves(prepared)
-    elif prepared.view is None and not shows_round(found):
+    elif prepared.view is None:
+        # A few fat rods may explain leaves that curl, in few points: what most of a scan is, its
+        # shape tells.
         wood, leaves = without_leaves(prepared, _MOSTLY)
     else:
         return found, prepared, []
