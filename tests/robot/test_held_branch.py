@@ -4,6 +4,7 @@ import itertools
 import json
 import zlib
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -104,19 +105,20 @@ def test_stiffness_is_the_slope_of_the_wrench(beam):
         assert stiffness[:, k] == pytest.approx(slope, abs=2e-3 * np.abs(stiffness[:, k]).max())
 
 
+def on_an_arc(beam, way: float) -> np.ndarray:
+    """The frame of the tip of a branch that turns as it goes by ``way`` [m], shape [4, 4]."""
+    angle = way / 0.25
+    place = matrices(np.array([0, 0, 0, -angle, 0, 0]))
+    middle = np.r_[beam.nodes[:, :2].mean(axis=0), TIP[2]]
+    place[:3, 3] = middle + 0.25 * np.array([0, np.sin(angle), np.cos(angle) - 1])
+    return place
+
+
 def test_a_solution_leads_along_the_bend_of_the_branch(setting, beam):
     """8 mm on, where the branch is stiff along itself: with how its stiffness changed since the
     solution before, or when the gripper closed, at most a fifth of the tangent's error is left."""
-    solver = _Solver(setting)
-    middle = np.r_[beam.nodes[:, :2].mean(axis=0), TIP[2]]
-
-    def frame(way: float) -> np.ndarray:
-        """On the arc of a branch that turns as it goes."""
-        angle = way / 0.25
-        place = matrices(np.array([0, 0, 0, -angle, 0, 0]))
-        place[:3, 3] = middle + 0.25 * np.array([0, np.sin(angle), np.cos(angle) - 1])
-        return place
-
+    solver, frame = _Solver(setting), partial(on_an_arc, beam)
+    middle = frame(0.0)[:3, 3]
     solver.grasp(middle)
     tried = solver.tried()
     before, at = solver.solve(frame(0.004)), solver.solve(frame(0.010))
@@ -127,6 +129,16 @@ def test_a_solution_leads_along_the_bend_of_the_branch(setting, beam):
         at.bends = known
         errors.append(np.linalg.norm(at.wrench_at(frame(0.018), 0.0)[:3] - true[:3]))
     assert errors[0] > 0.3 and max(errors[1:]) < 0.2 * errors[0]
+
+
+def test_a_slow_robot_is_led_by_a_solution_farther_back(setting, beam):
+    """Solutions 1 mm apart tell too little of how the stiffness changes: two of them do."""
+    solver, frame = _Solver(setting), partial(on_an_arc, beam)
+    solver.grasp(frame(0.0)[:3, 3])
+    past = [solver.solve(frame(0.001 * k)) for k in range(10, 6, -1)]
+    at = solver.solve(frame(0.011))
+    at.led_by(past, (np.zeros((0, 3)), np.zeros((0, 6, 6))))
+    assert 0.002 < np.linalg.norm(at.bends[0][0]) < 0.0031
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 A process of its own solves the branch, over and over, where the gripper is about to be when the
 solution has come. Between two solutions the wrench is extrapolated by the tangent stiffness at the
-last one and by how that changed since the one before, so the arm's loop never waits: the reaction
+last one and by how that changed since one before, so the arm's loop never waits: the reaction
 is late by nothing and off by what is of third order in the way moved since. A branch held at an arm
 of 0.3 m and moved across by 6 mm comes 60 micrometres nearer to its root: along its stiff axis the
 tangent alone would be newtons off. How long a solution takes, and by how much the wrench was off
@@ -11,6 +11,8 @@ when one came, is part of the robot's state.
 
 import time
 import zlib
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -31,6 +33,9 @@ _LEAD = 1.5  # times what a solution takes: the middle of when it is used
 _LONGEST_LEAD = 0.5  # s
 _LEAST_WAY = 2e-3  # m between two solutions whose tangents are compared
 _SAME_PLACE = 1e-6  # m, rad; over that the tangent leads on exactly
+_TOLERANCE = 1e-5  # of the residual, relative to the forces: far below what a sensor tells
+_MOST_WAYS = 2.0  # so many times the way between two solutions a change is led on
+_PAST = 5  # solutions that are known still: the robot may go slowly
 _TRIED_WAY = 3e-3  # m across the branch, when the gripper has closed
 
 
@@ -111,7 +116,7 @@ class Solution:
         peak_strain: Greatest principal strain.
         seconds: What it took.
         converged: Whether it is an equilibrium; if not, the rest is of the last one.
-        bends: Over the way from the solution before first, then over those that were tried when
+        bends: Over the way from a solution before first, then over those that were tried when
             the gripper closed.
     """
 
@@ -144,6 +149,16 @@ class Solution:
             return _NO_BENDS
         return way[None], (self.stiffness - before.stiffness)[None]
 
+    def led_by(self, past: Sequence["Solution"], tried: Bends) -> None:
+        """Note how it goes on from ``past`` solutions, the latest first, or else as that did."""
+        for before in past:
+            newest = self.bend_from(before)
+            if len(newest[0]):
+                self.bends = _joined(newest, tried)
+                return
+        # Where it hardly moved, what was known before still holds.
+        self.bends = past[0].bends if past else tried
+
 
 class HeldBranch:
     """What the gripper holds: a branch, once it is closed on it."""
@@ -169,6 +184,7 @@ class HeldBranch:
         self._jump = np.zeros(6)
         self._largest_jump = 0.0
         self._tried = _NO_BENDS
+        self._past: deque[Solution] = deque(maxlen=_PAST)
         self._twist, self._last_patch = np.zeros(6), np.eye(4)
         self._gripper = self._closed_at = np.eye(4)
         self._view: dict[str, Any] | None = None
@@ -239,6 +255,7 @@ class HeldBranch:
                 self._jump, self._largest_jump = np.zeros(6), 0.0
                 self._twist, self._last_patch = np.zeros(6), rest
                 self._taken, self._tried = answer["solution"].seconds, _NO_BENDS
+                self._past = deque([answer["solution"]], maxlen=_PAST)
                 self._pipe.send(("try", None))
                 self._busy = True
                 return
@@ -321,14 +338,13 @@ class HeldBranch:
             if kind == "tried":
                 self._tried = found
                 if self._solution is not None:
-                    self._solution.bends = found
+                    self._solution.led_by(list(self._past)[1:], found)
                 return
             before, self._age = self._solution, 0.0
             self._taken = self._asked_age
+            found.led_by(self._past, self._tried)
+            self._past.appendleft(found)
             if before is not None:
-                # Where it hardly moved, what was known before still holds.
-                newest = found.bend_from(before)
-                found.bends = _joined(newest, self._tried) if len(newest[0]) else before.bends
                 # The wrench goes over to the new solution, a branch's force does not jump.
                 jump = self._extrapolated(before, patch) - self._extrapolated(found, patch)
                 self._jump += jump
@@ -421,6 +437,8 @@ class _Solver:
         self._state = np.zeros_like(mesh.nodes)
         self._last: Solution | None = None
         self._follows: np.ndarray | None = None
+        # By how much that has changed since the solution before, and over which way.
+        self._turning: tuple[np.ndarray, np.ndarray] | None = None
         self._faces: np.ndarray | None = None
         self._rng = np.random.default_rng(0)
         self._warm_up()
@@ -472,7 +490,7 @@ class _Solver:
 
     def tried(self) -> Bends:
         """How the stiffness changes both ways across the branch, turned as it turns by itself."""
-        solution, state = self._last, self._state
+        solution, state, follows = self._last, self._state, self._follows
         if solution is None:
             return _NO_BENDS
         stiffness = solution.stiffness
@@ -482,27 +500,30 @@ class _Solver:
             turn = -np.linalg.solve(stiffness[3:, 3:], stiffness[3:, :3] @ way)
             there = self.solve(frame_of(np.r_[solution.frame[:3, 3] + way, turn]))
             bends = _joined(bends, there.bend_from(solution))
-        self._state, self._last = state, solution
+        self._state, self._last, self._follows, self._turning = state, solution, follows, None
         return bends
 
     def solve(self, patch: np.ndarray) -> Solution:
         """Return the solution at a frame of the patch; the last one where there is none."""
         from limber.mechanics.sensitivities import grasp_slopes
+        from limber.mechanics.statics.result import StaticSettings
         from limber.mechanics.statics.solve import follow_poses
         from limber.mechanics.strain import peak_load
 
         pose = np.r_[patch[:3, 3], rotation_vector(patch)]
-        # By the tangent of the solution before it is nearly there.
-        guess = None
-        if self._last is not None and self._follows is not None:
-            guess = self._state + self._follows @ self._last.change_to(patch)
         result = follow_poses(self._held, self._grasp, pose[None], start=self._state,
-                              guess=guess)[0]
+                              guess=self._guessed(patch),
+                              settings=StaticSettings(tolerance=_TOLERANCE))[0]
         if not result.converged and self._last is not None:
             self._last = replace(self._last, seconds=result.seconds, converged=False)
             return self._last
         self._state = result.displacement
         slopes = grasp_slopes(self._held, self._grasp, self._state)
+        self._turning = None
+        if self._last is not None and self._follows is not None:
+            way = patch[:3, 3] - self._last.frame[:3, 3]
+            if np.linalg.norm(way) > _SAME_PLACE:
+                self._turning = way, slopes.displacement - self._follows
         self._follows = slopes.displacement
         points = (np.zeros((0, 6)) if self._operator is None
                   else self._operator @ slopes.displacement.reshape(-1, 6))
@@ -511,3 +532,17 @@ class _Solver:
             self.seen(), points, peak_load(self._held, self._state)[0], result.seconds,
             result.converged)
         return self._last
+
+    def _guessed(self, patch: np.ndarray) -> np.ndarray | None:
+        """Where the nodes nearly are at a frame of the patch, [node_count, 3].
+
+        By the tangent of the solution before and how that changed.
+        """
+        if self._last is None or self._follows is None:
+            return None
+        change, follows = self._last.change_to(patch), self._follows
+        if self._turning is not None:
+            way, turning = self._turning
+            part = float(np.clip(change[:3] @ way / (way @ way), -_MOST_WAYS, _MOST_WAYS))
+            follows = follows + 0.5 * part * turning
+        return self._state + follows @ change
