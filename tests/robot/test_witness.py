@@ -22,6 +22,15 @@ def test_pieces_add_up_on_one_processor_and_count_within_their_time(witness):
     assert witness.longest(2.0) == 0.2 and witness.longest(6.0) == 0.0
 
 
+def test_pieces_that_follow_each_other_are_one_stand_still(witness):
+    """A host that takes 4 ms of every 6 keeps a processor for 40 ms of 60, not for 4."""
+    witness._seen = [[(7.0 + 0.006 * k, 0.004) for k in range(20)], [(7.0, 0.01)]]
+    assert witness.longest(6.0) == pytest.approx(0.04, abs=1e-6)
+    assert witness.longest(7.11) == pytest.approx(0.04, abs=1e-6)
+    witness._seen = [[(7.0 + 0.1 * k, 0.004) for k in range(20)]]
+    assert witness.longest(6.0) == pytest.approx(0.004)
+
+
 def test_a_stop_is_done_again_only_where_the_machine_was_away_for_as_long(witness, capsys):
     voided = Voided(witness)
     assert not voided.explains(0.9, 1.1, 0.006, "stop") and voided.count == 0

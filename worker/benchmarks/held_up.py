@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import TypeVar
 
@@ -18,6 +18,7 @@ from limber.errors import LimberError
 
 HELD_UP_SECONDS = 0.03
 """From here on a loop that may be silent for 50 ms can come to be: chosen."""
+_TOGETHER_SECONDS = 0.06
 _MEANWHILE_SECONDS = 10.0
 """A failure is told at most so long after what made it: a loop of minutes has seen many pauses."""
 _MOST_AGAIN = 3
@@ -68,14 +69,27 @@ class Witness:
         self.close()
 
     def longest(self, since: float) -> float:
-        """Return the longest stand-still [s] that ended after ``since`` [s, monotonic clock]."""
-        return max((seconds for seen in self._seen for moment, seconds in seen if moment > since),
-                   default=0.0)
+        """Return the longest stand-still [s] that ended after ``since`` [s, monotonic clock].
+
+        Pieces that follow each other within the 60 ms in which a robot's data grows too old count
+        as one: a host takes its time away so.
+        """
+        return max(self._longest_of([one for one in seen if one[0] > since - _TOGETHER_SECONDS],
+                                     since) for seen in map(tuple, self._seen))
 
     def lost(self, since: float, until: float) -> float:
         """Return how long a processor stood still between two moments in all, at most [s]."""
-        return max(sum(max(min(moment, until) - max(moment - seconds, since), 0.0)
-                       for moment, seconds in seen) for seen in self._seen)
+        return max(self._lost_of(tuple(seen), since, until) for seen in self._seen)
+
+    @classmethod
+    def _longest_of(cls, seen: Sequence[tuple[float, float]], since: float) -> float:
+        return max((max(seconds, cls._lost_of(seen, moment - _TOGETHER_SECONDS, moment))
+                    for moment, seconds in seen if moment > since), default=0.0)
+
+    @staticmethod
+    def _lost_of(seen: Sequence[tuple[float, float]], since: float, until: float) -> float:
+        return sum(max(min(moment, until) - max(moment - seconds, since), 0.0)
+                   for moment, seconds in seen)
 
     def close(self) -> None:
         """End the processes."""
