@@ -1,9 +1,12 @@
 """What keeps a robot's loop from being held up."""
 
+import os
 import subprocess
 import sys
 
 import pytest
+
+from limber.robot.real_time import keep_awake
 
 _COUNTED = """
 import gc
@@ -41,3 +44,25 @@ def test_what_is_loaded_stays_in_memory():
     if kept == "False":
         pytest.skip("this user may not lock so much memory")
     assert int(locked) > 0.9 * int(whole)
+
+
+_AWAKE = """
+import struct
+from pathlib import Path
+from limber.robot.real_time import keep_awake
+print(keep_awake(), *struct.unpack("i", Path("/dev/cpu_dma_latency").read_bytes()[:4]))
+"""
+
+
+@pytest.mark.skipif(not os.access("/dev/cpu_dma_latency", os.R_OK | os.W_OK),
+                    reason="this user may not keep processors awake here")
+def test_processors_stay_awake_as_long_as_the_process_runs():
+    """The system reads back what holds: no latency at all."""
+    asked = subprocess.run([sys.executable, "-c", _AWAKE], capture_output=True, text=True,
+                           check=True).stdout.split()
+    assert asked == ["True", "0"]
+
+
+def test_a_computer_without_that_device_is_told(monkeypatch, tmp_path):
+    monkeypatch.setattr("limber.robot.real_time._WAKING", tmp_path / "none")
+    assert not keep_awake()

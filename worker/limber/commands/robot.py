@@ -42,6 +42,10 @@ def check(run: Run, cell_file: Path) -> dict[str, Any]:
     if not facts["kept_in_memory"]:
         run.progress.warn("The driver's memory is not locked (on Linux `ulimit -l`): what it has "
                           "not used for a while may come from the disk, which ends in a stop.")
+    if not facts["kept_awake"]:
+        run.progress.warn("The computer's processors may sleep while they idle (on Linux, who may "
+                          "write to /dev/cpu_dma_latency keeps them awake): a virtual machine's "
+                          "wake late, which ends in a stop.")
     pose = np.array(facts["pose"])
     from limber.robot.kinematics import forward, matrices
 

@@ -29,7 +29,7 @@ from limber.robot.connecting import WATCHDOG_HZ, checked, connect, require
 from limber.robot.expected import ExpectedWrench
 from limber.robot.frames import frame_of, pose_of, turn_between
 from limber.robot.guard import PLAYING, Decision, Guard, GuardSettings, State, Verdict
-from limber.robot.real_time import claim_real_time, spare_what_is_loaded
+from limber.robot.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 from limber.robot.samples import Dashboard, Sample, SampleStream
 from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
 from limber.robot.trajectory import Trajectory
@@ -90,7 +90,7 @@ class Driver:
         self.guard = self._new_guard()
         self._warm_up()
         # Now: where it has just compiled this takes longer than the watchdog would wait.
-        self.facts["kept_in_memory"] = spare_what_is_loaded()
+        self.facts |= {"kept_in_memory": spare_what_is_loaded(), "kept_awake": keep_awake()}
         self._control, self._io = connect(cell, self._stream.rate)
         # Before ur-rtde's own threads, which have what was claimed before they began.
         claim_real_time(_LOOP_PRIORITY)
