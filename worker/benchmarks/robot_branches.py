@@ -36,6 +36,9 @@ FRACTION = 0.85
 # half a second its force is led on too far, and it is not the prediction that is measured.
 _LENGTH_M = 0.4
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
+_WITHIN = 0.95
+_OFF_N = 0.5
+"""From here on the virtual branch itself was off, by its own word: chosen."""
 
 
 def random_branch(folder: Path, seed: int) -> tuple[Branch, tuple[float, ...]]:
@@ -94,9 +97,9 @@ def followed_paths(seed: int, count: int, address: str, voided: Voided) -> list[
     within, errors, ways, stopped = [], [], [], []
     for number in range(count):
         try:
-            result, state = voided.again(partial(_executed, seed + number, address),
+            result, state = voided.again(partial(_followed, seed + number, address),
                                          f"seed {seed + number}")
-        except LimberError as error:
+        except (AssertionError, LimberError) as error:
             stopped.append(f"seed {seed + number}: {error}")
             continue
         within.append(result["force_within_share"])
@@ -113,11 +116,19 @@ def followed_paths(seed: int, count: int, address: str, voided: Voided) -> list[
     return [
         Row(f"force within 5 % of the peak or the interval, {count} branches, least share of a "
             "path", "95 %", f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f}); "
-            f"{len(stopped)} stopped{voided}", min(within) >= 0.95 and not stopped),
+            f"{len(stopped)} failed{voided}", min(within) >= _WITHIN and not stopped),
         Row("difference of the force, 95 % of a path below, worst branch", "reported",
             f"{100 * max(errors):.1f} % of the peak", None),
         Row("following a branch's path: distance from it, worst", "1 mm",
             f"{1000 * max(ways):.2f} mm", max(ways) < 1e-3)]
+
+
+def _followed(seed: int, address: str) -> tuple[dict, float]:
+    result, off = _executed(seed, address)
+    # A machine that stands still solves the virtual branch too late: its force is then not one.
+    assert result["force_within_share"] >= _WITHIN or off <= _OFF_N, (
+        f"within {result['force_within_share']:.3f}, the virtual branch was {off:.2f} N off")
+    return result, off
 
 
 def _executed(seed: int, address: str,
