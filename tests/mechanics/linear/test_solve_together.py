@@ -7,6 +7,7 @@ from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.supernodal import SupernodalFactor
 from limber.mechanics.model import BranchModel
+from limber.sparse import general_factor
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +42,34 @@ def test_forces_in_a_few_places_are_solved_as_any(beam):
 
 
 def test_a_pin_is_solved_for_only_when_it_is_asked_for(beam, monkeypatch):
-    """Whether a state is stable is known without."""
+    """Whether a state is stable is known without; what it takes is known half-way."""
     equations, solved = beam.equations((Grasp.from_mesh(beam.mesh, "pinned"),)), []
-    whole = SupernodalFactor.solve
-    monkeypatch.setattr(SupernodalFactor, "solve",
-                        lambda factor, right: solved.append(right.shape) or whole(factor, right))
+    for name in ("down", "up"):
+        half = getattr(SupernodalFactor, name)
+        monkeypatch.setattr(SupernodalFactor, name, lambda factor, right, name=name, half=half:
+                            solved.append((name, right.shape)) or half(factor, right))
     tangent = equations.tangent(beam, np.zeros_like(beam.mesh.nodes))
     assert tangent.is_positive_definite and not solved
     for _ in range(2):
         tangent.solve(np.ones_like(beam.mesh.nodes))
-    assert solved.count(equations.pin_rows.shape) == 1
+    assert solved.count(("down", equations.pin_rows.shape)) == 1
+    assert ("up", equations.pin_rows.shape) not in solved
+
+
+def test_a_pin_is_solved_for_as_with_a_general_library(beam, monkeypatch):
+    """By halves and whole: the same, with forces, with moves of the pin alone, and with both."""
+    equations = beam.equations((Grasp.from_mesh(beam.mesh, "pinned"),))
+    rng = np.random.default_rng(3)
+    rights, moves = rng.standard_normal((2, *beam.mesh.nodes.shape)), rng.standard_normal((3, 2))
+    cases = [(rights, moves), (rights, None), (np.zeros_like(rights), moves)]
+    tangent = equations.tangent(beam, np.zeros_like(beam.mesh.nodes))
+    halves = [tangent.solve_all(list(right), move) for right, move in cases]
+    general = general_factor(*equations.pattern.entries(), equations.pattern.size)
+    general.factorise(equations.assemble(beam, np.zeros_like(beam.mesh.nodes)))
+    monkeypatch.setattr(tangent, "_factor", general)
+    for (right, move), half in zip(cases, halves, strict=True):
+        whole = tangent.solve_all(list(right), move)
+        assert np.allclose(half, whole, rtol=1e-8, atol=1e-10 * np.abs(whole).max())
 
 
 def test_a_tangent_asked_for_again_is_at_hand_until_another_is_made(beam):

@@ -14,6 +14,7 @@ from limber.mechanics.elements.stiffness import tangent_stiffness
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.linear.factor import Factor, make_factor
 from limber.mechanics.linear.pattern import LaneLayout, Pattern
+from limber.mechanics.linear.supernodal import SupernodalFactor
 from limber.mechanics.materials import Material
 from limber.sparse import NotPositiveDefiniteError
 
@@ -85,13 +86,13 @@ class Tangent:
             return shift == 0.0
 
     @cached_property
-    def _pin_solutions(self) -> np.ndarray:
+    def _pin_halves(self) -> np.ndarray:
         # Not before they are asked for: many a tangent only says whether a state is stable.
-        return self._factor.solve(self.equations.pin_rows)
+        return self._factor.down(self.equations.pin_rows)
 
     @cached_property
-    def _compliance(self) -> np.ndarray:
-        return self.equations.pin_rows.T @ self._pin_solutions
+    def _pin_solutions(self) -> np.ndarray:
+        return self._factor.solve(self.equations.pin_rows)
 
     def solve(self, right: np.ndarray, pin_moves: np.ndarray | None = None) -> np.ndarray:
         """Return the displacement [node_count, 3], 0 at held nodes, for forces ``right``.
@@ -113,18 +114,29 @@ class Tangent:
         """
         equations = self.equations
         order = equations.pattern.order
-        solutions = self._factor.solve(np.stack([right[order].ravel() for right in rights], axis=1))
+        forces = np.stack([right[order].ravel() for right in rights], axis=1)
         if equations.pinned:
             moves = 0.0 if pin_moves is None else np.reshape(
                 pin_moves, (3 * len(equations.pinned), -1))
-            excess = equations.pin_rows.T @ solutions - moves
-            solutions = solutions - self._pin_solutions @ np.linalg.solve(self._compliance, excess)
+            solutions = self._solve_pinned(forces, moves)
+        else:
+            solutions = self._factor.solve(forces)
         results = []
         for right, solution in zip(rights, solutions.T, strict=True):
             result = np.zeros_like(right)
             result[order] = solution.reshape(-1, 3)
             results.append(result)
         return results
+
+    def _solve_pinned(self, forces: np.ndarray, moves: np.ndarray | float) -> np.ndarray:
+        """Return the solutions [size, S] for ``forces``, whose pinned means are ``moves``."""
+        factor, rows = self._factor, self.equations.pin_rows
+        if not isinstance(factor, SupernodalFactor):
+            solutions, pins = factor.solve(forces), self._pin_solutions
+            return solutions - pins @ np.linalg.solve(rows.T @ pins, rows.T @ solutions - moves)
+        # What the pins take is known half-way, and the other half is gone once for all.
+        half, pins = factor.down(forces), self._pin_halves
+        return factor.up(half - pins @ np.linalg.solve(pins.T @ pins, pins.T @ half - moves))
 
 
 class Equations:
@@ -188,12 +200,15 @@ class Equations:
         return known[2]
 
     def tangent(self, model: "BranchModel", displacement: np.ndarray, *,
-                increment: np.ndarray | None = None, viscous: Viscous | None = None,
-                mass_factor: float = 0.0, drag: float = 0.0) -> Tangent:
+                increment: np.ndarray | None = None, strain: np.ndarray | None = None,
+                viscous: Viscous | None = None, mass_factor: float = 0.0,
+                drag: float = 0.0) -> Tangent:
         """Return tangent stiffness plus ``mass_factor`` [1/s^2] times the mass, factorised.
 
         Args:
             increment: The last increment [m], for mixed-point Newton (StVK only).
+            strain: At whose stress the geometric part is taken instead, shape [tet_count, q, 6]
+                (StVK only).
             viscous: Viscous part in motion.
             drag: Part of the mean diagonal that is added to the diagonal.
 
@@ -204,8 +219,8 @@ class Equations:
         # Its memory serves the one that is made now.
         self._known = None
         return self.factorised(self.assemble(
-            model, displacement, increment=increment, viscous=viscous, mass_factor=mass_factor),
-            drag)
+            model, displacement, increment=increment, strain=strain, viscous=viscous,
+            mass_factor=mass_factor), drag)
 
     def mass(self, model: "BranchModel") -> Tangent:
         """Return the factorised mass matrix, for accelerations at the start."""
@@ -228,8 +243,8 @@ class Equations:
         self._spare.append(factor)
 
     def assemble(self, model: "BranchModel", displacement: np.ndarray, *,
-                 increment: np.ndarray | None = None, viscous: Viscous | None = None,
-                 mass_factor: float = 0.0) -> np.ndarray:
+                 increment: np.ndarray | None = None, strain: np.ndarray | None = None,
+                 viscous: Viscous | None = None, mass_factor: float = 0.0) -> np.ndarray:
         """Return the matrix of :meth:`tangent`, lower triangle by columns, shape [value_count].
 
         In the one memory that all assembly of these equations writes to.
@@ -245,6 +260,8 @@ class Equations:
         growth, memory = 1.0, _NO_MEMORY
         if viscous is not None:
             growth, memory = viscous.growth, layout.per_point(viscous.memory)
+        elif strain is not None:
+            memory = layout.per_point(strain - model.strains(displacement))
         mixed = increment is not None and model.material == Material.st_venant_kirchhoff
         tangent_stiffness(for_kernels(displacement),
                           for_kernels(increment) if mixed else _NO_INCREMENT,

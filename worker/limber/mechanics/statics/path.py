@@ -27,6 +27,9 @@ forked branch, 1 % are above; a bow that turns over loses 0.74.
 """
 _SNAP = 1 / 64
 """Part of the way taken when the branch has to snap: chosen, not measured."""
+_FALLS = 0.3
+"""Part of the imbalance that a step with a factor of before may leave. A factor of its own costs
+six times as much and takes off more: chosen, not measured."""
 
 
 class Path:
@@ -75,10 +78,14 @@ class Path:
                  for a, b in zip(self.begin_poses, self.end_poses, strict=True)]
         return self.problem.constraint(poses)[0] + (1 - part) * self.begin_rest, pins
 
-    def run(self, progress: Progress, guess: np.ndarray | None = None) -> StaticResult:
-        """Go the way; where there is a ``guess`` of its end [node_count, 3], from that first."""
+    def run(self, progress: Progress, guess: np.ndarray | None = None,
+            strain: np.ndarray | None = None) -> StaticResult:
+        """Go the way; where there is a ``guess`` of its end [node_count, 3], from that first.
+
+        ``strain`` [tet_count, q, 6] is what goes with it, where that is known.
+        """
         step = 1.0
-        if guess is not None and not self._leap(guess):
+        if guess is not None and not self._leap(guess, strain):
             step = 0.5
         while self.reached < 1.0:
             progress(self.reached, "seeking equilibrium", iteration=self.iterations)
@@ -126,11 +133,13 @@ class Path:
         trial = self.displacement + increment
         trial[held] = target[held]
         diagonal_norm, steady = tangent.diagonal_norm, tangent.is_positive_definite
+        if settings.keeps_factor and steady:
+            trial, increment = self._gone_on(trial, increment, tangent, self.load_at(part))
         # Its memory serves the tangents on the way.
         del tangent
         return self.correct(trial, increment, part, diagonal_norm, steady)
 
-    def _leap(self, guess: np.ndarray) -> bool:
+    def _leap(self, guess: np.ndarray, strain: np.ndarray | None) -> bool:
         """Try to reach the end from near it; return whether that was it."""
         begin = self.displacement
         trial = np.where(self.equations.held[:, None], self.goal.held, guess)
@@ -139,7 +148,7 @@ class Path:
         longest = np.linalg.norm(trial - begin, axis=1).max()
         # No linear step leads there, whose spurious strains mixed points would take off.
         if longest <= self.settings.max_step * self.model.extent and self.correct(
-                trial, np.zeros_like(trial), 1.0, 0.0, True) is not None:
+                trial, np.zeros_like(trial), 1.0, 0.0, True, strain) is not None:
             self.reached = 1.0
             return True
         self.status, self.trouble = Status.stalled, ""
@@ -159,32 +168,29 @@ class Path:
         return tangent.solve(right, pins - now.reshape(-1, 3)) + moved
 
     def correct(self, trial: np.ndarray, increment: np.ndarray, part: float,
-                diagonal_norm: float, steady: bool) -> float | None:
+                diagonal_norm: float, steady: bool, strain: np.ndarray | None = None,
+                ) -> float | None:
         """Iterate from ``trial`` to equilibrium at ``part`` of the way.
 
         Args:
             trial: Displacement [m], shape [node_count, 3], after ``increment``.
             diagonal_norm: Of a tangent near it [N/m]: tells the floor that round-off sets.
             steady: Whether that tangent is positive definite.
+            strain: Where known better than ``trial`` says it, shape [tet_count, q, 6].
 
         Returns:
             The length taken, None if none was found.
         """
-        settings, equations = self.settings, self.equations
-        load = self.load_at(part)
+        settings, load = self.settings, self.load_at(part)
         best, worse = np.inf, 0
         stable = True
         for _ in range(settings.max_iterations):
-            state = self.model.internal(trial)
-            out = load - state.force
-            residual = equations.free_part(out)
-            norm = float(np.linalg.norm(residual))
+            state, residual, norm, reference = self._imbalance(trial, load)
             if not np.isfinite(norm):
                 self.trouble = "the displacements grew without bound"
                 return None
-            reference = float(np.linalg.norm(out - residual) + np.linalg.norm(load))
             self.history.append(norm / reference if reference else 0.0)
-            if norm <= max(settings.tolerance * reference, self._floor(diagonal_norm)):
+            if norm <= self._enough(reference, diagonal_norm):
                 return self._accept(trial, state, part, stable, steady)
             worse = worse + 1 if norm > 0.9 * best else 0
             best = min(best, norm)
@@ -192,30 +198,66 @@ class Path:
                 self.trouble = "Newton's iteration does not converge"
                 return None
             self.iterations += 1
-            solved = self._newton_increment(trial, increment, residual)
+            solved = self._newton_step(trial, increment, strain, load, residual)
             if solved is None:
                 return None
-            increment, stable, diagonal_norm = solved
+            strain = None
+            trial, increment, stable, diagonal_norm = solved
             steady = steady and stable
-            if not self.problem.mixed:
-                increment = self._searched(trial, increment, load, residual)
-            trial = trial + increment
         self.trouble = f"no convergence in {settings.max_iterations} iterations"
         return None
 
-    def _newton_increment(self, trial: np.ndarray, increment: np.ndarray, residual: np.ndarray,
-                          ) -> tuple[np.ndarray, bool, float] | None:
-        """Return Newton's increment, and of its tangent whether it is stable and its norm.
+    def _newton_step(self, trial: np.ndarray, increment: np.ndarray, strain: np.ndarray | None,
+                     load: np.ndarray, residual: np.ndarray,
+                     ) -> tuple[np.ndarray, np.ndarray, bool, float] | None:
+        """Return the state after a step and its increment, and of the tangent whether it is stable
+        and its norm.
 
         The tangent itself is freed: there is never more than one of a large mesh in memory.
         """
+        mixed = self.problem.mixed
         try:
             tangent = self.equations.tangent(
-                self.model, trial, increment=increment if self.problem.mixed else None)
+                self.model, trial, increment=increment if mixed and strain is None else None,
+                strain=strain if mixed else None)
         except NotPositiveDefiniteError:
             self.trouble = "the stiffness has no positive pivots"
             return None
-        return tangent.solve(residual), tangent.is_positive_definite, tangent.diagonal_norm
+        increment = tangent.solve(residual)
+        if not mixed:
+            increment = self._searched(trial, increment, load, residual)
+        trial, stable = trial + increment, tangent.is_positive_definite
+        if self.settings.keeps_factor and stable:
+            trial, increment = self._gone_on(trial, increment, tangent, load)
+        return trial, increment, stable, tangent.diagonal_norm
+
+    def _gone_on(self, trial: np.ndarray, increment: np.ndarray, tangent: Tangent,
+                 load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the state that more steps with the same factor lead to, and the last increment.
+
+        As long as each takes off most of the imbalance; one that does not is not taken.
+        """
+        _, residual, norm, reference = self._imbalance(trial, load)
+        while norm > self._enough(reference, tangent.diagonal_norm):
+            further = tangent.solve(residual)
+            _, residual, left, reference = self._imbalance(trial + further, load)
+            if not left <= _FALLS * norm:
+                break
+            trial, increment, norm = trial + further, further, left
+        return trial, increment
+
+    def _imbalance(self, trial: np.ndarray, load: np.ndarray,
+                   ) -> tuple[InternalState, np.ndarray, float, float]:
+        """Return the state at ``trial``, what is out of balance [N], its norm, and that of loads
+        and reactions."""
+        state = self.model.internal(trial)
+        out = load - state.force
+        residual = self.equations.free_part(out)
+        return (state, residual, float(np.linalg.norm(residual)),
+                float(np.linalg.norm(out - residual) + np.linalg.norm(load)))
+
+    def _enough(self, reference: float, diagonal_norm: float) -> float:
+        return max(self.settings.tolerance * reference, self._floor(diagonal_norm))
 
     def _searched(self, trial: np.ndarray, increment: np.ndarray, load: np.ndarray,
                   residual: np.ndarray) -> np.ndarray:
@@ -240,7 +282,8 @@ class Path:
             self.status, self.trouble = Status.inverted, "an element would turn inside out"
             return None
         # The iteration's tangents are of states on the way; of the last the exact one decides.
-        if (part >= 1.0 or not stable) and not self._is_stable(trial):
+        asked = part >= 1.0 or not stable or self.settings.keeps_factor
+        if asked and not self._is_stable(trial):
             self.status, self.trouble = Status.unstable, "the equilibrium found is not stable"
             return None
         if not steady and self._lost(trial, state, part) > _LOST:

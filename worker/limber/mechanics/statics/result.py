@@ -26,6 +26,8 @@ class StaticSettings:
             reported as a false equilibrium.
         snap: Where a path of stable equilibria ends, let the branch snap to another one.
         way_back: Where it snapped, walk back and say whether it ends elsewhere.
+        keeps_factor: Take further steps with a factor that is at hand, as long as each takes off
+            most of the imbalance; every state that is passed is then asked whether it is stable.
     """
 
     tolerance: float = 1e-7
@@ -38,6 +40,7 @@ class StaticSettings:
     verify: bool = False
     snap: bool = True
     way_back: bool = True
+    keeps_factor: bool = False
 
 
 DEFAULT_SETTINGS = StaticSettings()

@@ -53,7 +53,7 @@ def solve_static(model: BranchModel, *, grasp: Grasp | Sequence[Grasp] | None = 
 def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.ndarray, *,
                  nodal_forces: np.ndarray | None = None,
                  start: "StaticResult | np.ndarray | None" = None,
-                 guess: np.ndarray | None = None,
+                 guess: np.ndarray | None = None, guess_strain: np.ndarray | None = None,
                  settings: StaticSettings = DEFAULT_SETTINGS,
                  progress: Progress = SILENT) -> list[StaticResult]:
     """Find the equilibrium at each of ``poses`` [m, 6] in turn, each from the one before.
@@ -63,6 +63,8 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
     Args:
         guess: Displacement [m] that the first pose may have, shape [node_count, 3]: sought from
             there first, and by the way from ``start`` if no stable equilibrium is near.
+        guess_strain: Strain that the branch may have there, shape [tet_count, q, 6], where that is
+            better known: a guess between states has strain of its own, which is not theirs.
     """
     problem = StaticProblem(model, grasp, True, settings)
     displacement = problem.displacement_of(start)
@@ -71,7 +73,7 @@ def follow_poses(model: BranchModel, grasp: Grasp | Sequence[Grasp], poses: np.n
         progress(number / len(poses), "following poses", pose=number)
         goal = problem.target(pose, None, nodal_forces)
         result = _walked(Path(problem, displacement, goal, pose), SILENT,
-                         guess if number == 0 else None)
+                         *((guess, guess_strain) if number == 0 else ()))
         if settings.verify and result.converged:
             result = _verified(problem, result, goal, pose, SILENT)
         if result.converged:
@@ -97,9 +99,10 @@ def solve_prescribed(model: BranchModel, displacement: np.ndarray, *,
     return _walked(Path(problem, begin, replace(goal, held=held), None), SILENT)
 
 
-def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None) -> StaticResult:
+def _walked(path: Path, progress: Progress, guess: np.ndarray | None = None,
+            strain: np.ndarray | None = None) -> StaticResult:
     """Return where a way leads, with what is doubtful about it."""
-    result = path.run(progress, guess)
+    result = path.run(progress, guess, strain)
     asked = result.converged and path.settings.way_back
     doubt = doubt_of(path, result) if asked else ""
     if not doubt:
