@@ -22,6 +22,7 @@ class Bow:
     def __init__(self, hold):
         self.hold = hold
         self.reach = SimpleNamespace(arc_length=LENGTH)
+        self.model = SimpleNamespace(strains=lambda displacement: 0.0 * displacement)
 
     def side(self, place, before):
         if place[2] >= 0.0 or abs(place[0]) > self.hold:
@@ -30,8 +31,8 @@ class Bow:
 
     def follow(self, places, start, guess=None, *, snap):
         """Where a guess is near what stays on its side, the branch is there at once."""
-        if guess is not None and abs(guess[0, 0]) > 0.5:
-            start = np.array([[np.sign(guess[0, 0]), *places[0]]])
+        if guess is not None and abs(guess.displacement[0, 0]) > 0.5:
+            start = np.array([[np.sign(guess.displacement[0, 0]), *places[0]]])
         side, here = start[0, 0], start[0, 1:]
         for place in places:
             for part in np.linspace(0.0, 1.0, 21)[1:]:

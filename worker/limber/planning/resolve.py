@@ -10,6 +10,7 @@ from limber.mechanics import StaticResult
 from limber.planning.cost import PathMeasures, measure_path, resample
 from limber.planning.field.energy_field import LOADS
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.guess import straight_on
 from limber.progress import SILENT, Progress
 
 _APPROACH_STEP = 0.02  # [m] between poses on the way from rest to the start
@@ -142,12 +143,13 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
                  progress: Progress = SILENT) -> ResolvedPath:
     """Solve the branch along ``path`` [n, 3], coming from rest by ``approach`` [k, 3]."""
     before, unsolved, reasons = [grasp_model.rest], [], []
-    good, state = [], grasp_model.rest.displacement
+    good, last, state = [], None, grasp_model.rest.displacement
     ahead = resample(approach, _APPROACH_STEP)[1:-1]
     is_whole = True
     for number, point in enumerate(np.concatenate([ahead, path])):
         progress(number / (len(ahead) + len(path)), "path on the full model")
-        result = grasp_model.follow(point[None], state)[0]
+        guess = None if last is None else straight_on(grasp_model, last, state, point)
+        result = grasp_model.follow(point[None], state, guess)[0]
         if reason := refusal(result):
             unsolved.append(point)
             reasons.append(str(reason))
@@ -157,7 +159,7 @@ def resolve_path(grasp_model: GraspModel, path: np.ndarray, approach: np.ndarray
                 break
             continue
         (before if number < len(ahead) else good).append(result)
-        state = result.displacement
+        last, state = state, result.displacement
     return ResolvedPath(
         SolvedPoses.of(grasp_model, good or before[-1:]), SolvedPoses.of(grasp_model, before),
         np.array(unsolved).reshape(-1, 3), tuple(reasons), is_whole)

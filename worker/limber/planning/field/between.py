@@ -17,6 +17,7 @@ from scipy.spatial import Delaunay
 from limber.planning.field.chart import Chart
 from limber.planning.field.crew import Crew
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.guess import foretold_by, half_way
 from limber.planning.field.solved import Solved, taken
 from limber.progress import SILENT, Progress
 
@@ -150,21 +151,21 @@ def _half_way(grasp_model: GraspModel, first: Solved, second: Solved, middle: np
               ) -> Solved | None:
     """Return the state at ``middle`` [1, 3] that both neighbours come to, None if there is none."""
     found, apart = None, jump(first, second)
-    if (guess := _hermite(first, second, middle[0])) is not None:
+    if (guess := half_way(grasp_model, first, second, middle[0])) is not None:
         there = grasp_model.follow(middle, first.displacement, guess, snap=False)[0]
         if not refusal(there):
             found = taken(grasp_model, there)
             if max(jump(first, found), jump(found, second)) < _NEARER * apart:
                 return found
-    back = grasp_model.follow(middle, second.displacement, second.foretold(middle[0]),
-                              snap=False)[0]
+    back = grasp_model.follow(middle, second.displacement,
+                              foretold_by(grasp_model, second, middle[0]), snap=False)[0]
     if refusal(back):
         return None
     back = taken(grasp_model, back)
     if found is not None and _are_one(found, back, grasp_model):
         return found
-    there = grasp_model.follow(middle, first.displacement, first.foretold(middle[0]),
-                               snap=False)[0]
+    there = grasp_model.follow(middle, first.displacement,
+                               foretold_by(grasp_model, first, middle[0]), snap=False)[0]
     if refusal(there) or not _are_one(taken(grasp_model, there), back, grasp_model):
         return None
     return back
@@ -173,16 +174,6 @@ def _half_way(grasp_model: GraspModel, first: Solved, second: Solved, middle: np
 def _are_one(first: Solved, second: Solved, grasp_model: GraspModel) -> bool:
     off = np.abs(first.shape[3:] - second.shape[3:]).max()
     return bool(off <= _ONE * grasp_model.reach.arc_length)
-
-
-def _hermite(first: Solved, second: Solved, place: np.ndarray) -> np.ndarray | None:
-    """Return the displacement near half-way by values and slopes at both, None without slopes."""
-    straight = 0.5 * (first.pose[:3] + second.pose[:3])
-    told = [(one.foretold(place), one.foretold(one.pose[:3] + place - straight))
-            for one in (first, second)]
-    if any(guess is None for pair in told for guess in pair):
-        return None
-    return 0.25 * sum(guess for pair in told for guess in pair)
 
 
 def _nearest(place: np.ndarray, others: np.ndarray) -> float:

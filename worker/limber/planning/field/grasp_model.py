@@ -30,7 +30,7 @@ from limber.mechanics.strain import peak_load
 from limber.sparse import NotPositiveDefiniteError
 
 # A pose that needs finer steps than this lies beyond a snap: it is rejected, and soon.
-_SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False)
+_SETTINGS = StaticSettings(min_step=1 / 64, tolerance=1e-6, way_back=False, keeps_factor=True)
 _STEADY = replace(_SETTINGS, snap=False)
 _DIFFERENCE = 1e-6  # [m] of the grasp's moves by which rotations are differentiated
 
@@ -65,6 +65,15 @@ class Reach:
         chord = float(np.linalg.norm(centre - base))
         return cls(base, max(float(skeleton.arc_length[nearest]), chord), chord,
                    skeleton.nodes[path[-1]], along / np.linalg.norm(along))
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What a branch may look like: ``displacement`` [m], shape [node_count, 3], and the ``strain``
+    that goes with it, [tet_count, q, 6]; None where either is not known."""
+
+    displacement: np.ndarray | None = None
+    strain: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -109,17 +118,18 @@ class GraspModel:
         """Where the grasp is at rest [m], shape [3]."""
         return self.pose(self.rest.displacement)[:3]
 
-    def follow(self, positions: np.ndarray, start: np.ndarray, guess: np.ndarray | None = None,
+    def follow(self, positions: np.ndarray, start: np.ndarray, guess: Guess | None = None,
                *, snap: bool = True) -> list[StaticResult]:
         """Take the grasp through ``positions`` [m, 3] slowly, from displacement ``start``.
 
         Args:
-            guess: What the displacement may be at the first of them, shape [node_count, 3].
+            guess: What the branch may look like at the first of them.
             snap: Whether the branch may snap on the way; else it ends there.
         """
         poses = np.hstack([positions, np.zeros_like(positions)])
-        return follow_poses(self.model, self.grasp, poses, start=start, guess=guess,
-                            settings=_SETTINGS if snap else _STEADY)
+        guess = guess or Guess()
+        return follow_poses(self.model, self.grasp, poses, start=start, guess=guess.displacement,
+                            guess_strain=guess.strain, settings=_SETTINGS if snap else _STEADY)
 
     def pulled(self, force: np.ndarray, start: np.ndarray) -> StaticResult:
         """Return the state under a force [3] on the grasp, from displacement ``start``, held."""
@@ -127,7 +137,7 @@ class GraspModel:
         if refusal(loose):
             return loose
         place = self.pose(loose.displacement)[:3]
-        return self.follow(place[None], loose.displacement, loose.displacement)[0]
+        return self.follow(place[None], loose.displacement, Guess(loose.displacement))[0]
 
     def pose(self, displacement: np.ndarray) -> np.ndarray:
         """Return position and natural rotation of the grasped piece, shape [6]."""

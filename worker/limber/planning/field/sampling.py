@@ -185,7 +185,7 @@ def _solve_tree(grasp_model: GraspModel, targets: np.ndarray, numbers: np.ndarra
 
     def attempt(target: int, source: int) -> Solved:
         place, begin = targets[target], states[source]
-        guess = guess_of(states, np.array(positions), place, grasp_model.reach.arc_length)
+        guess = guess_of(grasp_model, states, np.array(positions), place)
         result = grasp_model.follow(place[None], begin.displacement, guess)[0]
         found = taken(grasp_model, result, int(numbers[target]))
         if not found.trouble:
