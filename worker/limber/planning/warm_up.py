@@ -15,7 +15,7 @@ def warm_up(progress: Progress = SILENT) -> None:
     points[0] = 0.0
     energies = 0.5 * (points**2).sum(axis=1)
     samples = GraspSamples(np.hstack([points, 0 * points]), energies, points, points,
-                           np.ones(40), np.empty((0, 6)), np.ones(40))
+                           np.ones(40), np.full((1, 6), 0.9), np.ones(40))
     field = fit_field(samples, np.array([0.0, 0.0, -3.0]), progress=progress.part(0.0, 0.5))
     settings = PlanSettings(iterations=100, engine="own", max_energy=1e3, max_force=1e3)
     plan_pair(field, np.zeros(3), GraspGoal((0.2, 0.0, 0.0), 0.05), settings,
