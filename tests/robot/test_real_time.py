@@ -66,3 +66,19 @@ def test_processors_stay_awake_as_long_as_the_process_runs():
 def test_a_computer_without_that_device_is_told(monkeypatch, tmp_path):
     monkeypatch.setattr("limber.robot.real_time._WAKING", tmp_path / "none")
     assert not keep_awake()
+
+
+_STUCK = """
+import queue, threading, time
+import limber.robot.driver as driver
+driver._LAST_SECONDS = 0.2
+threading.Thread(target=driver._read_orders, args=(queue.SimpleQueue(),), daemon=True).start()
+time.sleep(60)
+"""
+
+
+def test_a_driver_that_is_stuck_ends_when_nobody_gives_it_orders():
+    """Its recorder was killed and its robot closed: it kept a processor busy for minutes."""
+    ended = subprocess.run([sys.executable, "-c", _STUCK], stdin=subprocess.DEVNULL, timeout=30,
+                           check=False)
+    assert ended.returncode == 3

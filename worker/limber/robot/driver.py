@@ -45,6 +45,7 @@ _PROGRAM_SECONDS = 2.0
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
 _LONG_STEP_SECONDS = 0.004
+_LAST_SECONDS = 10.0  # from when nobody gives orders any more; a stop takes one at most
 _LOOP_PRIORITY = 22
 _HELD_UP_SECONDS = 0.02
 _GRACE_SECONDS = 0.015
@@ -507,6 +508,10 @@ def _read_orders(orders: "queue.SimpleQueue[dict[str, Any] | None]") -> None:
         except json.JSONDecodeError:
             orders.put({"order": line.strip()[:40]})
     orders.put(None)
+    # ur-rtde may wait for ever for a robot that went away as well: nobody is left who could end
+    # this process, and it has priority over all others.
+    time.sleep(_LAST_SECONDS)
+    os._exit(3)
 
 
 def main() -> int:
