@@ -19,8 +19,7 @@ class EnergySettings(Settings):
         "agree."))
     field_error: float | None = Field(None, gt=0, description=(
         "Percent that the energy may be off at samples left out of the fit (root mean square over "
-        "theirs); with it the tip and targets may be off by 4 mm at 95 % of them. More poses are "
-        "solved where the field is off most, up to four times --samples."))
+        "theirs): more poses are solved where it is off most, up to four times --samples."))
     deflection: float = Field(0.4, gt=0, le=1.0, description=(
         "Largest distance from rest, as a share of the branch's length up to the grasp."))
     gravity: bool = Field(True, description=(

@@ -61,7 +61,7 @@ _OPTIONAL_SHAPES = {
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
     "axial_forces_n": ("m",),
     "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
-    "force_error": (), "left_out_tip_errors_m": ("m",),
+    "force_error": (),
     **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
        for name, shape in {
            "shape": (), "smoothing": (), "scale": (), "shift": (3,), "centres": (f"{fit} m", 3),
@@ -177,8 +177,6 @@ class EnergyField:
         region: Where the field may be believed.
         errors: On samples left out; see :func:`error_measures`.
         missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 9].
-        tips_missed: How far the tip is off there, or the target that is off most [m], shape [m];
-            nan where the slopes are not known, as at a snap.
     """
 
     samples: GraspSamples
@@ -190,7 +188,6 @@ class EnergyField:
     region: TrustRegion
     errors: dict[str, float]
     missed: np.ndarray
-    tips_missed: np.ndarray
 
     @property
     def rest(self) -> np.ndarray:
@@ -265,7 +262,7 @@ class EnergyField:
             "poses": samples.poses, "energies_j": samples.energies,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
             "strains": samples.strains, "rejected_poses": samples.rejected_poses,
-            "left_out_errors": self.missed, "left_out_tip_errors_m": self.tips_missed,
+            "left_out_errors": self.missed,
             "chart_pivot_m": self.chart.pivot, "chart_radius_m": np.array(self.chart.radius),
             "chart_layers": np.array([[chart.stretch, chart.depth]
                                       for chart in (self.chart, self.shape_chart)]),
@@ -315,14 +312,13 @@ class EnergyField:
             charts = [replace(region.chart, stretch=float(stretch), depth=float(depth))
                       for stretch, depth in arrays["chart_layers"]]
             missed = arrays["left_out_errors"]
-            tips_missed = arrays.get("left_out_tip_errors_m", np.full(len(missed), np.nan))
             errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                               strict=True))
         except (KeyError, ValueError, OSError, TypeError) as error:
             raise InputError(f"{path} is not an energy field ({error}).",
                              "It was not written by `limber energy`, or is damaged.",
                              "Run `limber energy` again with --force.") from error
-        return cls(samples, *charts, *fits, region, errors, missed, tips_missed)
+        return cls(samples, *charts, *fits, region, errors, missed)
 
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
@@ -359,7 +355,7 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
         return float(np.prod([errors[name] for name in _CHOSEN_BY]))
 
     def shape_missed(choice: FitChoice) -> float:
-        size = _tips_missed(bending, choice, chart)[inside]
+        size = np.linalg.norm(_tips_missed(bending, choice, chart)[inside], axis=1)
         return float(np.median(size) * np.quantile(size, _MOST_TIPS))
 
     choice = _least(energy_missed, charts, progress.part(0.0, 0.5))
@@ -385,15 +381,12 @@ def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, f
 
 
 def _tips_missed(samples: GraspSamples, choice: FitChoice, chart: Chart) -> np.ndarray:
-    """Return how far each sample's tip is off in the fit to all the others, or the target that is
-    off most [m], shape [m]."""
+    """Return how far each sample's tip is off in the fit to all the others [m], shape [m, 3]."""
     chart = choice.on(chart)
     slopes = _slopes_on(chart, samples)
-    missed = RadialInterpolant.leave_one_out(
-        chart.map(samples.positions), samples.shape[:, 3:],
-        None if slopes is None else slopes[:, :, 3:],
+    return RadialInterpolant.leave_one_out(
+        chart.map(samples.positions), samples.tips, None if slopes is None else slopes[:, :, 3:6],
         kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, 0]
-    return np.linalg.norm(missed.reshape(len(missed), -1, 3), axis=2).max(axis=1)
 
 
 def _with_slopes(samples: GraspSamples) -> np.ndarray:
@@ -520,13 +513,11 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
                                   **options)
     loads = RadialInterpolant.fit(places, samples.load_table, **options)
     off = -RadialInterpolant.leave_one_out(places, samples.load_table, **options)[:, 0]
-    tips = np.full(len(samples.poses), np.nan)
-    tips[sure] = _tips_missed(bending, bent, region.chart)
-    known = tips[sure][~region.is_face()[sure]]
-    errors["tip_error_median_m"] = float(np.median(known))
-    errors["tip_error_most_m"] = float(np.quantile(known, _MOST))
+    tips = _tips_missed(bending, bent, region.chart)
+    inside = ~region.is_face()[sure]
+    errors["tip_error_median_m"] = float(np.median(np.linalg.norm(tips[inside], axis=1)))
     return EnergyField(samples, chart, shape_chart, energy, shape, loads, region, errors,
-                       np.column_stack([missed, off]), tips)
+                       np.column_stack([missed, off]))
 
 
 def _rows(points: np.ndarray) -> np.ndarray:

@@ -14,8 +14,6 @@ from limber.progress import SILENT, Progress
 
 _ROUND = 0.15  # of the samples are added a round
 _FEWEST = 8
-TIP_ERROR = 0.004
-"""By how much [m] tip and targets may be off at 95 % of the samples, where a bound is asked for."""
 _APART = 0.5  # of the way between two samples, that no other place of a round lies nearer
 _SHARE_PLACES = 20
 """Places of one task; must not depend on how many processes there are."""
@@ -26,17 +24,15 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
             ) -> tuple[Sampled, EnergyField]:
     """Return the field with samples added where it is off most.
 
-    Ends when its error on samples left out (``energy_error``) is at most ``asked``, a share, and
-    tip and targets (``tip_error_most_m``) are no farther off than ``TIP_ERROR``; or there are
-    ``most`` samples, or nothing is left to add.
+    Ends when its error on samples left out (``energy_error``) is at most ``asked``, a share, or
+    there are ``most`` samples, or nothing is left to add.
     """
     begun = len(field.samples.poses)
-    while not good_enough(field, asked) and len(field.samples.poses) < most:
+    while field.errors["energy_error"] > asked and len(field.samples.poses) < most:
         count = len(field.samples.poses)
         progress((count - begun) / max(most - begun, 1), "more poses where the field is off",
                  error=field.errors["energy_error"], samples=count)
-        places, sources = _where_off(
-            field, asked, min(max(_FEWEST, round(_ROUND * count)), most - count))
+        places, sources = _where_off(field, min(max(_FEWEST, round(_ROUND * count)), most - count))
         if not len(places):
             break
         solved = _solved(grasp_model, places, [sampled.displacements[k] for k in sources], workers)
@@ -51,30 +47,13 @@ def refined(grasp_model: GraspModel, sampled: Sampled, field: EnergyField, asked
     return sampled, field
 
 
-def good_enough(field: EnergyField, asked: float) -> bool:
-    """Return whether energy, and tip and targets, are no farther off than they may."""
-    return bool(field.errors["energy_error"] <= asked
-                and field.errors["tip_error_most_m"] <= TIP_ERROR)
-
-
-def _off(field: EnergyField, asked: float) -> np.ndarray:
-    """Return how far each sample is off, energy or tip, as a part of what they may, [m]; 0 on the
-    hull's face, and of what is good enough everywhere."""
-    off = np.zeros(len(field.samples.poses))
-    if field.errors["energy_error"] > asked:
-        usual = float(np.sqrt(np.mean(np.square(field.samples.energies))))
-        off = np.abs(field.missed[:, 0]) / (asked * usual)
-    if field.errors["tip_error_most_m"] > TIP_ERROR:
-        off = np.maximum(off, np.nan_to_num(field.tips_missed) / TIP_ERROR)
-    return np.where(field.region.is_face(), 0.0, off)
-
-
-def _where_off(field: EnergyField, asked: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return places [n, 3] half-way between neighbours where the field is off most, and the sample
+def _where_off(field: EnergyField, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return places [n, 3] half-way between neighbours where the energy is off most, and the sample
     nearest to each, [n]."""
     chart, positions = field.region.chart, field.samples.positions
     flat = chart.map(positions)
-    edges, off = neighbours(flat), _off(field, asked)
+    edges = neighbours(flat)
+    off = np.where(field.region.is_face(), 0.0, np.abs(field.missed[:, 0]))
     apart = np.linalg.norm(flat[edges[:, 0]] - flat[edges[:, 1]], axis=1)
     middles = chart.curved(flat[edges].mean(axis=1))
     chosen: list[int] = []
