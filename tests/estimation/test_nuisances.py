@@ -11,6 +11,7 @@ from limber.errors import WorkError
 from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
 from limber.estimation.doubt.path_error import led_by_path, path_error
 from limber.estimation.fit import fit_pulls
+from limber.estimation.forward import quasi_static
 from limber.estimation.forward.watched import WatchedForward
 from limber.estimation.nuisances import eliminated, in_words, unlikely
 from limber.estimation.objective import Objective
@@ -57,6 +58,26 @@ def objective_of(bench, pull, poisson=0.36):
 def found(small_bench, bad_cell):
     objective = objective_of(small_bench, bad_cell)
     return fit_pulls(objective, objective.space.base, SETTINGS)
+
+
+@pytest.mark.parametrize(("iterations", "most"), [(150, 3), (50, 12)])
+def test_a_branch_that_folds_up_is_given_up_early(small_bench, bad_cell, monkeypatch, iterations,
+                                                  most):
+    """Where all states take many iterations: in its first frames, or before its force settles.
+    What stood before stands again after that."""
+    objective = objective_of(small_bench, bad_cell)
+    free = objective.space.pack(Values(TRUTH, 0.36, 900.0))
+    before, solve, asked = objective.evaluate(free), quasi_static.solve_static, []
+
+    def folding(*arguments, **named):
+        asked.append(1)
+        return replace(solve(*arguments, **named), iterations=iterations)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(quasi_static, "solve_static", folding)
+        assert objective.evaluate(free - [0.4, 0.0, 0.8, 0.0]) is None
+    assert len(asked) <= most
+    assert objective.evaluate(free).objective == pytest.approx(before.objective, rel=0.05)
 
 
 def test_elimination_is_the_joint_least_squares_problem():

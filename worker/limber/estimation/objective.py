@@ -199,6 +199,7 @@ class Objective:
         settling = [index for index, forward in enumerate(self.forwards) if forward.watches_pose]
         if not settling:
             return self._compared(free, values, jacobian)
+        left = sum(self.forwards[index].iteration_limit for index in settling)
         last, part, longest = np.inf, 1.0, LONGEST_MOVE * max(
             float(np.linalg.norm(np.ptp(self.forwards[index].mesh.nodes, axis=0)))
             for index in settling)
@@ -214,7 +215,8 @@ class Objective:
                 found = self._compared(free, values, True) if jacobian else found
                 self.keep_forces()
                 return found
-            if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last:
+            left -= sum(self.forwards[index].iteration_count for index in settling)
+            if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last or left < 0:
                 break
             last, part = moved, min(1.0, longest / moved)
             for index, change in zip(settling, changes, strict=True):

@@ -30,10 +30,14 @@ from limber.recordings.grasping import grasp_on, pose_on
 from limber.recordings.recording import PullEntry
 from limber.sparse import NotPositiveDefiniteError
 
-SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200)
+SETTINGS = StaticSettings(tolerance=1e-6, total_iterations=200, way_back=False)
 """From the state before, an equilibrium takes 3 to 10 iterations, from rest some tens. A branch of
 moduli far too soft, which a fit may try, folds up under its force: that is no step of the fit, and
 looking for where it comes to rest may take minutes."""
+ITERATIONS_A_KEY = 20
+"""So many for each simulated frame beside those that a single one may take: of branches that stood
+12 were the most until the force had settled, in one simulation 4. Under a force that folds a branch
+up nearly every frame asks for hundreds, from one start after the other."""
 FEW_KEYS = 4
 """Simulated frames where only the difference of two pulls is looked at, which varies slowly: with
 4, 6 and 12 what follows for the moduli came out within 1.5 % of each other."""
@@ -90,6 +94,7 @@ class QuasiStaticForward(Forward):
         self._zero = np.zeros(6)
         self.spread = np.empty((len(frames), 0))
         self._memory: list[_Memory | None] = []
+        self.iteration_count = 0
         self.set_key_count(key_count)
 
     def set_key_count(self, count: int) -> None:
@@ -123,6 +128,11 @@ class QuasiStaticForward(Forward):
         return len(self.keys)
 
     @property
+    def iteration_limit(self) -> int:
+        """Iterations after which what is simulated leads nowhere."""
+        return int(SETTINGS.total_iterations) + ITERATIONS_A_KEY * len(self.keys)
+
+    @property
     def mesh(self) -> TetMesh:
         return self._model.mesh
 
@@ -154,6 +164,7 @@ class QuasiStaticForward(Forward):
         before: np.ndarray | None = None
         is_asked = (sensitivities or self.watches_pose) and self.response is None and (
             self.has_force_unknowns)
+        self.iteration_count = 0
         compliances: list[np.ndarray] = []
         for key, drive in enumerate(self._drives):
             memory = self._memory[key]
@@ -361,6 +372,7 @@ class QuasiStaticForward(Forward):
         loads = ({"grasp": self.grasp, "pose": drive} if self.drive == "pose"
                  else {"nodal_forces": drive})
         result = solve_static(model, start=start, settings=SETTINGS, **loads)
+        self.iteration_count += result.iterations
         return result if result.converged else None
 
     def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
@@ -376,6 +388,8 @@ class QuasiStaticForward(Forward):
             starts.append(start)
         starts += [before] if before is not None else []
         for start in [*starts, None]:
+            if self.iteration_count > self.iteration_limit:
+                break
             try:
                 result = self._solve(model, drive, start)
             except NotPositiveDefiniteError:
