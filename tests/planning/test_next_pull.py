@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +78,32 @@ def test_a_pull_elsewhere_tells_more_than_the_same_again(subject):
     after = known.after(first.information)
     again, there = (after.gain(after.after(each.information)) for each in (first, elsewhere))
     assert there > again > 0.0
+
+
+def test_a_few_simulated_frames_tell_as_much_as_all_recorded(subject, monkeypatch):
+    """Of what pulls tell, in each direction; four times as many tell more, but no four times:
+    the cell's errors stay."""
+    choice, known = PullChoice(0.8, 0.5, 0.2), Known.nothing(2)
+
+    def told(count):
+        return expected_pull(choice, subject, subject.start, known,
+                             Cell(frame_count=count)).information
+
+    few, many = told(36), told(144)
+    monkeypatch.setattr(next_pull, "_FRAMES", 36)
+    ratios = np.linalg.eigvals(np.linalg.solve(told(36), few)).real
+    assert np.allclose(ratios, 1.0, atol=0.15)
+    more = np.linalg.eigvals(np.linalg.solve(few, many)).real
+    assert (more > 1.0).all() and (more < 4.0).all()
+
+
+def test_a_new_pull_has_as_many_frames_as_the_last(small_pull):
+    """Its cell too; a swing goes on for longer than a pull."""
+    cell = Cell.of(small_pull)
+    assert cell.frame_count == len(small_pull.observations.times)
+    assert cell.sensor == small_pull.entry.sensor
+    swung = replace(small_pull, entry=small_pull.entry.model_copy(update={"motion": "swing"}))
+    assert Cell.of(swung).frame_count == Cell.of(None).frame_count == Cell().frame_count
 
 
 def test_an_estimate_without_finite_intervals_is_as_none():

@@ -134,7 +134,7 @@ def _suggested(found: Estimate, pulls: list[Pull], subject: Subject,
     """The most telling pull that `limber suggest-pull` finds after an estimate."""
     written = summary(found, settings) | details(found, subject, pulls)
     offered = suggest(subject, found.values, Known.estimated(plain(written)),
-                      Cell.of(pulls[-1].entry), SuggestPullSettings().fractions,
+                      Cell.of(pulls[-1]), SuggestPullSettings().fractions,
                       max_strain=MOST_STRAIN, workers=1)
     return max(offered.pulls, key=lambda pull: pull.bits).choice
 

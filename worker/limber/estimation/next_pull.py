@@ -43,7 +43,8 @@ _PROBE_REACH = 0.15  # of the arc length: at which places and directions are com
 _REACHES = (0.05, 0.1, 0.25, 0.35)  # then tried for the best of them
 _DIRECTIONS = 4
 _GOOD = 2  # places and directions that other reaches are tried for
-_FRAMES = 12
+_FRAMES = 12  # that are simulated, each as sure as all that a recording has in its place
+_RECORDED_FRAMES = 100  # of a recording, where there is none yet
 _SECONDS = 6.0
 
 
@@ -104,15 +105,36 @@ class Known:
 
 @dataclass(frozen=True)
 class Cell:
-    """What a pull would be measured with."""
+    """What a pull would be measured with, and in how many frames."""
 
     sensor: SensorEntry = SensorEntry()  # noqa: RUF009 (frozen)
     calibration: CalibrationEntry = CalibrationEntry()  # noqa: RUF009 (frozen)
+    frame_count: int = _RECORDED_FRAMES
 
     @classmethod
-    def of(cls, entry: PullEntry | None) -> "Cell":
-        """Return the cell of an earlier pull; without one, as one set up with care."""
-        return cls() if entry is None else cls(entry.sensor, calibration_of(entry))
+    def of(cls, pull: Pull | None) -> "Cell":
+        """Return the cell of an earlier pull, which a new one will be as long as; without one, as
+        one set up with care."""
+        if pull is None:
+            return cls()
+        seen, entry = pull.observations, pull.entry
+        is_alike = seen is not None and entry.motion == "quasi_static"
+        return cls(entry.sensor, calibration_of(entry),
+                   len(seen.times) if is_alike else _RECORDED_FRAMES)
+
+    def in_frames(self, count: int) -> "Cell":
+        """Return the cell in which ``count`` frames tell as much as all of this one's.
+
+        What varies from frame to frame averages out; what stays through a recording does not.
+        """
+        part = (count / self.frame_count)**0.5
+        sensor, known = self.sensor, self.calibration
+        torque = sensor.torque_sigma_nm
+        return Cell(sensor.model_copy(update={
+            "position_sigma_m": part * sensor.position_sigma_m,
+            "force_sigma_n": part * sensor.force_sigma_n,
+            "torque_sigma_nm": None if torque is None else part * torque}),
+            known.model_copy(update={"pose_noise_m": part * known.pose_noise_m}), count)
 
 
 @dataclass(frozen=True)
@@ -220,12 +242,13 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
     Raises:
         WorkError: the branch cannot be pulled so.
     """
-    pull, displacements = _without_noise(choice, subject, values, cell)
+    simulated = cell.in_frames(_FRAMES)
+    pull, displacements = _without_noise(choice, subject, values, simulated)
     settings = EstimateSettings(key_frames=4)
     at = replace(subject, start=values, model=_model(subject, values))
     forwards = forwards_of([pull], at, settings)
     space = parameter_space(at, forwards, settings)
-    objective = Objective(forwards, space, force_sigma=[cell.sensor.force_sigma_n])
+    objective = Objective(forwards, space, force_sigma=[simulated.sensor.force_sigma_n])
     evaluation = objective.evaluate(space.pack(values), jacobian=True)
     if evaluation is None:
         raise WorkError("The pull's forces lead nowhere.", "Its branch finds no rest under them.",

@@ -128,13 +128,13 @@ def _state(branch: Branch, settings: SuggestPullSettings) -> tuple[Subject, Valu
 
 
 def _cell(branch: Branch) -> Cell:
-    """Return what the last recorded pull says of its cell."""
+    """Return what the last recorded pull says of its cell, and how many frames it has."""
     from limber.estimation.next_pull import Cell
-    from limber.recordings.recording import read_entry
+    from limber.recordings.recording import read_pull
     from limber.stages.loading import known_pulls
 
     names = known_pulls(branch)
-    return Cell.of(read_entry(branch.path(f"pulls/{names[-1]}/pull.toml")) if names else None)
+    return Cell.of(read_pull(branch.path(f"pulls/{names[-1]}")) if names else None)
 
 
 def _told(found: Suggested, known: Known) -> dict[str, Any]:
