@@ -57,6 +57,9 @@ FIT_POINT_LIMIT = 60_000
 
 _ROOT_SHARE = 0.45  # of the thickest end, from which an end may be the root
 _ROOT_THICK, _ROOT_HEIGHT = 0.25, 0.1  # logarithm of thickness, and share of height, that tell
+_END_POINTS, _END_REACHES = 30, 4  # that tell how thick an end is; over so many times its reach
+# Radii of its carrier up to which a side arm may be a strand around the rim of a ragged foot.
+_STRAND = 5.0
 _ROOT_EVEN = 1.0  # by which two ends may differ, in these, and be as likely
 _NOISY = 0.2  # of the median radius
 
@@ -272,15 +275,16 @@ def _root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, u
     # Spurs would end the walk from a tip early: pruned as from the lowest tip, for now.
     first = int(tips[np.argmin(graph.nodes[tips] @ up)])
     parent = rooted(graph.nodes, graph.edges, first)
-    keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
-    neighbours: list[list[int]] = [[] for _ in graph.nodes]
-    for node in np.flatnonzero(keep & (parent >= 0)):
-        neighbours[node].append(int(parent[node]))
-        neighbours[parent[node]].append(int(node))
+    neighbours = _pruned_neighbours(graph, parent, prune)
     tips = np.array([node for node, near in enumerate(neighbours) if len(near) == 1])
     if root is not None:
         return int(tips[np.argmin(np.linalg.norm(graph.nodes[tips] - root, axis=1))]), None
     thick = _end_thickness(graph, points, neighbours, tips)
+    # Of a thick foot that few points show, contraction leaves strands around its rim: each tells
+    # as little of it as a twig.
+    neighbours = _pruned_neighbours(graph, parent, max(prune, _STRAND))
+    whole = np.array([len(neighbours[tip]) == 1 for tip in tips])
+    thick[whole] = np.maximum(thick[whole], _end_thickness(graph, points, neighbours, tips[whole]))
     able = thick >= _ROOT_SHARE * thick.max()
     height = graph.nodes[tips] @ up / np.linalg.norm(up)
     chosen = int(np.argmin(np.where(able, height, np.inf)))
@@ -293,6 +297,16 @@ def _root_node(graph: CurveGraph, points: np.ndarray, root: np.ndarray | None, u
     return int(tips[chosen]), other
 
 
+def _pruned_neighbours(graph: CurveGraph, parent: np.ndarray, prune: float) -> list[list[int]]:
+    """Neighbours of each node along what is left without spurs."""
+    keep, _ = prune_spurs(graph.nodes, parent, graph.thickness, prune)
+    neighbours: list[list[int]] = [[] for _ in graph.nodes]
+    for node in np.flatnonzero(keep & (parent >= 0)):
+        neighbours[node].append(int(parent[node]))
+        neighbours[parent[node]].append(int(node))
+    return neighbours
+
+
 def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[int]],
                    tips: np.ndarray) -> np.ndarray:
     """How thick each end is [m], shape [tips]; 0 for spurs."""
@@ -300,8 +314,12 @@ def _end_thickness(graph: CurveGraph, points: np.ndarray, neighbours: list[list[
     thick = np.zeros(len(tips))
     for place, tip in enumerate(tips):
         # Contraction may draw a few points of an end far beyond it.
-        chain = end_chain(neighbours, graph.nodes, int(tip), reach + graph.thickness[tip])
-        mine = points[np.isin(graph.owner, chain)]
+        # What few points show of a ragged foot says little: it goes on until there are enough.
+        for way in reach * np.arange(1, _END_REACHES + 1) + graph.thickness[tip]:
+            chain = end_chain(neighbours, graph.nodes, int(tip), way)
+            mine = points[np.isin(graph.owner, chain)]
+            if len(mine) >= _END_POINTS:
+                break
         # Along the chain: contraction leads what is left of a ragged foot around its rim.
         length = np.linalg.norm(np.diff(graph.nodes[chain], axis=0), axis=1).sum()
         if len(mine) < 4:
