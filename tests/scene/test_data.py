@@ -111,6 +111,20 @@ def test_goal_path_and_motion(tmp_path, mesh):
     assert np.linalg.norm(data.arrays["view_direction"]) == pytest.approx(1.0)
 
 
+def test_a_baseline_that_no_tree_found_is_not_called_its(tmp_path, mesh):
+    """Where RRT* found no path the gentle one drawn tight stands in its place, by its own name."""
+    plan = _plan({}, [[0.0, 0.0, 0.3], [0.1, 0.0, 0.3]])
+    summary = json.loads(plan["plans/p.json"]) | {
+        "energy_saved_percent": 3.0, "length_added_percent": 0.0}
+    plan |= {"plans/p-baseline.csv": plan["plans/p.csv"]}
+    for found, title in (({"RRT*": {}}, "RRT*"), ({"eikonal": {}}, "shortest path")):
+        told = json.dumps(summary | {"paths_on_field": found})
+        info = scene_data(_branch(tmp_path / title[:4], mesh,
+                                  plan__p=plan | {"plans/p.json": told})).info
+        assert info["paths"]["baseline"]["title"] == title
+        assert f"energy -3 %, length +0 % against {title}" in info["notes"]
+
+
 def test_search_trees(tmp_path, mesh):
     """Nodes and parents of each planner's tree; a plan without them has none, a circle is named."""
     table = "planner,x_m,y_m,z_m,parent\nRRT*,0,0,0.3,-1\nRRT*,0.1,0,0.3,0\nRRT*,0,0.1,0.3,{}\n"

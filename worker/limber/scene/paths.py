@@ -33,7 +33,10 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     summary = read_plan_summary(
         branch.require(f"plans/{plan}.json", f"plan --name {plan}"))
     planned = "gentle" if summary.get("planner") == "eikonal" else "D-RRT*"
-    for key, name, title in (("plan", plan, planned), ("baseline", f"{plan}-baseline", "RRT*")):
+    # Where its tree found none, the baseline is the gentle path drawn tight.
+    compared = summary.get("paths_on_field")
+    shortest = "RRT*" if compared is None or "RRT*" in compared else "shortest path"
+    for key, name, title in (("plan", plan, planned), ("baseline", f"{plan}-baseline", shortest)):
         if not branch.has(f"plans/{name}.csv"):
             continue
         table = read_columns(branch.path(f"plans/{name}.csv"), _POSITION, "the table of a path")
@@ -49,7 +52,7 @@ def add_plan(data: SceneData, branch: Branch, plan: str | None) -> str | None:
     saved, added = summary.get("energy_saved_percent"), summary.get("length_added_percent")
     if saved is not None and added is not None:
         data.info["notes"].append(f"energy {round(-saved):+d} %, length {round(added):+d} % "
-                                  "against RRT*")
+                                  f"against {shortest}")
     return plan
 
 
