@@ -28,12 +28,15 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.reduced.model import FORMAT, ReducedModel, build_reduced
 from limber.mechanics.reduced.state import ReducedSettings
-from limber.mechanics.reduced.training import Snapshots
+from limber.mechanics.reduced.training import Snapshots, TrainingSettings
 from limber.progress import SILENT, Progress
 from limber.reading import read_arrays
 
 LIMIT_BYTES = 2 << 30
 """How much all models of a folder may take: a dozen of a branch of some thousand tetrahedra."""
+SHARED = ReducedSettings(size=80, vibration_count=1, field_count=130, training=TrainingSettings(
+    grasp_count=160, young_spread=1.0))
+"""What is learnt of a branch whose moduli are known, where nobody asks otherwise."""
 SNAPSHOT_PREFIX = "snapshot_"
 _LEFT_OVER_SECONDS = 24 * 3600.0
 _WAIT_SECONDS = 0.5

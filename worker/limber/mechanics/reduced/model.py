@@ -46,10 +46,13 @@ from limber.mechanics.reduced.training_poses import TrainingPoses
 from limber.progress import SILENT, Progress
 from limber.reading import read_arrays
 
-FORMAT = 3
+FORMAT = 4
 _STATIC = ReducedStaticSettings()
 _DEFAULT = ReducedSettings()
 _NO_INCREMENT = np.empty(0)
+_LOST = 0.25
+"""Part of the potential's change in a step that its work may leave open before the step is taken
+for a jump: as for the full model (limber.mechanics.statics.path)."""
 _LEADING = 20
 """Modes that tell whether a state is like those of the training: chosen, not measured."""
 
@@ -89,6 +92,9 @@ class ReducedModel:
         young_spread: Factor in Young's modulus within which the training sampled.
         extent: Diagonal of the branch's bounding box [m].
         error: Held-out errors measured when it was built (limber.mechanics.reduced.refresh).
+        poisson: Poisson's ratio, where it is another than the training's.
+        strain_fields: What strain is made of, shape [tet_count, q, 6, m]; None where it was not
+            kept, and :meth:`strains` is not to be had.
     """
 
     grasp: Grasp
@@ -107,6 +113,7 @@ class ReducedModel:
     extent: float
     error: dict[str, float] = field(default_factory=dict)
     poisson: float | None = None
+    strain_fields: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.held = GraspCoordinates(self.grasp)
@@ -191,6 +198,15 @@ class ReducedModel:
         """Return that energy with the carried weight's [J]."""
         return self.strain_energy(q) + 0.5 * float(q @ self.weight_stiffness @ q)
 
+    def strains(self, q: np.ndarray) -> np.ndarray:
+        """Return the strain at the quadrature points, [tet_count, q, 6] (00 11 22 01 02 12).
+
+        As the model assumes it: a tenth as far off the full model's as that of the displacement.
+        """
+        self.strain_energy(q)
+        shares = np.linalg.solve(self.root.T, self._work.strain).astype(np.float32)
+        return (self.strain_fields @ shares).astype(float)
+
     def displacement_of(self, q: np.ndarray) -> np.ndarray:
         """Return the displacement of all nodes [m], shape [node_count, 3]."""
         return np.tensordot(q, self.basis.columns, 1)
@@ -229,6 +245,40 @@ class ReducedModel:
                     or iterations >= settings.iteration_limit):
                 break
         return self._state(best, pose, load, iterations, began, settings)
+
+    def followed(self, start: np.ndarray, pose: np.ndarray,
+                 settings: ReducedStaticSettings = _STATIC) -> ReducedState:
+        """Return the equilibrium that a pinned grasp comes to from coordinates ``start`` [size].
+
+        Unlike :meth:`solve_static` it looks for no other, and goes in steps so short that none
+        jumps to another; where one would, the state is not converged.
+        """
+        began, pose = time.perf_counter(), check_pose(pose)
+        at_pose = np.concatenate([self.grasp.centre + start[:self.basis.lift_count], pose[3:]])
+        found = self._follow(at_pose, start, pose, self.load, settings, settings.iteration_limit,
+                             steadily=True)
+        return self._state(found, pose, self.load, found.iterations, began, settings)
+
+    def pulled(self, start: np.ndarray, force: np.ndarray,
+               settings: ReducedStaticSettings = _STATIC) -> ReducedState | None:
+        """Return the equilibrium under a force [3] on a pinned grasp, from coordinates ``start``
+        [size], held there; None where the way ends before, as at a snap."""
+        count = self.basis.lift_count
+        begin = (self.energy_force(start)[1] - self.load)[:count]
+        q, reached, step = start, 0.0, 1.0
+        while reached < 1.0:
+            part = min(1.0, reached + step)
+            load = self.load.copy()
+            load[:count] += begin + part * (force - begin)
+            found = self._newton(q, None, load, settings, settings.max_iterations)
+            if found.converged and self._came_from(q, found):
+                q, reached = found.q, part
+                continue
+            step /= 2
+            if step < 0.5**settings.max_halvings:
+                return None
+        place = self.grasp.centre + q[:count]
+        return self.followed(q, np.concatenate([place, np.zeros(3)]), settings)
 
     def sensitivities(self, state: ReducedState) -> ReducedSensitivities:
         """Differentiate a converged state to log Young's modulus at each control point."""
@@ -280,8 +330,10 @@ class ReducedModel:
         return [own, *near] if far[0] <= 2 * far[1] else [near[0], own, *near[1:]]
 
     def _follow(self, at_pose: np.ndarray, q: np.ndarray, pose: np.ndarray, load: np.ndarray,
-                settings: ReducedStaticSettings, most: int) -> "_Found":
-        """Newton to the pose in ``most`` iterations; halves the way where that fails."""
+                settings: ReducedStaticSettings, most: int, *, steadily: bool = False,
+                ) -> "_Found":
+        """Newton to the pose in ``most`` iterations; halves the way where that fails, ``steadily``
+        also where the branch may have jumped."""
         iterations, reached, step = 0, 0.0, 1.0
         while True:
             part = min(1.0, reached + step)
@@ -289,7 +341,8 @@ class ReducedModel:
             found = self._newton(q, self.held.at(goal), load, settings,
                                  min(settings.max_iterations, most - iterations))
             iterations += found.iterations
-            sound = found.converged and found.novelty < 4 * settings.novelty_limit
+            sound = (found.converged and found.novelty < 4 * settings.novelty_limit
+                     and not (steadily and not self._came_from(q, found)))
             if sound and part == 1.0:
                 return replace(found, iterations=iterations)
             if iterations >= most:
@@ -301,16 +354,32 @@ class ReducedModel:
             if step < 0.5**settings.max_halvings:
                 return replace(found, converged=False, iterations=iterations)
 
-    def _newton(self, q: np.ndarray, held: np.ndarray, load: np.ndarray,
+    def _came_from(self, q: np.ndarray, found: "_Found") -> bool:
+        """Whether an equilibrium follows on the one at ``q``: every tangent on the way to it was
+        positive definite, or the potential changed by as much as the gripper worked."""
+        if found.steady:
+            return True
+        count, energies, forces = self.basis.lift_count, [], []
+        for end in (q, found.q):
+            energy, force = self.energy_force(end)
+            energies.append(energy - float(self.load @ end))
+            forces.append((force - self.load)[:count])
+        change = energies[1] - energies[0]
+        work = 0.5 * float((forces[0] + forces[1]) @ (found.q - q)[:count])
+        return work - change <= _LOST * (abs(work) + abs(change))
+
+    def _newton(self, q: np.ndarray, held: np.ndarray | None, load: np.ndarray,
                 settings: ReducedStaticSettings, most: int) -> "_Found":
-        count, q = self.basis.lift_count, q.copy()
-        move, increment = held - q[:count], None
+        """Iterate with the grasp's coordinates ``held``, or free where they are not."""
+        count, q = 0 if held is None else self.basis.lift_count, q.copy()
+        move, increment, steady = None if held is None else held - q[:count], None, True
         for iteration in range(most):
             energy, force, tangent = self.tangent(q, increment)
             right = load[count:] - force[count:]
             if move is not None:
                 right = right - tangent[count:, :count] @ move
             step, stable = solved_raised(tangent[count:, count:], right)
+            steady = steady and stable
             increment = np.concatenate([np.zeros(count) if move is None else move, step])
             q = q + increment
             gain = 0.5 * abs(right @ step)
@@ -319,7 +388,7 @@ class ReducedModel:
             if move is None and gain <= settings.tolerance * max(energy, 1e-12):
                 novelty = float((np.abs(q[self._known]) / self._largest[self._known]).max())
                 return _Found(q, stable, novelty, iteration + 1,
-                              self.energy(q) - float(load @ q))
+                              self.energy(q) - float(load @ q), steady)
             move = None
         return _Found(q, False, np.inf, most, np.inf)
 
@@ -355,6 +424,8 @@ class ReducedModel:
             "training_young": self.training_young, "energies": self.energies,
             "young_spread": self.young_spread, "extent": self.extent,
             "error_names": list(self.error), "error_values": list(self.error.values())}
+        if self.strain_fields is not None:
+            arrays["strain_fields"] = self.strain_fields
         with open(path, "wb") as stream:
             np.savez(stream, **arrays, **(beside or {}))
 
@@ -382,7 +453,8 @@ class ReducedModel:
                    arrays["weight_stiffness"], arrays["mass"],
                    RayleighDamping(*arrays["damping"]), arrays["control_young"],
                    arrays["poses"], arrays["training_young"], arrays["energies"],
-                   float(arrays["young_spread"]), float(arrays["extent"]), error)
+                   float(arrays["young_spread"]), float(arrays["extent"]), error,
+                   strain_fields=arrays.get("strain_fields"))
 
 
 @dataclass(frozen=True)
@@ -392,6 +464,7 @@ class _Found:
     novelty: float
     iterations: int
     potential: float
+    steady: bool = False  # every tangent on the way was positive definite
 
     def agrees(self, other: "_Found") -> bool:
         """Whether both are the same equilibrium."""
@@ -429,22 +502,26 @@ def build_reduced(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                              vibration_count=training.vibration_count,
                              progress=progress.part(0.0, 0.9))
     progress(0.9, "reducing", snapshots=len(snapshots))
-    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings)
+    reduced = reduce_snapshots(model, grasp, weights, control_young, snapshots, settings,
+                               keeps_strain=True)
     progress(1.0, "reduced model ready", size=reduced.size)
     return reduced, snapshots
 
 
 def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
                      control_young: np.ndarray, snapshots: Snapshots,
-                     settings: ReducedSettings) -> ReducedModel:
-    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`."""
+                     settings: ReducedSettings, *, keeps_strain: bool = False) -> ReducedModel:
+    """Return the reduced model of given full solutions; arguments as in :func:`build_reduced`.
+
+    ``keeps_strain``: Whether :meth:`ReducedModel.strains` is wanted, which doubles its size.
+    """
     control_young = np.asarray(control_young, float)
     if not settings.vibration_count:
         snapshots = snapshots.without_vibrations()
     basis = make_basis(model, grasp, snapshots, settings.size,
                        settings.vibration_count if len(snapshots.vibrations) else 0)
-    polynomial = make_polynomial(model, basis, weights, control_young, snapshots,
-                                 settings.field_count)
+    polynomial, fields = make_polynomial(model, basis, weights, control_young, snapshots,
+                                         settings.field_count, keeps_fields=keeps_strain)
     flat = basis.columns.reshape(basis.size, -1)
     spread = float(np.exp(np.abs(np.log(snapshots.young / control_young)).max()))
     weight = model.weight_stiffness
@@ -453,7 +530,7 @@ def reduce_snapshots(model: BranchModel, grasp: Grasp, weights: np.ndarray,
     return ReducedModel(
         grasp, model.mesh.nodes, basis, polynomial, flat @ model.weight_force.ravel(), carried,
         reduced_mass(model, basis), model.damping, control_young, snapshots.poses,
-        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent)
+        snapshots.young, snapshots.energy, max(spread, 1.0), model.extent, strain_fields=fields)
 
 
 def solved_raised(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, bool]:

@@ -173,8 +173,9 @@ def compile_kernels() -> None:
 
 def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
                     control_young: np.ndarray, snapshots: Snapshots | None,
-                    field_count: int | None) -> StrainPolynomial:
-    """Return the strain polynomial of a basis.
+                    field_count: int | None, *, keeps_fields: bool = False,
+                    ) -> tuple[StrainPolynomial, np.ndarray | None]:
+    """Return the strain polynomial of a basis, and the fields if they are wanted.
 
     Args:
         weights: From control points to tetrahedra, shape [tet_count, K].
@@ -182,6 +183,8 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
             product takes, shape [K].
         snapshots: Whose strains the fields are made of.
         field_count: Number of strain fields; None: all, no projection.
+        keeps_fields: Whether to return them, single precision, shape [tet_count, q, 6, m] (00 11 22
+            01 02 12); their sum by the polynomial's e is the strain.
 
     Raises:
         InputError: the material is not St. Venant-Kirchhoff.
@@ -197,7 +200,7 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
     else:
         sources = _strain_sources(model, snapshots)
         transform = _leading_fields(points, sources, field_count)
-    return _projected(points, basis, sources, transform)
+    return _projected(points, basis, sources, transform, keeps_fields)
 
 
 def reduced_mass(model: BranchModel, basis: Basis) -> np.ndarray:
@@ -352,16 +355,20 @@ def _all_fields(points: _Points, basis: Basis) -> np.ndarray:
 
 
 def _projected(points: _Points, basis: Basis, sources: _Sources | None,
-               transform: np.ndarray) -> StrainPolynomial:
+               transform: np.ndarray, keeps_fields: bool,
+               ) -> tuple[StrainPolynomial, np.ndarray | None]:
     count, regions = transform.shape[1], points.weights.shape[1]
     coupling = 0.0
     own = np.zeros((count, count))
     by_lambda = np.zeros((regions, count, count))
     by_mu = np.zeros((regions, count, count))
+    kept = []
     for chunk in points.chunks():
         terms = _terms(points, basis, chunk)
         strain = terms if sources is None else sources.strains(points, chunk)
         fields = strain @ transform
+        if keeps_fields:
+            kept.append((fields / _SHEAR[:, None]).astype(np.float32))
         flat = fields.reshape(-1, count)
         stress = points.stress(fields, chunk).reshape(flat.shape)
         coupling = coupling + stress.T @ terms.reshape(len(flat), -1)
@@ -373,18 +380,22 @@ def _projected(points: _Points, basis: Basis, sources: _Sources | None,
             mu = part * points.per_point(points.ratio[1], chunk)
             by_lambda[k] += trace.T @ (lam[:, None] * trace)
             by_mu[k] += 2 * flat.T @ (np.repeat(mu, 6)[:, None] * flat)
-    return _normalised(points, basis, coupling, own, by_lambda, by_mu)
+    inverse = _orthonormal(own)
+    coupling = inverse @ coupling
+    size = basis.size
+    polynomial = StrainPolynomial(
+        np.ascontiguousarray(coupling[:, :size]), np.ascontiguousarray(coupling[:, size:]),
+        inverse @ by_lambda @ inverse.T, inverse @ by_mu @ inverse.T, points.poisson)
+    if not keeps_fields:
+        return polynomial, None
+    fields = np.concatenate(kept) @ inverse.T.astype(np.float32)
+    return polynomial, fields.reshape(*points.model.weights.shape, 6, len(inverse))
 
 
-def _normalised(points: _Points, basis: Basis, coupling: np.ndarray, own: np.ndarray,
-                by_lambda: np.ndarray, by_mu: np.ndarray) -> StrainPolynomial:
-    """Make the fields orthonormal, so that coefficients are what the functionals measure."""
+def _orthonormal(own: np.ndarray) -> np.ndarray:
+    """Return what makes fields of products ``own`` orthonormal, so that coefficients are what the
+    functionals measure, shape [m, fields]."""
     scale = 1 / np.sqrt(np.diag(own))
     values, vectors = np.linalg.eigh((own + own.T) / 2 * scale * scale[:, None])
     keep = values > _ALIKE
-    inverse = (vectors[:, keep] / np.sqrt(values[keep])).T * scale
-    coupling = inverse @ coupling
-    size = basis.size
-    return StrainPolynomial(
-        np.ascontiguousarray(coupling[:, :size]), np.ascontiguousarray(coupling[:, size:]),
-        inverse @ by_lambda @ inverse.T, inverse @ by_mu @ inverse.T, points.poisson)
+    return (vectors[:, keep] / np.sqrt(values[keep])).T * scale
