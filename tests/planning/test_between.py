@@ -19,6 +19,8 @@ class Bow:
     """A branch that stands straight above z = 0; pushed below, its tip goes to one side, +1 or -1,
     and stays there unless it is pulled straight or drawn over by more than ``hold`` [m]."""
 
+    needs_guess = True
+
     def __init__(self, hold):
         self.hold = hold
         self.reach = SimpleNamespace(arc_length=LENGTH)

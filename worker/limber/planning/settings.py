@@ -13,6 +13,7 @@ class EnergySettings(Settings):
     groups: ClassVar[Groups] = {
         "samples": ("samples", "field_error", "deflection", "seed"),
         "material": ("gravity",),
+        "solver": ("forward",),
     }
     samples: int = Field(225, ge=30, description=(
         "Grasp positions to solve: two thirds lie evenly, the others where neighbours do not "
@@ -25,6 +26,10 @@ class EnergySettings(Settings):
     gravity: bool = Field(True, description=(
         "The branch bears its own weight, and was scanned so. Otherwise it has no weight."))
     seed: int = Field(0, ge=0, description="Of the sampled positions.")
+    forward: Literal["full", "reduced"] = Field("full", description=(
+        "reduced: the model that `limber session --mode pinned` learns, kept for both and learnt "
+        "first where there is none; each of its states is corrected once by the full model, which "
+        "solves those in doubt."))
 
 
 class PlanSettings(Settings):

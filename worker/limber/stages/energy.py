@@ -23,6 +23,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
         WorkError: too few poses could be solved.
     """
     from limber.planning.field.energy_field import fit_field
+    from limber.planning.field.learnt import LearntGraspModel
     from limber.planning.field.refining import refined
     from limber.planning.field.sampling import energy_inputs, sample_field
     from limber.stages.loading import load_grasp_model
@@ -33,6 +34,8 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
     if not force and branch.is_current("energy", settings, digests=digests):
         return branch.manifest.stages["energy"].result
     with branch.stage("energy", settings, digests=digests) as stage:
+        if settings.forward == "reduced":
+            grasp_model = LearntGraspModel.learnt(grasp_model, progress=progress.part(0.0, 0.02))
         progress(0.0, "rest state")
         sampled = sample_field(grasp_model, settings, workers=workers,
                                progress=progress.part(0.02, 0.7))
@@ -61,6 +64,7 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
             taut_count=sampled.taut_count,
             energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
+            forward=settings.forward, reduced_count=int(samples.reduced.sum()),
             errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
             chart_stretch=field.chart.stretch,
             chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,

@@ -48,7 +48,7 @@ _MOST = 0.95  # of the samples are no farther off
 _MOST_TIPS = 0.9  # likewise; what is beyond lies where the branch may go aside either way
 _OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
-             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n"}
+             "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
 LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
 """What a pose loads besides energy and force: largest strain and stress [Pa] by magnitude; the
 gripper's force along the branch [N], outward positive, and its torque [Nm]; how close the branch is
@@ -59,7 +59,7 @@ _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_
 _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
-    "axial_forces_n": ("m",),
+    "axial_forces_n": ("m",), "reduced": ("m",),
     "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
     "force_error": (),
     **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
@@ -93,6 +93,8 @@ class GraspSamples:
         shape_slopes: Slopes of natural rotation, tip and targets to the grasp's position, shape
             [m, 3, 6 + 3 targets].
         axial_forces: Part of the force along the branch at the grasp, outward [N], shape [m].
+        reduced: Which the reduced model found, corrected once by the full one; the others, and all
+            of a file that does not say it, the full model alone; shape [m].
         closeness: To the obstacles that a plan is made among, shape [m]; in no file.
     """
 
@@ -109,6 +111,7 @@ class GraspSamples:
     stresses: np.ndarray | None = None
     shape_slopes: np.ndarray | None = None
     axial_forces: np.ndarray | None = None
+    reduced: np.ndarray | None = None
     closeness: np.ndarray | None = None
 
     @property
@@ -138,6 +141,8 @@ class GraspSamples:
 
     def joined(self, other: "GraspSamples") -> "GraspSamples":
         """Return these samples and those of ``other`` behind them."""
+        if self.reduced is not None and other.reduced is None:
+            other = replace(other, reduced=np.zeros(len(other.poses), bool))
         return replace(self, **{
             name: np.concatenate([values, getattr(other, name)])
             for name, values in vars(self).items()

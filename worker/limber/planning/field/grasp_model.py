@@ -9,6 +9,7 @@ gripper that turns otherwise bends the branch more than planned here.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -84,7 +85,10 @@ class GraspModel:
         branch: As it hangs, or without weight.
         grasp: Pinned.
         reach: Where the grasp may go.
+        needs_guess: Whether :meth:`follow` is quicker with a guess.
     """
+
+    needs_guess: ClassVar[bool] = True
 
     branch: LoadedBranch
     grasp: Grasp

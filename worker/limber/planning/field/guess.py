@@ -28,7 +28,7 @@ Share = tuple[float, np.ndarray, np.ndarray]
 def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.ndarray,
              place: np.ndarray) -> Guess | None:
     """Return what the branch may look like with the grasp at ``place`` [3], None where nothing is
-    known.
+    known, nothing in it where the model needs no guess.
 
     An interpolation of the nearest states with their tangents (Hermite, radial); by the nearest
     alone where the others say something else: they may have gone aside another way.
@@ -36,6 +36,8 @@ def guess_of(grasp_model: GraspModel, known: Sequence[Solved], positions: np.nda
     Args:
         known: With their ``positions`` [m], shape [m, 3].
     """
+    if not grasp_model.needs_guess:
+        return Guess()
     length, states = grasp_model.reach.arc_length, []
     for k in np.argsort(np.linalg.norm(positions - place, axis=1), kind="stable")[:2 * _STATES]:
         gaps = [np.linalg.norm(one.pose[:3] - positions[k]) for one in states]
@@ -94,7 +96,9 @@ def straight_on(grasp_model: GraspModel, before: np.ndarray, now: np.ndarray, pl
 
 def blended(grasp_model: GraspModel, shares: Sequence[Share]) -> Guess:
     """Return the sum of the states' displacements and their changes, each by its weight, and of
-    their strains likewise."""
+    their strains likewise; nothing where the model needs no guess."""
+    if not grasp_model.needs_guess:
+        return Guess()
     strains, strain = grasp_model.model.strains, 0.0
     for weight, displacement, change in shares:
         own = strains(displacement)

@@ -9,6 +9,7 @@ from limber.mechanics import StaticResult
 from limber.mechanics.status import Status
 from limber.planning.field.energy_field import GraspSamples
 from limber.planning.field.grasp_model import GraspModel, refusal
+from limber.planning.field.learnt import CorrectedResult
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,8 @@ class Solved:
 
     The others as in :class:`~.energy_field.GraspSamples`, of one sample; ``trouble`` is why it
     cannot be believed, ``displacement`` [node_count, 3] that of all nodes [m], ``tangents``
-    [3, node_count, 3] how that changes with the grasp's position, in single precision.
+    [3, node_count, 3] how that changes with the grasp's position, in single precision; ``reduced``
+    whether the reduced model found it.
     """
 
     target: int
@@ -36,6 +38,7 @@ class Solved:
     axial_force: float
     displacement: np.ndarray
     tangents: np.ndarray
+    reduced: bool = False
 
     @property
     def shape(self) -> np.ndarray:
@@ -71,7 +74,7 @@ def taken(grasp_model: GraspModel, result: StaticResult, target: int = -1) -> So
         float(result.min_det_f), refusal(result), grasp_model.branch.target_positions(moved),
         np.zeros(3) if at_rest else result.reaction_torque, strain, place, stress,
         grasp_model.shape_slopes(moved, tangents), grasp_model.axial_force(moved, force), moved,
-        tangents.astype(np.float32))
+        tangents.astype(np.float32), isinstance(result, CorrectedResult))
 
 
 def samples_of(good: Sequence[Solved], rejected: np.ndarray) -> GraspSamples:
@@ -85,4 +88,5 @@ def samples_of(good: Sequence[Solved], rejected: np.ndarray) -> GraspSamples:
         rejected_poses=np.hstack([rejected, np.zeros_like(rejected)]), strains=column("strain"),
         targets=column("targets"), torques=column("torque"),
         strain_places=column("strain_place"), stresses=column("stress"),
-        shape_slopes=column("shape_slopes"), axial_forces=column("axial_force"))
+        shape_slopes=column("shape_slopes"), axial_forces=column("axial_force"),
+        reduced=column("reduced"))
