@@ -1,6 +1,11 @@
 """Warming up compiles what fits and surfaces need."""
 
-from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle, nearest_of, normal_blocks
+from limber.geometry.skeleton.radii.fit_kernels import (
+    mean_on_circle,
+    nearest_of,
+    normal_blocks,
+    reach_on_circle,
+)
 from limber.geometry.surface.distance import _distances
 from limber.geometry.surface.face_crossings import pierced
 from limber.geometry.surface.rounded_union import fillet_level
@@ -10,5 +15,6 @@ from limber.geometry.warm_up import warm_up
 def test_warm_up_compiles_the_loops():
     """After it they exist as machine code, each in one form."""
     warm_up()
-    for kernel in (pierced, fillet_level, _distances, nearest_of, normal_blocks, mean_on_circle):
+    for kernel in (pierced, fillet_level, _distances, nearest_of, normal_blocks, mean_on_circle,
+                   reach_on_circle):
         assert len(kernel.signatures) == 1

@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from limber.geometry.skeleton.radii.fit_kernels import mean_on_circle, nearest_of, normal_blocks
+from limber.geometry.skeleton.radii.fit_kernels import (
+    mean_on_circle,
+    nearest_of,
+    normal_blocks,
+    reach_on_circle,
+)
 
 
 def test_nearest_cylinder_is_the_one_that_a_search_along_all_finds() -> None:
@@ -55,3 +60,25 @@ def test_mean_on_a_circle_is_von_mises() -> None:
     np.testing.assert_allclose(np.arctan2(mean[:, 1], mean[:, 0]), angle, atol=1e-9)
     np.testing.assert_allclose(np.linalg.norm(mean, axis=1),
                                ive(1, sharpness) / ive(0, sharpness), rtol=1e-9)
+
+
+def test_reach_is_a_side_blurred_as_von_mises_has_it() -> None:
+    """Against its distribution in SciPy, and derivatives against differences."""
+    from scipy.special import i0e
+    from scipy.stats import vonmises
+
+    rng = np.random.default_rng(5)
+    angle, sharpness = rng.uniform(-np.pi, np.pi, 300), np.exp(rng.uniform(-3, 6, 300))
+    limit, least, step = 1.45, 0.01, 1e-5
+
+    def reach(turn: float = 0.0, further: float = 0.0):
+        return reach_on_circle(angle + turn, sharpness, i0e(sharpness), limit + further, least)
+
+    log, by_angle, by_limit = reach()
+    inside = (vonmises.cdf(limit - angle, sharpness) - vonmises.cdf(-limit - angle, sharpness))
+    np.testing.assert_allclose(np.exp(log), least + (1 - least) * inside, atol=2e-5)
+    # From sharpness 30 the density is von Mises' own, and the share that of its normal shape.
+    np.testing.assert_allclose(
+        by_angle, (reach(step)[0] - reach(-step)[0]) / (2 * step), atol=5e-3)
+    np.testing.assert_allclose(
+        by_limit, (reach(0, step)[0] - reach(0, -step)[0]) / (2 * step), atol=5e-3)

@@ -233,7 +233,7 @@ def test_a_ragged_foot_that_contraction_led_around_its_rim_may_be_the_root() -> 
 def test_an_end_is_not_left_beyond_the_points() -> None:
     """Where contraction overshoots a cut end, the root is brought back to where points are."""
     from limber.geometry.skeleton.radii.axis_fit import AxisFit
-    from limber.geometry.skeleton.radii.noisy_rings import SCATTERED_ALONG_SIGHT
+    from limber.geometry.skeleton.radii.sides_seen import SCATTERED_ALONG_SIGHT
     from limber.geometry.skeleton.skeletonise import _with_full_tips
 
     points = _tube([0, 0, 0], [0, 0, 0.3], 0.01, 4000)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
+from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.surface.distance import distance_to_surface
 from limber.geometry.surface.forks import smooth_forks
@@ -19,4 +20,5 @@ def warm_up(progress: Progress = SILENT) -> None:
     surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
     distance_to_surface(skeleton.nodes, surface)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
+    reach_on_circle(np.zeros(1), np.ones(1), np.ones(1), 1.0, 0.5)  # of one-sided scans alone
     progress(1.0, "compiling the surface's loops")

@@ -18,16 +18,19 @@ from scipy.spatial import cKDTree
 from limber.geometry.skeleton.radii.cylinders import Match, cylinders_around, match_cylinders
 from limber.geometry.skeleton.radii.fit_kernels import normal_blocks
 from limber.geometry.skeleton.radii.noisy_rings import (
-    SCATTERED_ALONG_SIGHT,
     Aims,
-    SeenSides,
-    across_sight,
     held_across,
     mean_places,
     place_doubt,
+    weighted_aims,
+)
+from limber.geometry.skeleton.radii.sides_seen import (
+    SCATTERED_ALONG_SIGHT,
+    SeenSides,
+    across_sight,
     seen_sides,
     side_doubt,
-    weighted_aims,
+    side_told,
 )
 from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
@@ -51,6 +54,7 @@ _TRUE = (1.007, 1.016, 1.031, 1.052, 1.110, 1.155, 1.225, 1.333)
 _BAND, _BAND_LIMIT = 1.2, 3.5  # smoothing length in local radii, without noise and at most
 # Radii to either side whose points tell how evenly a side is seen, each at least so many noises.
 _WINDOW, _NOISY_WINDOW = 4.0, 2.0
+_HELD = 2  # trusted rounds in which the limit stays that of most sensors
 _TELLING = 80  # points there that tell
 _ASKEW, _NARROW = 0.25, 0.33  # mean of the sine from the sight, and of its square: half a circle's
 
@@ -98,7 +102,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     near, found_at = None, nodes
     # Once a fit is too thin, scatter along the sight no longer shows as such: what is known counts.
     known = SCATTERED_ALONG_SIGHT if along_sight else seen
-    even = None
+    even, told, told_rounds = None, None, 0
     for number in range(rounds):
         # The cylinders around a point are looked up anew once axes have moved.
         moved = np.linalg.norm(nodes - found_at, axis=1)
@@ -116,6 +120,11 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         if trusted:
             now, axis, sharpness, stout = _sides(
                 skeleton.parent, nodes, match, weight, noise, known)
+            if now.one_sided and known is None:
+                shown = weight if even is None else weight * even[match.segment]
+                told = now = side_told(match.normal, axis, sharpness, shown, now.view, told or now,
+                                       limit_free=told_rounds >= _HELD)
+                told_rounds += 1
             place = mean_places(match.normal, axis, sharpness, stout, now)
             if not now.along_sight:
                 aims, nearest = weighted_aims(match.thick, noise, limit)
@@ -145,6 +154,8 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     noise = _robust_sigma(match.residual, match.thick)
     weight = _tukey(match.residual, np.full(len(points), _TUKEY * max(noise, 1e-12)))
     seen, *_ = _sides(skeleton.parent, nodes, match, weight, noise, known)
+    if told is not None and seen.one_sided:
+        seen = told
     sigma, state = skeleton.radius_sigma, skeleton.radius_state
     if uncertainty:
         sigma, pooled = _uncertainty(skeleton, nodes, radius, match, weight, max(noise, 1e-12))

@@ -1,10 +1,13 @@
 """Loops of the axis fit over points: which cylinder each is nearest to, and what it asks of it."""
 
+import math
+
 import numpy as np
 from numba import njit
 
 _EVEN = 1e-9  # of a radius
 _WIDE, _FINE = 60.0, 150  # sharpness: 7 degrees; places around
+_NORMAL, _TERMS = 30.0, 30  # sharpness from which; of the series below
 _TOLD = 14.0  # logarithm of a place's weight, under the best one's, from which it counts
 
 
@@ -142,3 +145,56 @@ def mean_on_circle(cosine: np.ndarray, sine: np.ndarray, sharpness: np.ndarray,
             y += weight * up[k]
         mean[i, 0], mean[i, 1] = x / total, y / total
     return mean
+
+
+@njit(cache=True)
+def reach_on_circle(angle: np.ndarray, sharpness: np.ndarray, bessel: np.ndarray, limit: float,
+                    least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Logarithm of how likely points are of a side seen up to a limit, and its derivatives.
+
+    Places up to the limit count 1, those beyond ``least``; each point's are blurred as von Mises
+    has it. Not divided by the sum over all places.
+
+    Args:
+        angle: Of each point, from the middle of the side that was seen [rad], shape [m].
+        sharpness: Shape [m].
+        bessel: I0(sharpness) exp(-sharpness), shape [m].
+        limit: Up to pi [rad].
+        least: Density of the places beyond.
+
+    Returns:
+        The logarithm, its derivative in the angle and that in the limit, shape [m] each.
+    """
+    log, by_angle, by_limit = np.empty(len(angle)), np.empty(len(angle)), np.empty(len(angle))
+    for i in range(len(angle)):
+        k, low, high = sharpness[i], -limit - angle[i], limit - angle[i]
+        blurred = least + (1 - least) * (_below(high, k, bessel[i]) - _below(low, k, bessel[i]))
+        at_low = np.exp(k * (np.cos(low) - 1)) / (2 * np.pi * bessel[i])
+        at_high = np.exp(k * (np.cos(high) - 1)) / (2 * np.pi * bessel[i])
+        log[i] = np.log(blurred)
+        by_angle[i] = (1 - least) * (at_low - at_high) / blurred
+        by_limit[i] = (1 - least) * (at_low + at_high) / blurred
+    return log, by_angle, by_limit
+
+
+@njit(cache=True)
+def _below(angle: float, sharpness: float, bessel: float) -> float:
+    """Share of von Mises' distribution around 0 below an angle, which counts whole turns.
+
+    Its series (Hill, ACM Algorithm 518, 1977), or the normal one that it comes near to.
+    """
+    turns = np.floor((angle + np.pi) / (2 * np.pi))
+    angle -= 2 * np.pi * turns
+    if sharpness > _NORMAL:
+        half = np.sqrt(2 / np.pi) / bessel * np.sin(angle / 2)
+        return turns + 0.5 * (1 + math.erf(half / np.sqrt(2)))
+    sine, cosine = np.sin(angle), np.cos(angle)
+    order = _TERMS
+    up, across = np.sin(order * angle), np.cos(order * angle)
+    ratio, total = 0.0, 0.0
+    for _ in range(_TERMS - 1):
+        order -= 1
+        up, across = up * cosine - across * sine, across * cosine + up * sine
+        ratio = 1 / (2 * order / max(sharpness, 1e-12) + ratio)
+        total = (up / order + total) * ratio
+    return turns + 0.5 + (angle / 2 + total) / np.pi
