@@ -15,7 +15,7 @@ from limber.planning.field.trust import TrustRegion
 from limber.planning.goals import GraspGoal, TargetGoal
 from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle
-from limber.planning.planners.refine import refine, violation
+from limber.planning.planners.refine import Limited, refine
 from limber.planning.planners.smoothing import smooth_cost
 from limber.planning.problem import GentleProblem
 from limber.planning.regions import Ball
@@ -231,22 +231,27 @@ def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
 
 
 def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
-    """Analytic gradients agree with central differences, limits broken and goal missed."""
+    """Analytic gradients agree with central differences, limits broken and goal missed; also with
+    multipliers."""
     problem = replace(problem_on(ridge_field, max_energy=0.02, max_force=0.5), longest=0.1)
     path = next(bulges(problem, 1))[::4] * 1.6
     path[-1] += 0.05
     direction = np.random.default_rng(0).normal(size=path.shape)
     step = 1e-6
 
+    limits = Limited(problem, 1e-3)
+
     def both(points):
         value, slope = smooth_cost(points, problem.energy_field, problem.weights)
-        broken, push = violation(points, problem, 1e-3, 0.2)
-        return value + 50.0 * broken, slope + 50.0 * push
+        broken, push = limits.penalty(points)
+        return value + broken, slope + push
 
-    ahead, behind = both(path + step * direction)[0], both(path - step * direction)[0]
-    assert violation(path, problem, 1e-3, 0.2)[0] > 0.01
-    assert (both(path)[1] * direction).sum() == pytest.approx((ahead - behind) / (2 * step),
-                                                              rel=1e-3)
+    for _ in range(2):
+        ahead, behind = both(path + step * direction)[0], both(path - step * direction)[0]
+        assert limits.penalty(path)[0] > 0.01
+        assert (both(path)[1] * direction).sum() == pytest.approx((ahead - behind) / (2 * step),
+                                                                  rel=1e-3)
+        assert limits.push(path) > 0.1
 
 
 def test_costs_of_two_seeds_compare(ridge_field):

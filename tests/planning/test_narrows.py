@@ -1,5 +1,6 @@
 """Narrow places: found or excluded by cells, and asked of the full model where the field errs."""
 
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from limber.planning.limits import Limits
 from limber.planning.narrows import asked_in_doubt
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
 from limber.progress import Progress
@@ -61,6 +63,21 @@ def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_fie
     assert judge(none).proven
     with pytest.raises(NoWayError, match=r"No path exists.*Proven on a grid"):
         plan_gentle(none)
+
+
+@pytest.mark.parametrize("share", [1.02, 1.2])
+def test_a_chord_far_over_a_limit_is_refined_into_the_valley(shell_field, share):
+    """From a chord of the shell with many times the force that is allowed: the path keeps the limit
+    and is no dearer than from the easiest way."""
+    start = shell_field.region.chart.plain.curved(np.array([[-0.03, 0.05, 0.0]]))[0]
+    ends = np.stack([start, GOAL.position])
+    limit = share * np.linalg.norm(shell_field.force(ends), axis=1).max()
+    problem = replace(problem_on(shell_field, max_force=limit), start=start)
+    chord = resample(ends, 0.002)
+    assert np.linalg.norm(shell_field.force(chord), axis=1).max() > 10.0 * limit
+    path, cost = refine(chord, problem)
+    easy = easiest_way(shell_field, problem.limits, start, GOAL)
+    assert cost == problem.cost(path) <= 1.002 * refine(easy.points, problem)[1] < np.inf
 
 
 def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
