@@ -19,13 +19,12 @@ import numpy as np
 from scipy.ndimage import label, maximum_filter
 
 from limber.errors import Cancelled, NoPathError
+from limber.planning.bound.corners import CURVATURE_FACTOR, least_between, least_size
 from limber.planning.bound.subsolution import (
-    CURVATURE_FACTOR,
     RIM,
     Terrain,
     corner_values,
     corners_of,
-    least_between,
     least_in_cells,
     second_differences,
     spline_value,
@@ -104,13 +103,18 @@ class _Grid:
         """Return the positions [n, 3] of corners ``numbers`` [n, 3]; halves are centres."""
         return self.origin + (numbers * self.spacing) @ self.axes
 
+    def along_edges(self, vectors: np.ndarray) -> np.ndarray:
+        """Return slopes [n, 3] to the position as those along a cell's edges, times their length.
+        """
+        return self.spacing * vectors @ self.axes.T
+
     def spread(self, corners: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return ``values`` at ``corners`` [n, 3] of the whole grid, nan elsewhere."""
+        """Return ``values`` [n, ...] at ``corners`` [n, 3] of the whole grid, nan elsewhere."""
         return _spread(tuple(n + 1 for n in self.open_cells.shape), corners, values)
 
 
 def _spread(shape: tuple[int, ...], places: np.ndarray, values: np.ndarray) -> np.ndarray:
-    whole = np.full(shape, np.nan)
+    whole = np.full((*shape, *values.shape[1:]), np.nan)
     whole[tuple(places.T)] = values
     return whole
 
@@ -200,7 +204,8 @@ def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
     corners = np.argwhere(widened(corners_of(widened(open_cells, RIM))))
     points = grid.points(corners)
     energy = grid.spread(corners, problem.energy_field.energy(points))
-    open_cells &= ~_surely_over(problem, grid, open_cells, energy)
+    force = grid.spread(corners, problem.energy_field.force(points))
+    open_cells &= ~_surely_over(problem, grid, open_cells, energy, force)
     if not open_cells[tuple(cell)]:
         raise _separated(problem, grid, open_cells)
     # Only what hangs together with the start, also by an edge or a corner of a cell.
@@ -208,7 +213,8 @@ def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
     open_cells = together == together[tuple(cell)]
     raw = energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
-    ground = terrain(rate, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
+    slopes = problem.weights.energy * grid.along_edges(force)
+    ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
     goal = _about_goal(problem, grid, ground)
     if not goal.meets:
         raise _separated(problem, grid, open_cells)
@@ -330,20 +336,23 @@ def _surely_outside(problem: GentleProblem, grid: _Grid) -> np.ndarray:
 
 
 def _surely_over(problem: GentleProblem, grid: _Grid, cells: np.ndarray, energy: np.ndarray,
-                 ) -> np.ndarray:
-    """Return those of ``cells`` in which no point keeps the limits; ``energy`` at the corners."""
+                 force: np.ndarray) -> np.ndarray:
+    """Return those of ``cells`` in which no point keeps the limits; ``energy`` and ``force`` at
+    their corners and next to them."""
     limits, field, over = problem.limits, problem.energy_field, np.zeros(cells.shape, bool)
-    nodes = np.argwhere(widened(corners_of(cells)))
-    points = grid.points(nodes)
     if limits.max_energy < np.inf:
-        over |= least_between(energy, cells) > limits.max_energy + problem.field_error
+        over |= least_between(energy, grid.along_edges(force), cells) > (
+            limits.max_energy + problem.field_error)
     for name, limit in zip(LOADS, limits.max_loads, strict=True):
         if limit < np.inf:
-            load = grid.spread(nodes, field.load(points, name)**2)
-            over |= least_between(load, cells) > limit**2
+            nodes = np.argwhere(widened(corners_of(cells)))
+            points = grid.points(nodes)
+            load = field.load(points, name)
+            slopes = 2.0 * load[:, None] * grid.along_edges(field.load_gradient(points, name))
+            over |= least_between(grid.spread(nodes, load**2), grid.spread(nodes, slopes),
+                                  cells) > limit**2
     if limits.max_force < np.inf:
-        force = grid.spread(nodes, (field.force(points)**2).sum(axis=1))
-        over |= least_between(force, cells) > limits.max_force**2
+        over |= least_size(force, cells) > limits.max_force
     return over
 
 

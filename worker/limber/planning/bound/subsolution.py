@@ -22,8 +22,10 @@ anywhere, the cost of length alone. (With the squares of both the slope of c wou
 four times as much about a narrow valley.) The second derivatives are the one thing that is not
 proven: they are taken as at most the largest second difference of c at the cell's corners and the
 next ones along the axis, and as much more as these differ; or as ``CURVATURE_FACTOR`` times the
-largest size of those at its corners, if that is less; never as less than 0. Where c has a kink
-inside a cell (the energy is cut off at zero) the cost of length counts.
+largest size of those at its corners, if that is less; never as less than 0, nor than the change of
+slope between the corners says (:mod:`limber.planning.bound.corners`): the floor of a valley may lie
+between them. Where c has a kink of the other kind inside a cell (the energy is cut off at zero) the
+cost of length counts.
 """
 
 from typing import NamedTuple
@@ -31,10 +33,8 @@ from typing import NamedTuple
 import numpy as np
 
 from limber.compiled import compiled
+from limber.planning.bound.corners import CURVATURE_FACTOR, turns
 from limber.planning.bound.marching import march, neighbours
-
-CURVATURE_FACTOR = 2.0
-"""What second differences at a cell's corners are multiplied by to bound derivatives inside."""
 
 RIM = 2
 """Closed cells about the open ones that have coefficients as well."""
@@ -86,14 +86,15 @@ def widened(cells: np.ndarray, times: int = 1) -> np.ndarray:
     return out
 
 
-def terrain(rate: np.ndarray, positive: np.ndarray, open_cells: np.ndarray, spacing: float,
-            floor: float) -> Terrain:
+def terrain(rate: np.ndarray, slopes: np.ndarray, positive: np.ndarray, open_cells: np.ndarray,
+            spacing: float, floor: float) -> Terrain:
     """Return the terrain of ``rate`` at the corners, nowhere below ``floor`` [1/m].
 
-    ``positive`` says at which corners the energy is not cut off; corners that were not evaluated
-    hold nan in ``rate`` and are no neighbours of an open cell's.
+    ``slopes`` [..., 3] are what it grows by a cell's edge there, along each; ``positive`` says at
+    which corners the energy is not cut off; corners that were not evaluated hold nan in ``rate``
+    and are no neighbours of an open cell's.
     """
-    bends = _bends(rate, open_cells)
+    bends = np.maximum(_bends(rate, open_cells), 0.25 * turns(slopes, open_cells))
     level = with_corner(positive) & with_corner(~positive)
     return Terrain(spacing, open_cells, np.nan_to_num(rate, nan=floor), bends, level, floor)
 
@@ -135,37 +136,6 @@ def _bends(values, cells):
                                     size = max(size, abs(second))
                     bend = min(2.0 * most - least, CURVATURE_FACTOR * size)
                     out[axis, i, j, k] = 0.25 * max(bend, 0.0)
-    return out
-
-
-@compiled
-def least_between(values, cells):
-    """Return what a smooth function is at least in ``cells`` [nx, ny, nz], -inf where not known.
-
-    Its least value at the cell's corners, less how far it may leave its trilinear interpolation:
-    ``CURVATURE_FACTOR / 8`` times the sum over axes of the largest second difference there (one
-    with a value that is not known, nan, counts as 0).
-    """
-    out = np.full(cells.shape, -np.inf)
-    curved = np.empty(3)
-    places = np.argwhere(cells)
-    for n in range(len(places)):
-        i, j, k = places[n, 0], places[n, 1], places[n, 2]
-        least = np.inf
-        curved[:] = 0.0
-        for p in range(i, i + 2):
-            for q in range(j, j + 2):
-                for r in range(k, k + 2):
-                    here = values[p, q, r]
-                    least = here if np.isnan(here) else min(least, here)
-                    x = abs(values[p - 1, q, r] - 2.0 * here + values[p + 1, q, r])
-                    y = abs(values[p, q - 1, r] - 2.0 * here + values[p, q + 1, r])
-                    z = abs(values[p, q, r - 1] - 2.0 * here + values[p, q, r + 1])
-                    curved[0] = x if x > curved[0] else curved[0]
-                    curved[1] = y if y > curved[1] else curved[1]
-                    curved[2] = z if z > curved[2] else curved[2]
-        if not np.isnan(least):
-            out[i, j, k] = least - CURVATURE_FACTOR / 8.0 * curved.sum()
     return out
 
 
