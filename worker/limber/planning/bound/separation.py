@@ -7,9 +7,8 @@ and only where they are open. If what is open does not lead from the start's cel
 hold a point of the goal, no path does. If cells that keep all limits at their corners do, there
 mostly is one.
 
-What a limit is on is nowhere in a cell farther from the trilinear interpolation of its corners than
-``CURVATURE_FACTOR / 8`` times the largest second differences there, summed over axes: the same
-assumption as in :mod:`limber.planning.bound.subsolution`.
+What a limit is on is at least in a cell what its values and slopes at the corners say
+(:mod:`limber.planning.bound.corners`).
 """
 
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from limber.planning.bound.subsolution import CURVATURE_FACTOR
+from limber.planning.bound.corners import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import LOADS
@@ -144,7 +143,7 @@ def judge(problem: GentleProblem) -> Verdict:
     while True:
         cells = cells.take(~_surely_outside(cells))
         positions, nodes = cells.nodes()
-        over, doubt = _surely_over(problem, positions, nodes)
+        over, doubt = _surely_over(cells, positions, nodes)
         begin = cells.holding(problem.start)
         away = problem.goal.distance(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
@@ -206,38 +205,63 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
     return outside
 
 
-def _surely_over(problem: GentleProblem, positions: np.ndarray, nodes: np.ndarray,
+def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
     """Return in which cells no point keeps the limits, bool [n], and how much in doubt each axis
     leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3]."""
     over, doubt = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
-    for values, limit in _limited(problem, positions):
-        least, bends = _least(values[nodes])
+    for values, slopes, limit in _limited(cells.problem, positions):
+        along = cells.chart.push_forward(positions, slopes) * cells.edges
+        least, bends = _least(values[nodes], along[nodes])
         over |= least > limit
         doubt = np.maximum(doubt, bends / limit)
+    limit = cells.problem.limits.max_force
+    if limit < np.inf:
+        force = cells.problem.energy_field.force(positions)[nodes]
+        bends = _bends(force)
+        over |= off_zero(force[:, _AT]) - bends.sum(axis=1) > limit
+        # Between corners it may be anything that lies between theirs.
+        apart = force[:, _AT].reshape(-1, 2, 2, 2, 3)
+        apart = np.stack([np.linalg.norm(np.diff(apart, axis=axis), axis=-1).max(axis=(1, 2, 3))
+                          for axis in (1, 2, 3)], axis=1)
+        doubt = np.maximum(doubt, (bends + apart) / limit)
     return over, doubt
 
 
-def _limited(problem: GentleProblem, positions: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
-    """Yield what is limited at ``positions`` [m, 3], smooth, shape [m], and its limit."""
+def _limited(problem: GentleProblem, positions: np.ndarray,
+             ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
+    """Yield what is limited at ``positions`` [m, 3] besides the force, smooth, shape [m], its slope
+    to the position, [m, 3], and its limit."""
     field, limits = problem.energy_field, problem.limits
     if limits.max_energy < np.inf:
-        yield field.energy(positions), limits.max_energy + problem.field_error
+        yield (field.energy(positions), field.force(positions),
+               limits.max_energy + problem.field_error)
     for name, limit in zip(LOADS, limits.max_loads, strict=True):
         if limit < np.inf:
-            yield field.load(positions, name)**2, limit**2
-    if limits.max_force < np.inf:
-        yield (field.force(positions)**2).sum(axis=1), limits.max_force**2
+            load = field.load(positions, name)
+            yield load**2, 2.0 * load[:, None] * field.load_gradient(positions, name), limit**2
 
 
-def _least(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a function with ``values`` [n, 32] at ``_STENCIL`` is at least in each cell, [n],
-    and by how much less for the second differences along each axis, [n, 3]."""
+def _least(values: np.ndarray, slopes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a function with ``values`` [n, 32] at ``_STENCIL``, and ``slopes`` [n, 32, 3]
+    there along the edges, times their lengths, is at least in each cell, [n], and by how much less
+    for what it bends along each axis, [n, 3]."""
     corners = values[:, _AT]
-    beside = values[:, _BESIDE]
-    second = np.abs(beside[..., 0] - 2.0 * corners[:, None] + beside[..., 1])
-    bends = CURVATURE_FACTOR / 8.0 * second.max(axis=2)
+    bends = _bends(values[..., None])
+    if slopes is not None:
+        ends = slopes[:, _AT].reshape(-1, 2, 2, 2, 3)
+        turns = np.stack([np.diff(ends[..., axis], axis=axis + 1).max(axis=(1, 2, 3))
+                          for axis in range(3)], axis=1)
+        bends = np.maximum(bends, 0.25 * turns)
     return corners.min(axis=1) - bends.sum(axis=1), bends
+
+
+def _bends(values: np.ndarray) -> np.ndarray:
+    """Return how far a function with ``values`` [n, 32, c] at ``_STENCIL`` may leave the trilinear
+    interpolation of the corners for its second differences along each axis, [n, 3]."""
+    beside = values[:, _BESIDE]
+    second = beside[..., 0, :] - 2.0 * values[:, None, _AT] + beside[..., 1, :]
+    return CURVATURE_FACTOR / 8.0 * np.linalg.norm(second, axis=-1).max(axis=2)
 
 
 def _keys(numbers: np.ndarray) -> np.ndarray:

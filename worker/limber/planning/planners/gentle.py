@@ -2,7 +2,8 @@
 
 Each grid of the certificate shows the cheapest way on it; refined, it is a path. The first paths
 that are tried are the straight line and what other planners found; where none of them keeps the
-limits, a way by cells that do, if there is one (:mod:`limber.planning.bound.separation`).
+limits, a way by cells that do, if there is one (:mod:`limber.planning.bound.separation`), else the
+way that goes least over them.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 from limber.planning.bound.certificate import ENOUGH, Certificate, certify
 from limber.planning.bound.separation import Verdict, judge
 from limber.planning.cost import arc_lengths
+from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.refine import refine
 from limber.planning.problem import GentleProblem, NoWayError, no_way
 from limber.progress import SILENT, Progress
@@ -42,34 +44,41 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
     best: list = [None, np.inf]
     verdicts: list[Verdict] = []
 
-    def improve(rough: np.ndarray | None) -> float:
-        if rough is None:
-            starts = [_straight(problem), *(others or [])]
-        else:
-            starts = [rough]
-        for path in starts:
+    def found_from(paths: list[np.ndarray]) -> bool:
+        for path in paths:
             if len(path) < 2 or not arc_lengths(path)[-1] > 0.0:
                 continue
             points, cost = refine(path, problem)
             if cost < best[1]:
                 best[:] = points, cost
-        if best[0] is None and rough is None:
-            verdicts.append(judge(problem))
-            if verdicts[0].proven:
-                raise no_way(problem, f"Proven on {_grid(verdicts[0])}: cells where motion is "
-                             "surely not allowed separate the two.")
-            if verdicts[0].way is not None:
-                return improve(verdicts[0].way)
-        elif best[0] is None and rough is not verdicts[0].way:
+        return best[0] is not None
+
+    def improve(rough: np.ndarray | None) -> float:
+        starts = [_straight(problem), *(others or [])] if rough is None else [rough]
+        if found_from(starts):
+            return best[1]
+        if rough is not None:
             # Coarser cells than those that left it open will not settle it.
             raise NoWayError(
                 f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} "
                 f"was found, {UNPROVEN}.", f"It is open on {_grid(verdicts[0])}.",
                 "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
+        verdicts.append(judge(problem))
+        # A path that keeps the limits is a better proof than cells that separate.
+        way = verdicts[0].way
+        known = (way is not None and found_from([way])) or found_from(_easiest(problem))
+        if not known and verdicts[0].proven:
+            raise no_way(problem, f"Proven on {_grid(verdicts[0])}: cells where motion is "
+                         "surely not allowed separate the two.")
         return best[1]
 
     certificate = certify(problem, improve, enough=enough, progress=progress)
     return GentlePath(best[0], best[1], certificate)
+
+
+def _easiest(problem: GentleProblem) -> list[np.ndarray]:
+    way = easiest_way(problem.energy_field, problem.limits, problem.start, problem.goal)
+    return [] if way is None else [way.points]
 
 
 def _grid(verdict: Verdict) -> str:

@@ -1,0 +1,128 @@
+"""What a cell's corners say of what lies in it, where a valley's floor does: by brute force."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.planning.bound import certificate
+from limber.planning.bound.corners import off_zero
+from limber.planning.bound.separation import judge
+from limber.planning.cost import CostWeights
+from limber.planning.field.chart import Chart
+from limber.planning.field.energy_field import GraspSamples, fit_field
+from limber.planning.goals import GraspGoal, allowed_points
+from limber.planning.planners.gentle import plan_gentle
+from limber.planning.planners.refine import refine
+from limber.planning.problem import GentleProblem
+
+RADIUS = 0.25  # [m] of the shell about the origin
+ALONG, OFF = 20.0, 3e4  # [N/m] along the shell and across it
+MOST = 10.0  # [N] that the branch resists with off the shell, drawn taut or bowed out
+
+
+@pytest.fixture(scope="module")
+def bowing_field():
+    """A branch that is stiff by its shell and yields a little off it: its valley has steep sides,
+    and nothing a few millimetres beside it tells how low it is."""
+    generator = np.random.default_rng(4)
+    chart = Chart.about(np.zeros(3), RADIUS, np.array([0.0, 0.0, RADIUS]))
+    flat = np.concatenate([np.zeros((1, 3)), generator.uniform(-0.13, 0.13, (300, 3))])
+    flat[1:, 2] = generator.choice([0.02, -0.05], 300) * generator.uniform(0.0, 1.0, 300)**2
+    off = np.abs(flat[:, 2]) * OFF / MOST
+    slope = flat * ALONG
+    slope[:, 2] = np.sign(flat[:, 2]) * MOST * np.tanh(off)
+    energy = 0.5 * ALONG * (flat[:, :2]**2).sum(axis=1) + MOST**2 / OFF * (
+        off + np.log1p(np.exp(-2.0 * off)) - np.log(2.0))
+    points = chart.curved(flat)
+    return fit_field(GraspSamples(
+        np.hstack([points, np.zeros_like(points)]), energy, chart.pull_back(points, slope),
+        1.5 * points, np.ones(len(points)), np.empty((0, 6)), np.full(len(points), 0.01)),
+        np.zeros(3), RADIUS)
+
+
+def problem_on(field, share):
+    """Across the shell, with a limit of a ``share`` of the force that the end needs."""
+    ends = field.region.chart.plain.curved(np.array([[-0.08, 0.03, 0.0], [0.06, 0.07, 0.0]]))
+    goal = GraspGoal(tuple(ends[1]), 0.004)
+    weights = CostWeights.between(field, ends[0], ends[1], deformation=1.0, distance=1.5).weights
+    limit = share * np.linalg.norm(field.force(ends), axis=1).max()
+    return GentleProblem(field, field.limited(max_force=limit), weights, ends[0], goal)
+
+
+def poses_near_the_floor(field, count):
+    """Positions [n, 3] by the shell, most of them within a tenth of a millimetre."""
+    generator = np.random.default_rng(6)
+    flat = generator.uniform(-0.12, 0.12, (count, 3))
+    flat[:, 2] = generator.choice([-1.0, 1.0], count) * 10 ** generator.uniform(-6.0, -2.5, count)
+    return field.region.chart.plain.curved(flat)
+
+
+def test_a_hull_is_as_far_from_zero_as_its_nearest_point():
+    """Against weights by the thousand; below it always, and close to it where it does not hold 0.
+    """
+    generator = np.random.default_rng(3)
+    corners = generator.normal(size=(50, 8, 3)) + generator.normal(size=(50, 1, 3)) * 3.0
+    weights = generator.dirichlet(np.full(8, 0.3), 20_000)
+    nearest = np.linalg.norm(weights @ corners, axis=2).min(axis=1)
+    found = off_zero(corners)
+    assert (found <= nearest).all()
+    assert (found[nearest > 1.0] > 0.9 * nearest[nearest > 1.0]).all()
+    assert (nearest > 1.0).sum() > 20
+
+
+@pytest.mark.parametrize("share", [1.02, 1.5])
+def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
+        bowing_field, share, monkeypatch):
+    """On every grid of a certificate, at random poses by the shell that keep the limit: the cell is
+    open, and c is not below the claimed bound there."""
+    problem = problem_on(bowing_field, share)
+    poses = poses_near_the_floor(bowing_field, 20_000)
+    poses = poses[allowed_points(poses, problem.limits)]
+    assert len(poses) > 300
+    rate = problem.weights.length + problem.weights.energy * bowing_field.energy(poses)
+    original, asked = certificate._bound, []
+
+    def bound(problem, grid, cell):
+        found = original(problem, grid, cell)
+        place = (poses - grid.origin) @ grid.axes.T / grid.spacing
+        number = np.floor(place).astype(int)
+        within = ((number >= 0) & (number < grid.open_cells.shape)).all(axis=1)
+        within[within] = grid.open_cells[tuple(number[within].T)]
+        number, part = number[within], place[within] - number[within]
+        lost = ~found.ground.open_cells[tuple(number.T)]
+        least = claimed_rate(found.ground, number, part)
+        asked.append((within.sum(), lost.sum(), (least > rate[within] * (1 + 1e-9)).sum()))
+        return found
+
+    monkeypatch.setattr(certificate, "_bound", bound)
+    found = plan_gentle(problem)
+    assert asked[0][0] > 300 and len(asked) > 2
+    assert [lost for _, lost, _ in asked] == [0] * len(asked)
+    assert [below for _, _, below in asked] == [0] * len(asked)
+    assert found.certificate.lower <= found.cost < 1.03 * found.certificate.lower
+
+
+def claimed_rate(ground, cells, part):
+    """What the terrain says c is at least, at ``part`` [n, 3] of ``cells`` [n, 3]."""
+    value = 0.0
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, part, 1.0 - part).prod(axis=1)
+        value = value + weight * ground.rate[tuple((cells + corner).T)]
+    bends = ground.bends[(slice(None), *cells.T)].T
+    value -= (2.0 * bends * part * (1.0 - part)).sum(axis=1)
+    level = ground.level[tuple(cells.T)]
+    return np.where(level, ground.floor, np.maximum(value, ground.floor))
+
+
+def test_no_proof_stands_against_a_path(bowing_field):
+    """With a force just enough a path exists, and no cells say otherwise; with one too low for the
+    goal they do."""
+    enough = problem_on(bowing_field, 1.02)
+    line = np.linspace(enough.start, enough.goal.position, 40)
+    path, cost = refine(line, enough)
+    assert cost == enough.cost(path) < np.inf
+    assert not judge(enough).proven
+    held = replace(enough, limits=enough.limits._replace(max_force=0.9 * np.linalg.norm(
+        bowing_field.force(enough.start[None]))))
+    assert judge(held).proven
