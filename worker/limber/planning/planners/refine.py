@@ -193,8 +193,9 @@ class Limited:
         for axis in range(3):
             for bound, side in ((limits.low[axis], -1.0), (limits.high[axis], 1.0)):
                 if np.isfinite(bound):
+                    way = side * np.eye(3)[axis] / scale
                     yield _Excess((side * (points[:, axis] - bound) + self.margin) / scale,
-                                  lambda push, way=side * np.eye(3)[axis] / scale:
+                                  lambda push, way=way:
                                   push[:, None] * way)
         outside = (problem.goal_excess(points[-1]) + 1e-2 * problem.goal.tolerance) / scale
         yield _Excess(np.array([outside]), lambda push: self._at_end(points, push))
@@ -214,7 +215,8 @@ class Limited:
             return pull
         if limits.max_energy < np.inf:
             yield _Excess(known.energy(points) / limits.max_energy - 1.0 + reserve, asked(
-                lambda active: known.energy_gradient(points[active]) / limits.max_energy), _WEIGHTS[1])
+                lambda active: known.energy_gradient(points[active]) / limits.max_energy),
+                _WEIGHTS[1])
         for name, limit in zip(LOADS, limits.max_loads, strict=True):
             if limit < np.inf:
                 load = known.load(points, name)
