@@ -129,9 +129,11 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         ahead(0.3, "both paths on the full model")
         # The shortest path rarely changes with what was learnt: it is solved once.
         same = before is not None and np.array_equal(before.baseline.points, pair.baseline.points)
+        paths = [pair.plan.points] + [pair.baseline.points] * (not same)
+        # A refined path has points closer together, so that its chords follow the shell.
         plan, *other = resolve_side_by_side(
-            grasp_model, [pair.plan.points] + [pair.baseline.points] * (not same), pair.approach,
-            workers, ahead.part(0.3, 0.95))
+            grasp_model, [resample(points, STEP) for points in paths], pair.approach, workers,
+            ahead.part(0.3, 0.95))
         baseline = other[0] if other else baseline
         broken = broken_on_full_model(plan, limits, goal, grasp_model.mesh.nodes)
         if isinstance(aim, TargetGoal) and plan.is_whole:

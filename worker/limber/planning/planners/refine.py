@@ -193,10 +193,9 @@ class Limited:
         for axis in range(3):
             for bound, side in ((limits.low[axis], -1.0), (limits.high[axis], 1.0)):
                 if np.isfinite(bound):
-                    way = side * np.eye(3)[axis] / scale
+                    outward = side * np.eye(3)[axis] / scale
                     yield _Excess((side * (points[:, axis] - bound) + self.margin) / scale,
-                                  lambda push, way=way:
-                                  push[:, None] * way)
+                                  lambda push, outward=outward: push[:, None] * outward)
         outside = (problem.goal_excess(points[-1]) + 1e-2 * problem.goal.tolerance) / scale
         yield _Excess(np.array([outside]), lambda push: self._at_end(points, push))
         if problem.longest < np.inf:
@@ -206,24 +205,23 @@ class Limited:
         """Yield the excess of energy, loads and force at each point."""
         known, limits, reserve = self.problem.energy_field, self.problem.limits, self.reserve
 
-        def asked(slope: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
-            """Ask the slope [k, 3] of the points at which the limit pushes alone."""
+        def excess(values: np.ndarray, limit: float,
+                   slope: Callable[[np.ndarray], np.ndarray]) -> _Excess:
+            """Ask the slopes [k, 3] at those points alone at which the limit pushes."""
             def pull(push: np.ndarray) -> np.ndarray:
                 out, active = np.zeros_like(points), np.flatnonzero(push)
-                out[active] = push[active, None] * slope(active)
+                out[active] = push[active, None] * slope(active) / limit
                 return out
-            return pull
+            return _Excess(values / limit - 1.0 + reserve, pull, _WEIGHTS[1])
         if limits.max_energy < np.inf:
-            yield _Excess(known.energy(points) / limits.max_energy - 1.0 + reserve, asked(
-                lambda active: known.energy_gradient(points[active]) / limits.max_energy),
-                _WEIGHTS[1])
+            yield excess(known.energy(points), limits.max_energy,
+                         lambda active: known.energy_gradient(points[active]))
         for name, limit in zip(LOADS, limits.max_loads, strict=True):
             if limit < np.inf:
                 load = known.load(points, name)
-                yield _Excess(np.abs(load) / limit - 1.0 + reserve, asked(
-                    lambda active, load=load, name=name, limit=limit:
-                    np.sign(load[active])[:, None]
-                    * known.load_gradient(points[active], name) / limit), _WEIGHTS[1])
+                yield excess(np.abs(load), limit, lambda active, load=load, name=name:
+                             np.sign(load[active])[:, None]
+                             * known.load_gradient(points[active], name))
         if limits.max_force < np.inf:
             force = known.force(points)
             size = np.linalg.norm(force, axis=1)
@@ -232,8 +230,8 @@ class Limited:
                 # The Hessian times F / |F|: one difference along the force.
                 step = _STEP * force[active] / np.maximum(size[active], 1e-12)[:, None]
                 return (known.force(points[active] + step) - known.force(points[active] - step)) / (
-                    2.0 * _STEP * limits.max_force)
-            yield _Excess(size / limits.max_force - 1.0 + reserve, asked(stiffness), _WEIGHTS[1])
+                    2.0 * _STEP)
+            yield excess(size, limits.max_force, stiffness)
 
     def _at_end(self, points: np.ndarray, push: np.ndarray) -> np.ndarray:
         shifts = _STEP * np.concatenate([np.eye(3), -np.eye(3)])
