@@ -23,15 +23,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # tests start would inherit that, and no user's does.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-SHARED = Path(__file__).parents[2] / "shared" / "data"
-
 
 @pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """The folder of real recordings, which is not part of the project."""
-    if not SHARED.is_dir():
-        pytest.skip(f"the real recordings are not here (looked for {SHARED.name} in ../shared)")
-    return SHARED
+def recorded_data() -> Path:
+    """The folder of real recordings and reference tables; its README names their sources."""
+    return Path(__file__).parent / "data"
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ from limber.recordings.importing import _against
 from limber.recordings.recording import GraspEntry, Observations, read_pull
 from limber.recordings.registration import read_nominal, register
 
-SHARED = Path(__file__).parents[3] / "shared" / "data" / "silicone_beam"
+BEAM = Path(__file__).parents[1] / "data" / "silicone_beam"
 YOUNG, WEIGHTS = 2.5e7, (0.3, 0.7)
 TURN = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
 
@@ -228,13 +228,12 @@ def test_registration_by_name_by_fit_and_around_a_stray_marker(tmp_path):
             read_nominal(tmp_path / "bad.csv")
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the recorded beam is not here")
 def test_the_recorded_beam_settles_alike_in_both_files(branch_folder, tmp_path):
     """The silicone beam's CSV and C3D give the same displacement: about 17 mm at the tip."""
     moved = []
     for number, source in enumerate(("beam_load52_V2_a.csv", "beam_load52_V2_a.c3d")):
         name = f"beam{number}"
-        assert call(["import-pull", str(branch_folder), str(SHARED / source), "--name", name,
+        assert call(["import-pull", str(branch_folder), str(BEAM / source), "--name", name,
                      "--weight", "0.51012", "--grasp-point", "0", "0", "0.3",
                      "--grasp-radius", "0.02", "--progress",
                      "none"]) == 0

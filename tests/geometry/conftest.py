@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.skeleton import Skeleton
 
@@ -16,9 +17,22 @@ def forked_branch():
 
 
 @pytest.fixture(scope="session")
-def coffeetree(shared_data) -> Path:
-    """The laser scan of a coffee tree's branch; skips where the recordings are not there."""
-    return shared_data / "coffeetree_branch" / "branch.xyz"
+def coffeetree(recorded_data) -> Path:
+    """The laser scan of a coffee tree's branch [m], in map coordinates."""
+    return recorded_data / "coffeetree_branch" / "branch.xyz"
+
+
+@pytest.fixture(scope="session")
+def tomato_draws(recorded_data) -> np.ndarray:
+    """Four draws of 1,500 points [mm] of a scanned tomato seedling with leaves, [4, 1500, 3]."""
+    with np.load(recorded_data / "tomato" / "tomato_03-05.npz") as file:
+        return file["draws_mm"].astype(float)
+
+
+@pytest.fixture(scope="session")
+def tomato(tomato_draws) -> Cloud:
+    """All points of the draws [mm], once each."""
+    return Cloud(np.unique(tomato_draws.reshape(-1, 3), axis=0))
 
 
 @pytest.fixture

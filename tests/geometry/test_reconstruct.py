@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from limber.cli import call
 from limber.errors import Cancelled, InputError
+from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import generate_branch
 from limber.geometry.mesh_surface import MeshSurfaceSettings
@@ -231,12 +232,10 @@ def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_a_leafy_plants_leaves_are_cut_off(shared_data, seed):
+def test_a_leafy_plants_leaves_are_cut_off(tomato_draws, seed):
     """Of few points of a seedling whose leaves outweigh its stem, too: a few fat rods that explain
     most of them do not pass for wood."""
-    scan = read_points(shared_data / "tomato_maize" / "tomato_03-05.xyz")
-    chosen = np.random.default_rng(seed).permutation(len(scan))[:1500]
-    made = reconstruct_cloud(scan.subset(chosen), ReconstructSettings(unit="mm"))
+    made = reconstruct_cloud(Cloud(tomato_draws[seed]), ReconstructSettings(unit="mm"))
     assert made.numbers["leaf_count"] == 2
     assert 0.7 < made.cloud.attributes["leaf"].mean() < 0.8
     assert made.numbers["radius_max_m"] < 0.002

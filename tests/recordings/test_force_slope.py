@@ -10,7 +10,7 @@ from limber.cli import call
 from limber.errors import InputError
 from limber.recordings.force_slope import force_slope, read_force_displacement
 
-DATA = Path(__file__).parents[3] / "shared" / "data" / "blueberry_cane_push"
+DATA = Path(__file__).parents[1] / "data" / "blueberry_cane_push"
 
 
 def test_slope_contact_and_offset_of_a_known_push():
@@ -68,7 +68,6 @@ def test_incomplete_rows_are_dropped_with_a_word(tmp_path):
     assert len(way) == 8 and "unfinished" in warnings[0]
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the recorded cane pushes are not here")
 def test_recorded_canes():
     """27 pushes of living canes: each has a positive slope within its interval, near that of a
     plain line through what lies over the noise.
@@ -156,7 +155,6 @@ def test_headers_of_other_load_cells(tmp_path, header, row, newtons, metres):
     assert force[2] == pytest.approx(12 * newtons) and way[2] == pytest.approx(metres)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the recorded cane pushes are not here")
 def test_every_recorded_push_through_the_command(tmp_path, capsys):
     """All 27: a slope within its interval, contact on the way, and the reason why no modulus."""
     for path in sorted(DATA.glob("*.csv")):

@@ -3,7 +3,6 @@
 import json
 import sys
 import types
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,6 @@ from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.registration import rigid_fit
 from limber.recordings.streams import Stream, read_stream, write_stream
 from limber.stages.import_pull import import_pull
-
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 
 
 @pytest.fixture
@@ -115,10 +112,9 @@ def test_folder_of_clouds(bare_folder, source):
     assert [t for t, _ in list_frames(bare_folder / "pulls" / "c", "clouds")] == [0.0, 0.1, 0.2]
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
-def test_a_force_table_gives_a_slope_and_the_reason_why_no_modulus(tmp_path, capsys):
+def test_a_force_table_gives_a_slope_and_the_reason_why_no_modulus(recorded_data, tmp_path, capsys):
     """A recorded cane push through the command: a slope with interval, and the explanation."""
-    source = sorted((SHARED / "blueberry_cane_push").glob("*.csv"))[5]
+    source = sorted((recorded_data / "blueberry_cane_push").glob("*.csv"))[5]
     assert call(["import-pull", str(tmp_path / "cane.branch"), str(source), "--name", "push",
                  "--json", "--progress", "none"]) == 0
     line = json.loads(capsys.readouterr().out.strip().splitlines()[-1])
@@ -127,10 +123,9 @@ def test_a_force_table_gives_a_slope_and_the_reason_why_no_modulus(tmp_path, cap
     assert "fourth power" in line["why_no_modulus"]
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
-def test_c3d_holds_what_its_table_holds():
+def test_c3d_holds_what_its_table_holds(recorded_data):
     """The silicone beam's C3D file and its CSV table are the same motion."""
-    folder = SHARED / "silicone_beam"
+    folder = recorded_data / "silicone_beam"
     stream, labels = markers_from_c3d(folder / "beam_load52_V2_a.c3d")
     table = read_stream(folder / "beam_load52_V2_a.csv")
     assert labels[0] == "Tip - 1" and len(labels) == 6

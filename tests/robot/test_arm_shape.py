@@ -32,9 +32,9 @@ def test_rods_are_one_chain_from_the_shoulder_to_the_flange(name):
     assert lengths[0, [1, 3]] == pytest.approx([-arm.a[1], -arm.a[2]])
 
 
-def test_tubes_lie_where_the_urdf_of_others_has_them(shared_data):
+def test_tubes_lie_where_the_urdf_of_others_has_them(recorded_data):
     """A UR5's upper arm and forearm have their middles where the URDF says."""
-    root = ElementTree.parse(shared_data / "ur5_urdf" / "ur5.urdf").getroot()
+    root = ElementTree.parse(recorded_data / "ur5_urdf" / "ur5.urdf").getroot()
     origins = {joint.get("name"): joint.find("origin") for joint in root.findall("joint")}
     middles = {link.get("name"): np.array(
         link.find("inertial/origin").get("xyz").split(), float)

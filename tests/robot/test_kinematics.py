@@ -51,9 +51,9 @@ def test_forward_and_every_inverse_branch_as_an_independent_library(name):
         assert exist[row].sum() == len(library.inverse_kinematics(frames[row]))
 
 
-def test_forward_as_the_urdf_of_others(shared_data):
+def test_forward_as_the_urdf_of_others(recorded_data):
     """The chain of joint origins in a UR5's URDF, multiplied out; its base is turned by half."""
-    root = ElementTree.parse(shared_data / "ur5_urdf" / "ur5.urdf").getroot()
+    root = ElementTree.parse(recorded_data / "ur5_urdf" / "ur5.urdf").getroot()
     origins = {joint.get("name"): joint.find("origin") for joint in root.findall("joint")}
     names = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
     for joints in random_joints(200):

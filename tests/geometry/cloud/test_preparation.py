@@ -1,13 +1,11 @@
 """Cleaning a cloud: digits, duplicates, outliers, and what is refused."""
 
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
-from limber.geometry.cloud.files import read_points
 from limber.geometry.cloud.preparation import PreparationSettings, prepare
 from limber.geometry.cloud.sheets import find_sheet
 from limber.geometry.generated import generate_branch
@@ -115,12 +113,9 @@ def test_a_line_is_no_branch():
         prepare(Cloud(line), 1.0)
 
 
-def test_leaves_are_no_sheets():
+def test_leaves_are_no_sheets(tomato):
     """The lower half of a leafy seedling, where two leaves lie flat, keeps them."""
-    path = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "tomato_maize"
-    if not path.is_dir():
-        pytest.skip("no ../shared/data")
-    points = read_points(path / "tomato_03-05.xyz").points / 1000
+    points = tomato.points / 1000
     for axis in range(3):
         middle = (points[:, axis].min() + points[:, axis].max()) / 2
         for half in (points[points[:, axis] < middle], points[points[:, axis] > middle]):

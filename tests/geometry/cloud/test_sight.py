@@ -1,6 +1,5 @@
 """Clouds of one depth camera: recognised as such, and rid of their flying pixels."""
 
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.perception.simulated_camera import render_depth, with_noise
 
-DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 AHEAD = np.array([1.0, 0.0, 0.1])
 
 
@@ -74,15 +72,17 @@ def test_the_image_is_found_in_turned_axes_and_beside_nothing_else() -> None:
     assert find_sight(points + [0.3, 0.0, 0.5], np.array([0.3, 0.0, 0.5])) is not None
 
 
-def test_scanned_clouds_are_no_images() -> None:
+def test_scans_from_many_sides_are_no_depth_images(coffeetree, tomato) -> None:
     """Laser scans from many sides and map coordinates are not mistaken for one camera's."""
-    if not DATA.is_dir():
-        pytest.skip("no ../shared/data")
-    for name in ("coffeetree_branch/branch.xyz", "aRchi_tree_1/Tree_1.ply",
-                 "tomato_maize/tomato_03-05.xyz"):
-        assert find_sight(read_points(DATA / name).points) is None, name
-    for name in ("apple_rgbd/frame_00025.ply", "apple_rgbd/frame_00125.ply"):
-        assert find_sight(read_points(DATA / name).points) is not None, name
+    assert find_sight(read_points(coffeetree).points) is None
+    assert find_sight(tomato.points) is None
+
+
+@pytest.mark.parametrize("name", ["frame_00025", "frame_00125"])
+def test_real_depth_images_are_recognised(recorded_data, name) -> None:
+    """Parts of 3,000 points of two RGB-D images of apple trees."""
+    with np.load(recorded_data / "apple_rgbd" / f"{name}.npz") as file:
+        assert find_sight(file["points_mm"].astype(float)) is not None
 
 
 def test_the_user_decides_about_flying_pixels() -> None:
