@@ -1,0 +1,158 @@
+"""Runs the parts of the suite one after another; ends with one table and one exit code.
+
+scripts/test calls it after the set-up. A part that fails hides no other part.
+"""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+BIN = Path(sys.prefix) / ("Scripts" if os.name == "nt" else "bin")
+PYTEST = [sys.executable, "-m", "pytest"]
+NO_TESTS = 5
+"""pytest's exit code where no test was selected."""
+
+
+@dataclass
+class Part:
+    """What one part of the suite came to."""
+
+    name: str
+    seconds: float
+    failed: bool
+    counts: Counter[str] | None = None
+    skips: Counter[str] = field(default_factory=Counter)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the parts that ``arguments`` ask for; 0 if all passed, else 1."""
+    parser = argparse.ArgumentParser(prog="scripts/test", description=__doc__, epilog=(
+        "Other arguments go to pytest: scripts/test tests/geometry -k skeleton"))
+    parser.add_argument("--fast", action="store_true",
+                        help="style, types and the quick tests of every package: for each save")
+    parser.add_argument("--ci", action="store_true",
+                        help="also bring a real Blender first and test the wheel last")
+    asked, others = parser.parse_known_args(arguments)
+    parts = [Part("set-up", float(os.environ.get("LIMBER_SETUP_SECONDS", "0")), False)]
+    if asked.ci:
+        parts.append(provided_blender())
+    parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
+    parts.extend(tests(asked.fast, others))
+    if asked.ci:
+        parts.append(command("wheel", [ROOT / "scripts" / "test_wheel"]))
+    print(summary(parts), flush=True)
+    return int(any(part.failed for part in parts))
+
+
+def command(name: str, words: list) -> Part:
+    """Run a program as one part."""
+    print(f"\n=== {name} ===", flush=True)
+    began = time.monotonic()
+    code = subprocess.run([str(word) for word in words], cwd=ROOT, check=False).returncode
+    return Part(name, time.monotonic() - began, code != 0)
+
+
+def tests(fast: bool, others: list[str]) -> list[Part]:
+    """The tests: those chosen by pytest's own arguments, the quick ones, or all."""
+    if fast:
+        return [pytest_part("tests", ["-n", "2", "--dist", "worksteal", "-m",
+                                      "not slow and not real_time and not real_blender", *others])]
+    if others:
+        return [pytest_part("tests", others)]
+    return [
+        pytest_part("tests", ["-n", "2", "--dist", "worksteal", "-m", "not real_time",
+                              "--durations", "20"]),
+        # These follow clocks of 2 and 8 ms: beside another test they would measure the machine.
+        # Another program's burst can delay one of them as well, so a failed one is tried once more.
+        pytest_part("real time", ["-m", "real_time", "--durations", "5"], retry=True),
+    ]
+
+
+def pytest_part(name: str, arguments: list[str], retry: bool = False) -> Part:
+    """Run pytest as one part; with ``retry``, what failed is tried once more."""
+    print(f"\n=== {name} ===", flush=True)
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.xml"
+        code = _pytest(arguments, report)
+        counts, skips = _counted(report)
+        if code == 1 and retry:
+            print(f"scripts/test: {counts['failed']} failed; once more, those alone", flush=True)
+            again = Path(folder) / "again.xml"
+            code = _pytest([*arguments, "--last-failed", "--last-failed-no-failures", "none"],
+                           again)
+            still = _counted(again)[0]["failed"]
+            counts["passed"] += counts["failed"] - still
+            counts["failed"] = still
+    return Part(name, time.monotonic() - began, code not in (0, NO_TESTS), counts, skips)
+
+
+def _pytest(arguments: list[str], report: Path) -> int:
+    return subprocess.run([*PYTEST, *arguments, "--junit-xml", str(report)], cwd=ROOT,
+                          check=False).returncode
+
+
+def _counted(report: Path) -> tuple[Counter[str], Counter[str]]:
+    """Count passed, failed and skipped tests of a JUnit report, and the reasons of the skips."""
+    counts: Counter[str] = Counter()
+    skips: Counter[str] = Counter()
+    if not report.exists():
+        return counts, skips
+    for case in ElementTree.parse(report).iter("testcase"):
+        skip = case.find("skipped")
+        if skip is not None:
+            counts["skipped"] += 1
+            skips[skip.get("message") or "no reason given"] += 1
+        elif case.find("failure") is not None or case.find("error") is not None:
+            counts["failed"] += 1
+        else:
+            counts["passed"] += 1
+    return counts, skips
+
+
+def provided_blender() -> Part:
+    """Bring a real Blender (as root, where LIMBER_BLENDER names none); tests find it by that."""
+    began = time.monotonic()
+    if "LIMBER_BLENDER" in os.environ or not hasattr(os, "getuid") or os.getuid() != 0:
+        return Part("Blender", 0.0, False)
+    print("\n=== Blender ===", flush=True)
+    done = subprocess.run([ROOT / "scripts" / "provision_blender", "--gui-test"], cwd=ROOT,
+                          stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode == 0:
+        os.environ["LIMBER_BLENDER"] = done.stdout.strip().splitlines()[-1]
+    else:
+        print("no real Blender could be provided: its tests will be skipped", flush=True)
+    return Part("Blender", time.monotonic() - began, False)
+
+
+def summary(parts: list[Part]) -> str:
+    """The table of all parts, why tests were skipped, and a closing line."""
+    lines = ["", f"{'part':<10} {'seconds':>8} {'passed':>7} {'failed':>7} {'skipped':>8}"]
+    for part in parts:
+        numbers = ([str(part.counts[key]) for key in ("passed", "failed", "skipped")]
+                   if part.counts else ["-", "failed" if part.failed else "-", "-"])
+        lines.append(f"{part.name:<10} {part.seconds:>8.0f} {numbers[0]:>7} {numbers[1]:>7} "
+                     f"{numbers[2]:>8}")
+    skips = sum((part.skips for part in parts), Counter())
+    if skips:
+        lines += ["", "Skipped:"]
+        lines += [f"{count:>4}  {re.sub(r'^Skipped: ', '', reason)}"
+                  for reason, count in sorted(skips.items())]
+    total = sum((part.counts for part in parts if part.counts), Counter())
+    broken = sum(part.failed and not (part.counts and part.counts["failed"]) for part in parts)
+    lines += ["", f"{total['passed']} passed, {total['failed'] + broken} failed, "
+                  f"{total['skipped']} skipped"]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
