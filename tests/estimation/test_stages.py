@@ -101,7 +101,7 @@ def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, f
     """Killed at its third evaluation, or at its end before anything was entered: the next run
     ends as one in a folder where nothing had happened.
     """
-    settings = QUICK.model_copy(update={"forward": forward})
+    settings = EstimateSettings(forward=forward, key_frames=4, shapes=0)
     clean, early, late = (tmp_path / name for name in ("clean", "early", "late"))
     for folder in (clean, early, late):
         shutil.copytree(branch_folder, folder)
@@ -161,11 +161,11 @@ def test_without_force_the_estimate_refuses(branch_folder):
 def test_following_a_pull(branch_folder):
     """Frame by frame the intervals narrow; it ends at what all frames together give."""
     virtual_pull(branch_folder, "long", VirtualPullSettings(
-        young=tuple(TRUTH), poisson=0.36, frames=40, seed=6, phase=0.5, position_noise=5e-4))
+        young=tuple(TRUTH), poisson=0.36, frames=24, seed=6, phase=0.5, position_noise=5e-4))
     # What follows frame by frame knows one form of the field.
     settings = EstimateSettings(pull=("long",), key_frames=6, field="inverse_distance")
-    result = follow(branch_folder, settings, pace=0, training_count=30)
-    assert result["frame_count"] == 40 and result["method"] == "online"
+    result = follow(branch_folder, settings, pace=0, training_count=12)
+    assert result["frame_count"] == 24 and result["method"] == "online"
     stored = json.loads((branch_folder / "estimate-online.json").read_text())
     widths = [np.log(np.array(state["young_interval_pa"])) @ [-1, 1]
               for state in stored["history"]]
