@@ -41,7 +41,7 @@ def done(tmp_path_factory) -> tuple[Path, dict[str, dict]]:
 
     def stage(name: str, *arguments: object) -> None:
         results[name] = run_stage([name, *map(str, arguments)])
-    stage("generate", folder / "scan", "--seed", 3)
+    stage("generate", folder / "scan", "--seed", 3, "--length", 0.5, "--fork-count", 1)
     stage("reconstruct", folder / "scan" / "cloud.ply", "-o", branch)
     stage("virtual-pull", branch, "--name", "pull-1", "--seed", 3)
     stage("estimate", branch)
