@@ -73,8 +73,8 @@ CORE = ROOT / "worker" / "limber"
 # What may import what: a layer imports those before it, never one beside it or after it.
 LAYERS = (
     ("version", "constants", "errors", "lazy", "threads", "compiled", "sparse", "alignment",
-     "heartbeat", "machine_errors", "optional", "owner", "files", "reading", "caches", "plain",
-     "progress", "settings", "terminal"),
+     "heartbeat", "machine_errors", "names", "optional", "owner", "files", "reading", "caches",
+     "plain", "progress", "settings", "terminal"),
     ("jobs",),
     ("store", "geometry"),
     ("mechanics",), ("exports",),

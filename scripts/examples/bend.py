@@ -8,7 +8,7 @@ import sys
 from limber.stages.loading import load_branch
 from limber.store import Branch
 
-branch = load_branch(Branch.open(sys.argv[1]))
+branch = load_branch(Branch.read(sys.argv[1]))
 grasp = branch.marked_grasp("pinned")
 for way in (0.005, 0.010, 0.015):  # along x [m]
     pose = grasp.rest_pose + [way, 0, 0, 0, 0, 0]

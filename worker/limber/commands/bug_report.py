@@ -1,6 +1,7 @@
 """Gather what a report of a bug needs in one file."""
 
 import json
+import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     """
     from limber.commands.doctor import report
     from limber.errors import InputError
+    from limber.names import is_link
     from limber.plain import plain
     from limber.store.manifest import MANIFEST
 
@@ -36,7 +38,9 @@ def command(run: Run, source: Path, output: Path, data: bool, note: str) -> dict
     told: dict[str, Any] = {"note": note, "doctor": plain(report()), "damages": [], "opens": True}
     if source.is_dir():
         told |= _of_folder(source)
-        files = sorted(path for path in source.rglob("*") if path.is_file())
+        # A link may lead to a file that is none of the branch's.
+        files = sorted(Path(place, name) for place, _, names in os.walk(source) for name in names
+                       if Path(place, name).is_file() and not is_link(Path(place, name)))
         names = {path: path.relative_to(source).as_posix() for path in files}
     else:
         files, names = [source], {source: source.name}
@@ -63,7 +67,9 @@ def _of_folder(folder: Path) -> dict[str, Any]:
     from limber.store import Branch
 
     try:
-        return {"damages": [vars(damage) for damage in Branch.open(folder).damages()]}
+        branch = Branch.read(folder, unfinished=True)
+        return {"damages": [vars(damage) for damage in branch.damages()],
+                "is_unfinished": branch.is_unfinished}
     except BranchFolderError as error:
         # A folder that cannot be opened is the more worth a report.
         return {"opens": False, "error": str(error)}

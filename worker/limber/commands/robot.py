@@ -93,7 +93,7 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
     from limber.robot.cell import read_cell
     from limber.store import Branch
 
-    cell, branch = read_cell(cell_file), Branch.open(branch_folder)
+    cell, branch = read_cell(cell_file), Branch.read(branch_folder)
     if (points_file is None) == (views_file is None):
         raise InputError("Neither --points nor --views is given, or both.",
                          "The base is found from touched points or from a camera's views.",

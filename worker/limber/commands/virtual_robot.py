@@ -66,7 +66,7 @@ def _setting(branch_folder: Path, cell: Any, young: str | None, folder: Path) ->
     if cell is None:
         raise InputError("A branch without a cell file.", "It says where the branch stands.",
                          "Give --cell cell.toml.")
-    branch = Branch.open(branch_folder)
+    branch = Branch.read(branch_folder)
     moduli = tuple(float(part) for part in young.split(",")) if young else ()
     return BranchSetting.of_truth(load_truth(branch, VirtualPullSettings(young=moduli)), cell,
                                   folder / "truth.vtu")

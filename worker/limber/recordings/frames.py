@@ -11,6 +11,7 @@ from limber.errors import InputError
 from limber.geometry.cloud.camera import Camera, read_camera, write_camera
 from limber.geometry.cloud.files import read_points
 from limber.geometry.cloud.pixels import read_pixels
+from limber.names import inside
 from limber.progress import SILENT, Progress
 from limber.reading import checked_as, read_json, read_text
 from limber.recordings.tables import LENGTH_UNITS_M
@@ -164,11 +165,12 @@ def _inside(source: Path, name: str) -> Path:
     Raises:
         InputError: it lies elsewhere.
     """
-    path = source / name
-    if "\0" in name or not path.resolve().is_relative_to(source.resolve()):
-        raise InputError(f"A list in {source} names {name[:100]!r}.",
-                         "It leads out of the recording's folder.", "Correct the list.")
-    return path
+    try:
+        return inside(source, name)
+    except InputError as error:
+        raise InputError(f"A list in {source} names {name[:100]!r}. {error.seen}",
+                         f"{error.why} It may lead out of the recording's folder.",
+                         f"Correct the list. {error.fix}") from error
 
 
 def _camera(source: Path, image: Path) -> Camera:

@@ -13,6 +13,7 @@ from limber.alignment import Alignment
 from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.geometry.cloud.apart import read_apart
+from limber.names import refuse_links
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
 from limber.recordings.bags.pull import JointPoses, pull_of_bag
@@ -179,6 +180,7 @@ def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: I
                    branch: BranchFrame, robot: RobotKnown | None, progress: Progress,
                    ) -> dict[str, Any]:
     if kind == "pull":
+        refuse_links(source)
         shutil.copytree(source, folder, dirs_exist_ok=True)
         pull = read_pull(folder)
     else:

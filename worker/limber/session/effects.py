@@ -103,7 +103,7 @@ def effects_of(folder: Path, settings: SessionSettings, young: np.ndarray, loads
     held.set_young(young)
     outdoors, peak = held.set_outdoors(loads), None
     if gusts is not None:
-        outdoors, peak = with_peak(outdoors, gusts, known_damping(Branch.open(folder), progress))
+        outdoors, peak = with_peak(outdoors, gusts, known_damping(Branch.read(folder), progress))
     _, told = load_effects(
         outdoors, strain_limit=question.strain_limit, deviation=held.young_deviation,
         most=question.most if question.limit_load else None, progress=progress)

@@ -25,7 +25,7 @@ def load_held(folder: Path, settings: SessionSettings,
     Raises:
         BranchFolderError: no branch folder, or no mesh in it. InputError: it lacks the material.
     """
-    branch = Branch.open(folder)
+    branch = Branch.read(folder)
     axes = load_skeleton(branch) if branch.has("skeleton.swc") else None
     return HeldBranch(load_branch(branch, gravity=settings.gravity, progress=progress), axes,
                       young_deviation(branch))

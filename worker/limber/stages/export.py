@@ -75,7 +75,7 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
         InputError: no such format, or it cannot be written. BranchFolderError: the folder lacks
             mesh or skeleton. MissingDependencyError: USD is not installed.
     """
-    branch, suffix = Branch.open(folder), output.suffix.lower()
+    branch, suffix = Branch.read(folder), output.suffix.lower()
     if suffix in _RODS:
         text, told = _rods(branch, suffix, settings, progress)
     elif suffix in _ELEMENTS:

@@ -41,7 +41,7 @@ def export_pull(folder: Path, name: str, output: Path, *, progress: Progress = S
     from limber.recordings.bags.writing import write_mcap
     from limber.recordings.recording import read_pull
 
-    branch = Branch.open(folder)
+    branch = Branch.read(folder)
     entry = branch.require(f"pulls/{name}/pull.toml", "import-pull")
     progress(0.1, "reading the pull")
     pull = read_pull(entry.parent)

@@ -109,7 +109,8 @@ def load(folder: Path, settings: LoadSettings, *, force: bool = False,
                          "Give --wind, --snow, --fruit or --cut.")
     if any(not one[3] > 0 for one in settings.fruit):
         raise InputError("A fruit without mass.", "", "Give --fruit X Y Z KG.")
-    branch = Branch.open(folder)
+    # Without a name nothing is stored.
+    branch = (Branch.read if settings.name is None else Branch.open)(folder)
     inputs = _inputs(branch, settings)
     if settings.name is not None and not force and branch.is_current(
             f"load:{settings.name}", settings, **inputs):

@@ -35,7 +35,7 @@ def predict(branch_folder: Path, settings: PredictSettings, *, progress: Progres
     from limber.stages.loading import load_estimated_subject
 
     require_one_load(settings)
-    branch = Branch.open(branch_folder)
+    branch = Branch.read(branch_folder)
     known = read_estimate(branch.require("estimate.json", "estimate"))
     entry = _entry(branch, settings.pull)
     subject = load_estimated_subject(branch, known, gravity=settings.gravity)

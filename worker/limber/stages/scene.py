@@ -88,7 +88,7 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         raise InputError("Neither or both of --output and --data were given.",
                          "One says what to make.", "Give -o scene.blend.")
     progress(0.0, "reading the branch folder")
-    branch = Branch.open(branch_folder)
+    branch = Branch.read(branch_folder)
     data = scene_data(branch, plan, motion, load_targets(branch), strength)
     if color not in data.info["scalars"]:
         raise InputError(f"The branch has no {color} to show.",

@@ -87,10 +87,10 @@ def review_skeleton(folder: Path, *, edits_path: Path | None = None,
     """
     from limber.geometry.skeleton.doubts import doubtful_parts
 
-    branch = Branch.open(folder)
     if edits_path is not None:
-        _remade(branch, _wanted(branch, edits_path, frame, append), progress)
         branch = Branch.open(folder)
+        _remade(branch, _wanted(branch, edits_path, frame, append), progress)
+    branch = Branch.read(folder)
     skeleton, alignment, mesh = _latest(branch)
     if mesh == "out of date":
         progress.warn("This is the skeleton of the last reconstruct, which did not come to a mesh; "

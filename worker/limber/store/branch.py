@@ -9,8 +9,8 @@ Every stage of the pipeline writes through :meth:`Branch.stage`::
 
 Files are written beside the folder's own and enter it together when the block ends without an
 error; otherwise the folder stays as it was (:mod:`limber.store.journal`). One program at a time
-writes (:mod:`limber.store.lock`), any number read. What killed programs left behind is swept by
-the next one that writes.
+writes (:mod:`limber.store.lock`), any number read (:meth:`Branch.read`, which changes nothing).
+What killed programs left behind is finished or swept by the next one that writes.
 """
 
 import gc
@@ -27,13 +27,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from limber.constants import GRAVITY
-from limber.errors import BranchFolderError, WorkError
+from limber.errors import BranchFolderError, InputError, WorkError
 from limber.files import file_digest, flush_folder, write_atomically
 from limber.machine_errors import machine_error
+from limber.names import inside, refuse_links
 from limber.owner import is_owned_name, owned_name, sweep, sweep_beside
 from limber.plain import plain
 from limber.store import journal
-from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, run_lock
+from limber.store.lock import COMMIT_LOCK, RUN_LOCK, commit_lock, run_lock, wait_for_commit
 from limber.store.manifest import (
     MANIFEST,
     FileEntry,
@@ -96,10 +97,11 @@ class Stage:
 class Branch:
     """An opened branch folder."""
 
-    def __init__(self, folder: Path, manifest: Manifest):
+    def __init__(self, folder: Path, manifest: Manifest, *, only_reads: bool = False):
         self.folder = Path(folder)
         self.manifest = manifest
         self._checker = Checker(self.folder)
+        self._only_reads = only_reads
 
     @property
     def name(self) -> str:
@@ -126,6 +128,7 @@ class Branch:
             BranchFolderError: it holds other files, or cannot be made or written to.
         """
         folder = Path(folder)
+        _refuse_links(folder)
         if (folder / MANIFEST).exists() or journal.is_pending(folder):
             return cls.open(folder)
         if folder.is_dir() and any(not _is_litter(p.name) for p in folder.iterdir()):
@@ -139,25 +142,50 @@ class Branch:
 
     @classmethod
     def open(cls, folder: str | os.PathLike, *, verify: bool = False) -> "Branch":
-        """Open an existing branch folder.
+        """Open an existing branch folder to write to it; what a killed program left is finished.
 
         A file is compared with its checksum when it is used (:meth:`path`), so that a damaged
         one stops what needs it but not the stage that makes it anew; ``verify`` compares all.
 
         Raises:
-            BranchFolderError: not a branch folder, damaged, or of a newer format.
+            BranchFolderError: not a branch folder, damaged, of a newer format, or with links or
+                names that lead out of it.
         """
         folder = Path(folder)
         with _in_words(folder):
-            if not folder.is_dir():
-                raise BranchFolderError(
-                    f"There is no folder {folder}.", "A branch folder was expected.",
-                    "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+            _require_folder(folder)
+            _refuse_links(folder)
             _finish_pending(folder)
             branch = cls(folder, read_manifest(folder))
         if verify:
             branch.verify()
         return branch
+
+    @classmethod
+    def read(cls, folder: str | os.PathLike, *, unfinished: bool = False) -> "Branch":
+        """Open an existing branch folder only to read it: nothing in it is changed.
+
+        Where another program is entering results, it waits for the end of that.
+
+        Args:
+            unfinished: Take a folder with an interrupted commit as it will be when that is
+                finished. Only :meth:`damages` finds the files that are not in place yet.
+
+        Raises:
+            BranchFolderError: as :meth:`open`; or a commit was interrupted, and ``unfinished`` is
+                not set.
+        """
+        folder = Path(folder)
+        with _in_words(folder):
+            _require_folder(folder)
+            _refuse_links(folder)
+            _settle(folder, unfinished=unfinished)
+            return cls(folder, journal.current_manifest(folder), only_reads=True)
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether an interrupted command left results that are not in place yet."""
+        return journal.is_pending(self.folder)
 
     def path(self, name: str) -> Path:
         """Return the path of file or folder ``name``, whether it exists or not.
@@ -166,8 +194,9 @@ class Branch:
             BranchFolderError: the manifest has it, or files in it, and they are damaged.
         """
         name = checked_name(name)
+        path = _inside(self.folder, name)
         self._check(n for n in self.manifest.files if n == name or n.startswith(name + "/"))
-        return self.folder / name
+        return path
 
     def has(self, name: str) -> bool:
         return name in self.manifest.files and (self.folder / checked_name(name)).is_file()
@@ -206,7 +235,10 @@ class Branch:
         damages = self._checker.damages(self.manifest, names)
         if not damages:
             return
-        _finish_pending(self.folder)
+        if self._only_reads:
+            _settle(self.folder)
+        else:
+            _finish_pending(self.folder)
         now = read_manifest(self.folder).files
         renewed = [d.name for d in damages if now.get(d.name) != self.manifest.files[d.name]]
         if renewed:
@@ -373,10 +405,41 @@ def settled_manifest(folder: Path) -> Manifest:
     For those who carry a folder elsewhere and read nothing of it.
 
     Raises:
-        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`.
+        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`; or it has links.
     """
+    _refuse_links(folder)
     _finish_pending(folder)
     return read_manifest(folder)
+
+
+def _require_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise BranchFolderError(
+            f"There is no folder {folder}.", "A branch folder was expected.",
+            "Make one with `limber reconstruct CLOUD -o NAME.branch`.")
+
+
+def _refuse_links(folder: Path) -> None:
+    try:
+        refuse_links(folder)
+    except InputError as error:
+        raise BranchFolderError(error.seen, error.why, error.fix) from error
+
+
+def _inside(folder: Path, name: str) -> Path:
+    try:
+        return inside(folder, name)
+    except InputError as error:
+        raise BranchFolderError(error.seen, error.why, error.fix) from error
+
+
+def _settle(folder: Path, *, unfinished: bool = False) -> None:
+    """Wait for a program that enters results; refuse what a killed one left, unless ``unfinished``.
+    """
+    if journal.is_pending(folder):
+        wait_for_commit(folder)
+        if journal.is_pending(folder) and not unfinished:
+            raise journal.unfinished_error(folder)
 
 
 def _finish_pending(folder: Path) -> None:

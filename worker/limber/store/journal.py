@@ -6,11 +6,13 @@ which the stage counts. Then its files are moved into place, the manifest last. 
 """
 
 import os
+import shlex
 import shutil
 from pathlib import Path
 
 from limber.errors import BranchFolderError
 from limber.files import flush_folder, flush_tree
+from limber.names import inside
 from limber.store.manifest import MANIFEST, Manifest, read_manifest
 
 _COMMIT = ".commit"
@@ -19,6 +21,31 @@ _COMMIT = ".commit"
 def is_pending(folder: Path) -> bool:
     """Whether a killed program left a commit to finish, or a living one is in the middle of it."""
     return (folder / _COMMIT).is_dir()
+
+
+def current_manifest(folder: Path) -> Manifest:
+    """Return the manifest that counts: that of a pending commit, if any. Changes nothing.
+
+    Raises:
+        BranchFolderError: as :func:`~limber.store.manifest.read_manifest`.
+    """
+    pending = folder / _COMMIT
+    return read_manifest(pending if (pending / MANIFEST).exists() else folder)
+
+
+def current_path(folder: Path, name: str) -> Path:
+    """Return where file ``name`` of :func:`current_manifest` is, in place or waiting for it."""
+    waiting = inside(folder, f"{_COMMIT}/{name}")
+    return waiting if waiting.is_file() else inside(folder, name)
+
+
+def unfinished_error(folder: Path) -> BranchFolderError:
+    """Return the error of a command that only reads and meets a commit that was cut off."""
+    return BranchFolderError(
+        f"{folder} has results of an interrupted command that are not in place yet "
+        f"({_COMMIT}).", "This command only reads, and changes nothing in the folder.",
+        f"Run `limber verify {shlex.quote(str(folder))} --finish`, which puts them in place, then "
+        "this again.")
 
 
 def commit(folder: Path, work: Path, manifest: Manifest) -> None:
@@ -63,16 +90,17 @@ def _move_into_place(folder: Path, pending: Path) -> None:
     new = read_manifest(pending)
     old = read_manifest(folder) if (folder / MANIFEST).exists() else None
     touched = {folder}
-    for path in sorted(p for p in pending.rglob("*") if p.is_file()):
-        name = path.relative_to(pending).as_posix()
-        if name == MANIFEST:
+    for name in sorted(new.files):
+        path = inside(pending, name)
+        if not path.is_file():
+            # Of an earlier stage, or moved already.
             continue
-        target = folder / name
+        target = inside(folder, name)
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, target)
         touched |= {place for place in target.parents if place.is_relative_to(folder)}
     for name in set(old.files if old else ()) - set(new.files):
-        (folder / name).unlink(missing_ok=True)
+        inside(folder, name).unlink(missing_ok=True)
     for place in touched:
         flush_folder(place)
     os.replace(pending / MANIFEST, folder / MANIFEST)

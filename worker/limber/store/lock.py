@@ -3,10 +3,12 @@
 Both locks are the operating system's, so that a program's end, however it came, sets them free.
 """
 
+import errno
 import getpass
 import json
 import os
 import socket
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -84,6 +86,41 @@ def commit_lock(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def wait_for_commit(folder: Path) -> None:
+    """Wait, a minute at most, while another program moves results into ``folder``.
+
+    For those that only read: the lock is asked for on a handle that cannot write, and no file is
+    made. Without a lock file there is no such program.
+    """
+    until = time.monotonic() + _COMMIT_WAIT_SECONDS
+    while _is_held(folder / COMMIT_LOCK) and time.monotonic() < until:
+        time.sleep(0.02)
+
+
+def _is_held(path: Path) -> bool:
+    """Whether a program has the lock of a file."""
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+            msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except OSError as error:
+        # Anything else means that this file system has no locks.
+        return error.errno in (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
+    finally:
+        os.close(handle)
 
 
 def _acquire(lock: BaseFileLock, folder: Path, wait_seconds: float) -> None:

@@ -6,7 +6,7 @@ import json
 import platform
 import uuid
 from importlib import metadata
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from limber.alignment import Alignment
 from limber.errors import BranchFolderError, InputError
 from limber.machine_errors import machine_error
+from limber.names import relative_name
 from limber.reading import read_json
 from limber.version import VERSION
 
@@ -87,7 +88,8 @@ def read_manifest(folder: Path) -> Manifest:
     """Read the manifest of a branch folder.
 
     Raises:
-        BranchFolderError: there is none, or it is damaged or of a newer format.
+        BranchFolderError: there is none, it is damaged or of a newer format, or it lists a file
+            outside the folder.
         WorkError: the disk that it is on does not answer.
     """
     path = folder / MANIFEST
@@ -109,13 +111,15 @@ def read_manifest(folder: Path) -> Manifest:
             f"{folder} has format {version}; this Limber ({VERSION}) reads up to {FORMAT_VERSION}.",
             "It was made by a newer Limber.", "Update Limber.")
     try:
-        return Manifest.model_validate(content)
+        manifest = Manifest.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise BranchFolderError(
             f"{path}: {place or 'content'}: {first['msg']}.", "The manifest is damaged.",
             "Restore it from a copy, or reconstruct into a new folder.") from error
+    _require_inside(path, manifest)
+    return manifest
 
 
 def checked_name(name: str) -> str:
@@ -124,14 +128,26 @@ def checked_name(name: str) -> str:
     Raises:
         InputError: it leads out of the folder, or is one of the folder's own.
     """
-    pure = PurePosixPath(name)
-    inside = not pure.is_absolute() and ".." not in pure.parts and pure.parts
-    own = inside and (name == MANIFEST or pure.parts[0].startswith("."))
-    if not inside or own or "\\" in name:
-        raise InputError(f"{name!r} is not a name of a file in a branch folder.",
-                         "It must be relative, stay inside and not begin with a dot.",
-                         "Use a plain name.")
-    return pure.as_posix()
+    plain = relative_name(name)
+    if plain.casefold() == MANIFEST or plain.startswith("."):
+        raise InputError(f"{name!r} cannot be used as a file name in a branch folder.",
+                         f"{MANIFEST} and names with a dot first are the folder's own.",
+                         "Use another name.")
+    return plain
+
+
+def _require_inside(path: Path, manifest: Manifest) -> None:
+    """Refuse a manifest that lists a file outside its folder: commands remove and write those."""
+    for name in (*manifest.files, *(name for stage in manifest.stages.values()
+                                    for name in stage.writes)):
+        try:
+            checked_name(name)
+        except InputError as error:
+            raise BranchFolderError(
+                f"{path} lists a file {name[:200]!r}. {error.why}",
+                "The manifest is damaged or was tampered with. Nothing was changed.",
+                "Get the folder again from where it came, or reconstruct into a new one.",
+            ) from error
 
 
 def program_versions() -> dict[str, str]:

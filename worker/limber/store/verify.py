@@ -7,7 +7,8 @@ from pathlib import Path
 from limber.errors import BranchFolderError
 from limber.files import file_digest
 from limber.owner import is_owned_name
-from limber.store.manifest import MANIFEST, FileEntry, Manifest
+from limber.store import journal
+from limber.store.manifest import MANIFEST, FileEntry, Manifest, read_manifest
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Checker:
 
     def trouble(self, name: str, entry: FileEntry) -> str:
         """Say what is wrong with a file, or ""."""
-        path = self._folder / name
+        path = journal.current_path(self._folder, name)
         if not path.is_file():
             return "missing"
         about = path.stat()
@@ -61,7 +62,12 @@ def damage_error(folder: Path, damages: list[Damage], shown_count: int = 4) -> B
 
 def unlisted(folder: Path, manifest: Manifest) -> list[str]:
     """Return names of files that no stage wrote, without the folder's own hidden ones, sorted."""
+    if journal.is_pending(folder):
+        # Files that go when the commit is finished were listed all the same.
+        listed = manifest.files.keys() | read_manifest(folder).files.keys()
+    else:
+        listed = manifest.files.keys()
     names = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     return sorted(name.as_posix() for name in names
                   if not name.parts[0].startswith(".") and not is_owned_name(name.name)
-                  and name.as_posix() not in manifest.files and name.as_posix() != MANIFEST)
+                  and name.as_posix() not in listed and name.as_posix() != MANIFEST)
