@@ -1,8 +1,17 @@
 """Compiled kernels are kept, and what is kept never stands in the way."""
 
+import importlib.util
+import json
 import os
 import subprocess
 import sys
+import warnings
+
+import pytest
+
+from limber import caches, compiled
+from limber.cli import Run, _warnings_said, call
+from limber.errors import DamagedCacheWarning
 
 KERNEL = """
 from limber.compiled import compiled
@@ -61,3 +70,103 @@ print(twice(1.0), twice(2))
                            env=environment, capture_output=True).stdout.splitlines()
             for _ in range(2)]
     assert told == [["compiling", "2.0 4"], ["2.0 4"]]
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """A function that runs a kernel kept in a folder, as a new process would; and that folder."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache" / "numba"))
+    path = tmp_path / "kernel.py"
+    path.write_text("from limber.compiled import compiled\n\n\n@compiled\n"
+                    "def twice(value):\n    return value + value\n")
+
+    def run():
+        """Returns the result, whether it was compiled, and what was warned of."""
+        monkeypatch.setattr(compiled, "_damage_told", [])
+        spec = importlib.util.spec_from_file_location("kernel", path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            results = module.twice(1.5), module.twice(2)
+        assert all(issubclass(one.category, DamagedCacheWarning) for one in told)
+        return (results, 2 - len(module.twice._cache_hits), [str(one.message) for one in told])
+    assert run() == ((3.0, 4), 2, [])
+    assert run() == ((3.0, 4), 0, [])
+    return run, tmp_path / "cache"
+
+
+def _half(path):
+    path.write_bytes(path.read_bytes()[:path.stat().st_size // 2])
+
+
+def _flipped(path):
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle:middle + 200] = bytes(200)
+    path.write_bytes(content)
+
+
+DAMAGES = {"empty": lambda path: path.write_bytes(b""), "cut": _half,
+           "of other bytes": lambda path: path.write_bytes(os.urandom(500)),
+           "with other bytes inside": _flipped}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_a_damaged_file_is_renewed_and_told_once(kept, suffix, damage):
+    """An index or code: the kernel runs, one warning names a file, and the next run is as ever."""
+    run, folder = kept
+    files = sorted(folder.rglob(f"*{suffix}"))
+    assert files
+    for file in files:
+        DAMAGES[damage](file)
+    results, compiled_count, told = run()
+    assert results == (3.0, 4) and compiled_count == 2
+    assert len(told) == 1 and str(files[0].parent) in told[0] and "compiled anew" in told[0]
+    assert run() == ((3.0, 4), 0, [])
+
+
+def test_a_missing_data_file_is_made_again(kept):
+    """The index still names it: that is no damage."""
+    run, folder = kept
+    for file in folder.rglob("*.nbc"):
+        file.unlink()
+    assert run() == ((3.0, 4), 2, [])
+    assert run() == ((3.0, 4), 0, [])
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+def test_what_cannot_be_read_is_compiled_for_the_run(kept, suffix):
+    """A folder in the place of the file: neither read nor replaced."""
+    run, folder = kept
+    for file in folder.rglob(f"*{suffix}"):
+        file.unlink()
+        file.mkdir()
+    results, compiled_count, told = run()
+    assert results == (3.0, 4) and compiled_count == 2
+    assert len(told) == 1 and "cannot be read" in told[0]
+
+
+def test_cache_clear_removes_empty_files_and_folders(kept, monkeypatch, capsys):
+    """An empty file frees nothing and goes all the same."""
+    run, folder = kept
+    for file in folder.rglob("*.nbi"):
+        file.write_bytes(b"")
+    next(folder.rglob("*.nbc")).unlink()
+    (next(folder.rglob("*.nbi")).parent / "kernel.nbi").mkdir()
+    monkeypatch.setattr(caches, "cache_folder", lambda: folder)
+    assert call(["cache", "--clear", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["caches"] == {
+        "numba": {"file_count": 0, "byte_count": 0}}
+    assert list(folder.rglob("*")) == [folder / "numba"]
+    assert run()[2] == []
+
+
+def test_a_command_says_it_as_its_own_warning():
+    """One line, and among the warnings of its result."""
+    said = []
+    run = Run(None, said.append)
+    with _warnings_said(run):
+        warnings.warn("a file was damaged", DamagedCacheWarning, stacklevel=1)
+    assert run.warnings == ["a file was damaged"] and said == ["warning: a file was damaged"]

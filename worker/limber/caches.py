@@ -56,6 +56,25 @@ def trim(folder: Path, most_bytes: float) -> int:
     return freed
 
 
+def clear(folder: Path) -> int:
+    """Remove every file below ``folder``, and the folders inside its own that are empty then.
+
+    Returns:
+        Bytes that were set free. What another program holds open is passed over.
+    """
+    freed = 0
+    for _, size, path in _files(folder):
+        with contextlib.suppress(OSError):
+            path.unlink()
+            freed += size
+    for place, _folders, _names in os.walk(folder, topdown=False):
+        # The folder of each cache stays: a program that is running may be about to write there.
+        if len(Path(place).relative_to(folder).parts) > 1:
+            with contextlib.suppress(OSError):
+                os.rmdir(place)
+    return freed
+
+
 def _files(folder: Path) -> list[tuple[float, int, Path]]:
     """Time of last use, size and path of each file; locks, which are empty, are left alone."""
     found = []
@@ -63,7 +82,7 @@ def _files(folder: Path) -> list[tuple[float, int, Path]]:
         for name in names:
             path = Path(place, name)
             with contextlib.suppress(OSError):
-                about = path.stat()
+                about = path.lstat()
                 if path.suffix != ".lock":
                     found.append((max(about.st_mtime, about.st_atime), about.st_size, path))
     return found

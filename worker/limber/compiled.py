@@ -5,18 +5,24 @@ Blender's and the user's Python differ, so it goes to the user's cache folder in
 NUMBA_CACHE_DIR wins. Where no folder can be written the kernels are compiled for the process.
 """
 
+import contextlib
 import functools
 import hashlib
+import io
 import os
 import tempfile
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import platformdirs
+from numba.core.caching import IndexDataCacheFile
 from numba.core.event import Event, Listener, register
+
+from limber.errors import DamagedCacheWarning
 
 
 def cache_folder() -> Path | None:
@@ -58,7 +64,7 @@ def compiled(function: Callable) -> Callable:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(folder)
     try:
-        return _forgetful(numba.njit(cache=True, **options)(function))
+        return _forgiving(numba.njit(cache=True, **options)(function))
     finally:
         numba.config.CACHE_DIR = before
 
@@ -83,8 +89,63 @@ class _FirstStart(Listener):
         """Who was told of the start knows enough."""
 
 
-def _forgetful(kernel: Any) -> Any:
-    """Let a kernel be compiled anew where what is kept of it cannot be read any more.
+class _CheckedFile(IndexDataCacheFile):
+    """numba's files of one kernel, each with a checksum behind what numba wrote.
+
+    numba unpickles what it finds, and hands it to the linker: a file that a full disk or a lost
+    computer cut off would end every command, or the process. Here such a file counts as missing.
+    """
+
+    def _load_index(self) -> dict:
+        return super()._load_index() if self._is_whole(self._index_path) else {}
+
+    def _load_data(self, name: str) -> Any:
+        path = self._data_path(name)
+        if not self._is_whole(path):
+            # numba compiles anew where a file is missing.
+            raise FileNotFoundError(path)
+        return super()._load_data(name)
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+        with super()._open_for_write(filepath) as stream:
+            content = io.BytesIO()
+            yield content
+            stream.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+
+    def _is_whole(self, path: str) -> bool:
+        """Whether a file is as it was written, or is not there; one that is damaged is removed."""
+        try:
+            content = Path(path).read_bytes()
+            if content[-_DIGEST:] == hashlib.sha256(content[:-_DIGEST]).digest():
+                return True
+            os.unlink(path)
+            _tell_damage(f"The compiled code kept in {path} was damaged; it is compiled anew.")
+        except FileNotFoundError:
+            # Nothing is kept; or another process has just removed it, and said so.
+            return True
+        except OSError as error:
+            _tell_damage(f"The compiled code kept in {path} cannot be read or replaced "
+                         f"({error.strerror}); it is compiled for this run alone. Remove that "
+                         "file or change its permissions.")
+        return False
+
+
+_DIGEST = hashlib.sha256().digest_size
+
+
+_damage_told: list[str] = []
+
+
+def _tell_damage(message: str) -> None:
+    """Warn, once in a process: where one file is damaged, others mostly are too."""
+    if not _damage_told:
+        _damage_told.append(message)
+        warnings.warn(message, DamagedCacheWarning, stacklevel=2)
+
+
+def _forgiving(kernel: Any) -> Any:
+    """Let a kernel be compiled anew where what is kept of it cannot be used, or nothing be kept.
 
     Types of arguments are kept by module and name. After an update that moves one, numba reads
     the old entry before it sees that the source has changed, and fails.
@@ -92,7 +153,9 @@ def _forgetful(kernel: Any) -> Any:
     cache = getattr(kernel, "_cache", None)  # there is none where numba is told not to compile
     if cache is None:
         return kernel
-    load = cache.load_overload
+    cache._cache_file = _CheckedFile(cache.cache_path, cache._impl.filename_base,
+                                     cache._impl.locator.get_source_stamp())
+    load, save = cache.load_overload, cache.save_overload
 
     def load_or_forget(signature: Any, target: Any) -> Any:
         try:
@@ -100,7 +163,15 @@ def _forgetful(kernel: Any) -> Any:
         except (ImportError, AttributeError):
             cache.flush()
             return None
-    cache.load_overload = load_or_forget
+
+    def save_or_tell(signature: Any, data: Any) -> None:
+        try:
+            save(signature, data)
+        except OSError as error:
+            # The kernel is compiled: that it is not kept costs time, no result.
+            _tell_damage(f"Compiled code cannot be kept in {cache.cache_path} "
+                         f"({error.strerror}): every run compiles it.")
+    cache.load_overload, cache.save_overload = load_or_forget, save_or_tell
     return kernel
 
 

@@ -60,6 +60,10 @@ class SafetyStop(LimberError):
     exit_code = 4
 
 
+class DamagedCacheWarning(UserWarning):
+    """A file that is kept to be quicker the next time could not be used."""
+
+
 class Cancelled(LimberError):
     """The user stopped the work (exit code 130); what was there before is untouched."""
 

@@ -18,12 +18,11 @@ def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
     """
     from limber.batch.units import in_unit
     from limber.caches import cache_folder, known_caches, trim
+    from limber.caches import clear as clear_folder
     from limber.errors import InputError
 
     most = None
-    if clear:
-        most = 0.0
-    elif limit is not None:
+    if limit is not None:
         try:
             most = 1e6 * float(in_unit(limit, "MB"))
         except (TypeError, ValueError) as error:
@@ -31,7 +30,10 @@ def command(run: Run, limit: str | None, clear: bool) -> dict[str, Any]:
                              ) from error
         if not 0 <= most < float("inf"):
             raise InputError(f"--limit {limit!r} is no size.", "", "Write 500 MB or 2 GB.")
-    freed = 0 if most is None else trim(cache_folder(), most)
+    if clear:
+        freed = clear_folder(cache_folder())
+    else:
+        freed = 0 if most is None else trim(cache_folder(), most)
     caches = known_caches()
     run.show(f"Kept in {cache_folder()}", [["what", "files", "MB"], *(
         [one.name, str(one.file_count), f"{one.byte_count / 1e6:.1f}"] for one in caches)])
