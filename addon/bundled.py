@@ -3,6 +3,8 @@
     python bundled.py FOLDER ARGUMENTS...
 
 FOLDER is where it is: where Blender has unpacked the wheels. What the worker starts finds them too.
+Where Blender's numpy may be too old for them, they bring another one, in a folder that Blender
+itself does not search.
 """
 
 import os
@@ -10,8 +12,10 @@ import sys
 
 if __name__ == "__main__":
     folder = sys.argv.pop(1)
-    os.environ["PYTHONPATH"] = folder
-    sys.path[0] = folder
+    own_numpy = os.path.join(folder, "limber_numpy")
+    searched = [own_numpy, folder] if os.path.isdir(own_numpy) else [folder]
+    os.environ["PYTHONPATH"] = os.pathsep.join(searched)
+    sys.path[:1] = searched
     from limber.cli import run
 
     run()

@@ -40,7 +40,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--fast", action="store_true",
                         help="style, types and the quick tests of every package: for each save")
     parser.add_argument("--ci", action="store_true",
-                        help="also bring a real Blender first and test the wheel last")
+                        help="also bring a real Blender first and test zip and wheel last")
     asked, others = parser.parse_known_args(arguments)
     parts = [Part("set-up", float(os.environ.get("LIMBER_SETUP_SECONDS", "0")), False)]
     if asked.ci:
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> int:
     parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
     parts.extend(tests(asked.fast, others))
     if asked.ci:
-        parts.append(command("wheel", [ROOT / "scripts" / "test_wheel"]))
+        parts += [command(name, [ROOT / "scripts" / f"test_{name}"]) for name in ("zip", "wheel")]
     print(summary(parts), flush=True)
     return int(any(part.failed for part in parts))
 

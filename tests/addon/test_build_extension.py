@@ -44,7 +44,7 @@ def test_wheels_are_judged_by_tag_content_and_what_they_require(build, tmp_path)
     """One that fits; another Python's, another machine's program under a fitting name, a
     requirement that is not there, one of too old a version, one that holds on Windows alone."""
     good = _wheel(tmp_path, "fits-1.0-cp311-cp311-manylinux_2_17_x86_64.manylinux2014_x86_64.whl",
-                  ["needed>=2", "numpy>=1.26", "colorama; sys_platform == 'win32'",
+                  ["needed>=2", "numpy>=1.20", "colorama; sys_platform == 'win32'",
                    "docs; extra == 'docs'"], fits=ELF)
     needed = _wheel(tmp_path, "Needed-2.1-py3-none-any.whl")
     assert build.wheels_trouble([good, needed], "linux-x64", "3.11") == []
@@ -62,6 +62,65 @@ def test_wheels_are_judged_by_tag_content_and_what_they_require(build, tmp_path)
                         ["colorama; sys_platform == 'win32'"])
     assert build.wheels_trouble([on_windows], "windows-x64", "3.13") == [
         f"{on_windows.name} requires colorama; sys_platform == 'win32'"]
+
+
+def test_numpy_is_judged_by_the_oldest_blender(build, tmp_path):
+    """Blender 4.2 has 1.24.3: what wants a newer one needs the worker's own beside it."""
+    wants = _wheel(tmp_path, "wants-1.0-py3-none-any.whl", ["numpy>=1.26.4,<2.7"])
+    assert build.wheels_trouble([wants], "linux-x64", "3.11") == [
+        f"{wants.name} requires numpy>=1.26.4,<2.7"]
+    assert build.wheels_trouble([wants], "linux-x64", "3.13") == []
+    own = _wheel(tmp_path, "limber_numpy-1.26.4-cp311-cp311-manylinux_2_17_x86_64.whl")
+    assert build.wheels_trouble([wants, own], "linux-x64", "3.11") == []
+    assert build.brings_numpy("3.11", "1.26.4") and not build.brings_numpy("3.13", "1.26.4")
+
+
+def test_the_workers_numpy_is_found_by_the_worker_alone(build, tmp_path):
+    """Unpacked as Blender unpacks it: a process that searches the folder first does not find it;
+    the worker does, and what the worker starts."""
+    wheel = tmp_path / "numpy-9.9-cp311-cp311-manylinux_2_17_x86_64.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("numpy/__init__.py", "__version__ = '9.9'")
+        archive.writestr("numpy/core/tests/test_all.py", "")
+        archive.writestr("numpy-9.9.dist-info/METADATA", "Name: numpy\nVersion: 9.9\n")
+    made = build.hidden_numpy(wheel)
+    assert made.name == "limber_numpy-9.9-cp311-cp311-manylinux_2_17_x86_64.whl"
+    assert build.wheels_trouble([made], "linux-x64", "3.11") == []
+    folder = tmp_path / "site-packages"
+    with zipfile.ZipFile(made) as archive:
+        assert not [name for name in archive.namelist() if "tests" in name]
+        archive.extractall(folder)
+    (folder / "limber").mkdir()
+    (folder / "limber" / "__init__.py").touch()
+    (folder / "limber" / "cli.py").write_text(
+        "import subprocess, sys\nimport numpy\n\n\ndef run():\n"
+        "    print(numpy.__version__, flush=True)\n"
+        "    subprocess.run([sys.executable, '-c', 'import numpy; print(numpy.__version__)'])\n")
+    worker = subprocess.run([sys.executable, ROOT / "addon" / "bundled.py", folder], check=True,
+                            capture_output=True, text=True)
+    assert worker.stdout.split() == ["9.9", "9.9"]
+    blender = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(folder)!r}); import numpy; "
+         "print(numpy.__version__)"], check=True, capture_output=True, text=True)
+    assert blender.stdout.strip() != "9.9"
+
+
+def test_a_python_without_the_tools_is_told_in_one_line(build, tmp_path, monkeypatch):
+    """A system's Python with an old setuptools: .venv's is taken, or it is said what is missing."""
+    lacking, root = tmp_path / "lacking", tmp_path / "root"
+    lacking.write_text("#!/bin/sh\nexit 1\n")
+    lacking.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(lacking))
+    monkeypatch.setattr(build, "ROOT", root)
+    root.mkdir()
+    shutil.copy(ROOT / "pyproject.toml", root)
+    with pytest.raises(SystemExit, match=r"lacks one of pip, packaging, setuptools.*setup"):
+        build.builder()
+    own = root / ".venv" / "bin" / "python"
+    own.parent.mkdir(parents=True)
+    own.write_text("#!/bin/sh\nexit 0\n")
+    own.chmod(0o755)
+    assert build.builder() == str(own)
 
 
 def _build(root, out):
