@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from limber import cli
 from limber.errors import Cancelled, ConvergenceError, InputError, SafetyStop
 from limber.options import settings_options
+from limber.stages.registry import stage_description, stage_summaries
 
 
 class Settings(BaseModel):
@@ -115,6 +117,38 @@ def test_every_listed_command_exists():
 def test_wrong_usage_is_exit_code_2(arguments):
     """Unknown commands and options, and missing arguments, end with 2."""
     assert cli.call(arguments) == 2
+
+
+REQUIRED = [(name, model, field) for name in stage_summaries()
+            for model in (stage_description(name).inputs, stage_description(name).settings,
+                          stage_description(name).options)
+            for field, about in model.model_fields.items()
+            if about.is_required() and not (about.json_schema_extra or {}).get("argument")]
+
+
+@pytest.mark.parametrize(("name", "model", "field"), REQUIRED)
+def test_a_forgotten_option_is_named_and_a_value_proposed(name, model, field, capfd):
+    """Of every stage: one line, without Python's words; what it proposes is taken."""
+    arguments = [f"some/{key}.xyz" for key, about in model.model_fields.items()
+                 if (about.json_schema_extra or {}).get("argument")]
+    assert cli.call([name, *arguments]) == 2
+    said = capfd.readouterr().err.strip()
+    flag = "--" + field.replace("_", "-")
+    assert said.startswith("error: Missing option") and "\n" not in said
+    assert flag in said and "Path(" not in said and "Field required" not in said
+    proposed = shlex.split(said.partition("for example: ")[2])
+    short = (model.model_fields[field].json_schema_extra or {}).get("short", flag)
+    assert not proposed[proposed.index(short) + 1].isupper()
+    cli.call([name, *arguments, *proposed])
+    assert "Missing" not in capfd.readouterr().err
+
+
+def test_a_forgotten_output_is_named_after_the_input(capfd):
+    """`limber reconstruct ten.xyz` proposes -o ten.branch."""
+    assert cli.call(["reconstruct", "scans/ten.xyz"]) == 2
+    assert capfd.readouterr().err == (
+        "error: Missing option -o (--output). The branch folder to make; with a folder of scans, "
+        "where to make them. Add, for example: -o ten.branch\n")
 
 
 HEAVY = {"numpy", "pydantic", "scipy", "numba", "rich", "trimesh", "matplotlib"}

@@ -7,6 +7,8 @@ unit of a value stands in its description in square brackets.
 
 import math
 import re
+import shlex
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
@@ -79,8 +81,41 @@ def checked_settings(model: type[Model], values: dict[str, Any]) -> Model:
     try:
         return model(**values)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = "--" + str(first["loc"][0] if first["loc"] else "settings").replace("_", "-")
-        raise InputError(f"{place} {first.get('input')!r}: {first['msg']}.",
-                         "It is outside what the stage can work with.",
-                         "See the option's help for its range.") from error
+        raise _refusal(model, values, error) from error
+
+
+def _refusal(model: type[BaseModel], values: dict[str, Any], error: ValidationError) -> InputError:
+    missing = [str(one["loc"][0]) for one in error.errors()
+               if one["type"] == "missing" and len(one["loc"]) == 1]
+    if missing:
+        return _missing(model, values, missing)
+    first = error.errors()[0]
+    message = first["msg"].removeprefix("Value error, ")
+    if not first["loc"]:
+        # It is about several values together, and names them.
+        return InputError(f"{message}.", "", "See the options' help.")
+    return InputError(f"{_flag(str(first['loc'][0]))} {first.get('input')!r}: {message}.",
+                      "It is outside what the stage can work with.",
+                      "See the option's help for its range.")
+
+
+def _missing(model: type[BaseModel], values: dict[str, Any], names: list[str]) -> InputError:
+    """Say which options are missing, what each is, and propose values."""
+    stem = next((value.resolve().stem for value in values.values() if isinstance(value, Path)),
+                "NAME")
+    seen, meant, proposed = [], [], []
+    for name in names:
+        field, flag = model.model_fields[name], _flag(name)
+        extra = field.json_schema_extra or {}
+        short = extra.get("short", flag)
+        seen.append(flag if short == flag else f"{short} ({flag})")
+        meant.append(f"{short}: {field.description}" if len(names) > 1 else field.description or "")
+        proposed.append(f"{short} " + shlex.quote(
+            extra.get("example", name.upper()).format(stem=stem)))
+    what = "option" if len(names) == 1 else "options"
+    return InputError(f"Missing {what} {' and '.join(seen)}.", " ".join(meant),
+                      f"Add, for example: {' '.join(proposed)}")
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

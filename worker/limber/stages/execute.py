@@ -18,7 +18,7 @@ from limber.progress import SILENT, Progress
 from limber.reading import read_columns, read_text
 from limber.robot.attendant import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs
+from limber.stages.inputs import BranchInputs, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -45,7 +45,7 @@ class ExecuteInputs(BranchInputs):
     groups: ClassVar[Groups] = {"input": ("name", "cell")}
 
     name: str = Field("path", description="Name of the plan.")
-    cell: Path = Field(description="The robot's cell file.")
+    cell: Path = required("The robot's cell file.", "cell.toml")
 
 
 class ExecuteSettings(Settings):

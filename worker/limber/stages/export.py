@@ -45,7 +45,7 @@ class ExportInputs(BranchInputs):
     groups: ClassVar[Groups] = {"output": ("output",)}
 
     output: Path = Field(description="File to write; its suffix says what.",
-                         json_schema_extra={"short": "-o"})
+                         json_schema_extra={"short": "-o", "example": "{stem}.urdf"})
 
 
 class ExportSettings(Settings):

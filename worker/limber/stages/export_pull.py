@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pydantic import Field
-
 from limber.errors import InputError
 from limber.progress import SILENT, Progress
 from limber.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs, NoOptions
+from limber.stages.inputs import BranchInputs, NoOptions, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -20,8 +18,8 @@ class ExportPullInputs(BranchInputs):
 
     groups: ClassVar[Groups] = {"input": ("name",), "output": ("mcap",)}
 
-    name: str = Field(description="Name of the pull.")
-    mcap: Path = Field(description="File to write: ROS 2 messages in an MCAP container.")
+    name: str = required("Name of the pull.", "pull-1")
+    mcap: Path = required("File to write: ROS 2 messages in an MCAP container.", "{stem}.mcap")
 
 
 class ExportPullSettings(Settings):

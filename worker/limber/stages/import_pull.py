@@ -14,7 +14,7 @@ from limber.files import file_digest
 from limber.progress import SILENT, Progress
 from limber.recordings.settings import ImportSettings
 from limber.settings import Groups
-from limber.stages.inputs import BranchInputs, RunOptions, argument
+from limber.stages.inputs import BranchInputs, RunOptions, argument, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -32,7 +32,7 @@ class ImportInputs(BranchInputs):
 
     source: Path = argument("Marker CSV, C3D, PLY or RGB-D folder, force table, MCAP, rosbag2, "
                             "RTDE log.")
-    name: str = Field(description="Name of the pull.")
+    name: str = required("Name of the pull.", "pull-1")
     swing: bool = Field(
         False, description="The branch is let go, without a robot. Markers with --weight or --load "
         "become a pull for `limber swing`; other records (accelerometer, strain gauge, a video's "

@@ -13,6 +13,14 @@ def argument(description: str) -> Any:
     return Field(description=description, json_schema_extra={"argument": True})
 
 
+def required(description: str, example: str) -> Any:
+    """Return the field of an option that must be given; ``example`` is proposed where it is not.
+
+    ``{stem}`` in it stands for the name of the first file or folder that is given.
+    """
+    return Field(description=description, json_schema_extra={"example": example})
+
+
 class BranchInputs(Settings):
     """A branch folder."""
 

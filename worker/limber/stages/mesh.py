@@ -28,7 +28,7 @@ class MeshInputs(Settings):
         "z, width, height, and perhaps mass_kg, what hangs there; or a cylinder model: .mat of "
         "TreeQSM or SmartQSM, CSV of rTwig or SimpleForest, MTG, SWC.")
     output: Path = Field(description="The branch folder to make.",
-                         json_schema_extra={"short": "-o"})
+                         json_schema_extra={"short": "-o", "example": "{stem}.branch"})
 
 
 def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None = None, *,

@@ -45,7 +45,7 @@ class ReconstructInputs(Settings):
                            "folder in the output folder, and a bad one does not stop the others.")
     output: Path = Field(
         description="The branch folder to make; with a folder of scans, where to make them.",
-        json_schema_extra={"short": "-o"})
+        json_schema_extra={"short": "-o", "example": "{stem}.branch"})
     skeleton: Path | None = Field(
         None, description="Your own skeleton in the cloud's coordinates: SWC, cylinder CSV (ours, "
         "rTwig's, SimpleForest's), .mat of TreeQSM or SmartQSM, or MTG.")

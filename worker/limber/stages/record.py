@@ -14,7 +14,7 @@ from limber.errors import InputError, SafetyStop, WorkError
 from limber.progress import SILENT, Progress
 from limber.robot.attendant import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.settings import Groups, Settings
-from limber.stages.inputs import BranchInputs
+from limber.stages.inputs import BranchInputs, required
 from limber.stages.registry import StageDescription
 from limber.store import Branch
 
@@ -32,7 +32,7 @@ class RecordInputs(BranchInputs):
 
     groups: ClassVar[Groups] = {"input": ("cell",), "output": ("name",)}
 
-    cell: Path = Field(description="The robot's cell file.")
+    cell: Path = required("The robot's cell file.", "cell.toml")
     name: str = Field("pull-1", description="Name of the recording.")
 
 
