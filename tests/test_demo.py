@@ -1,10 +1,16 @@
 """`limber demo`: what it hands to the stages, and its end when one of them fails."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from limber import cli
 from limber.commands import demo
 from limber.errors import NoPathError
+from limber.options import options_of, without_foreign_options
+
+OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 
 
 @pytest.fixture
@@ -19,7 +25,8 @@ def stages(monkeypatch):
     def run(arguments, _progress):
         seen[arguments[0]] = arguments
         if arguments[0] in seen["fail"]:
-            raise NoPathError("There is no path.", "Walls.", "Move the goal.")
+            raise NoPathError("There is no path (--max-strain 0.01).", "Walls.",
+                              "Raise --max-force or --max-strain. Or move the goal (--goal).")
         return results.get(arguments[0], {})
     monkeypatch.setattr(demo, "run_stage", run)
     return seen
@@ -54,3 +61,43 @@ def test_a_scan_that_cannot_be_meshed_ends_at_once(stages, tmp_path) -> None:
     stages["fail"] = ["reconstruct"]
     assert cli.call(["demo", "-o", str(tmp_path / "out")]) == NoPathError.exit_code
     assert "report" not in stages
+
+
+def test_options_of_reconstruct_reach_it(stages, tmp_path) -> None:
+    """What its refusals propose, the demo takes."""
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    assert cli.call(["demo", str(scan), "-o", str(tmp_path / "out"), "--plants", "largest",
+                     "--unexplained", "1", "--skeleton", "own.swc", "--unit", "mm"]) == 0
+    told = " ".join(stages["reconstruct"])
+    for part in ("--plants largest", "--unexplained 1.0", "--skeleton own.swc", "--unit mm"):
+        assert part in told
+    assert "--young" not in told
+
+
+def test_refusals_of_a_scan_name_only_options_that_the_demo_has() -> None:
+    """All that scan and skeleton code names in its messages."""
+    folder = Path(demo.__file__).parents[1] / "geometry"
+    named = {option for path in [*folder.glob("skeleton/**/*.py"), *folder.glob("cloud/*.py"),
+                                 folder / "reconstruct.py", folder / "left_out.py"]
+             for option in OPTION.findall(path.read_text(encoding="utf-8"))}
+    assert {"--plants", "--crop-low", "--skeleton", "--unexplained"} <= named
+    assert named <= options_of(demo.command)
+
+
+@pytest.mark.parametrize("failing", ["reconstruct", "plan"])
+def test_what_a_stage_alone_can_take_is_not_proposed(stages, tmp_path, failing, capsys) -> None:
+    """Of a stage's advice the demo keeps what its own user can follow."""
+    stages["fail"] = [failing]
+    assert cli.call(["demo", "-o", str(tmp_path / "out")]) == NoPathError.exit_code
+    told = capsys.readouterr().err
+    assert "There is no path. Walls. Or move the goal (--goal)." in told
+    assert f"`limber {failing}` has more options" in told
+    assert {*OPTION.findall(told)} <= options_of(demo.command)
+
+
+def test_sentences_and_brackets_with_other_options_are_left_out() -> None:
+    """Numbers with a point and dashes within words end and name nothing."""
+    text = "At 0.5 m (--voxel 0.1) well-known. Give --b-c 1.5, or --a. Or --b."
+    assert without_foreign_options(text, {"--b", "--a"}) == "At 0.5 m well-known. Or --b."
+    assert without_foreign_options(text, {"--b", "--a", "--b-c", "--voxel"}) == text

@@ -212,7 +212,7 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
                 result = function(state, **options)
     except LimberError as error:
         code = error.exit_code
-        outcome |= {"status": error.status, "error": str(error)}
+        outcome |= {"status": error.status, "error": str(error), "fix": error.fix}
     except KeyboardInterrupt:
         code = 130
         outcome |= {"status": "cancelled", "error": "Cancelled; earlier results are untouched."}

@@ -7,9 +7,10 @@ be given several times. What a field's ``json_schema_extra`` may say beside that
 """
 
 import functools
+import re
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Literal
 
@@ -81,9 +82,37 @@ def _show_all(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None
         ctx.exit()
 
 
-def settings_options(model: type[BaseModel], name: str = "settings",
-                     ) -> Callable[[Callable], Callable]:
+def options_of(command: click.Command) -> frozenset[str]:
+    """Return the options that a command has, as they are typed."""
+    return frozenset(flag for param in command.params if isinstance(param, click.Option)
+                     for flag in (*param.opts, *param.secondary_opts))
+
+
+def without_foreign_options(text: str, own: Collection[str]) -> str:
+    """Return a message without what names options that are not among ``own``.
+
+    For a command that runs others: of its user's options theirs are none. Brackets and sentences
+    that name such an option are left out.
+    """
+    def is_foreign(part: str) -> bool:
+        return not {*_OPTION.findall(part)} <= {*own}
+    text = _BRACKETS.sub(lambda found: "" if is_foreign(found[0]) else found[0], text)
+    return " ".join(part for part in _SENTENCE_END.split(text) if not is_foreign(part))
+
+
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
+_BRACKETS = re.compile(r"\s*\([^()]*\)")
+_SENTENCE_END = re.compile(r"(?<=[.?!])\s+")
+
+
+def settings_options(model: type[BaseModel], name: str = "settings", *,
+                     without: Collection[str] = ()) -> Callable[[Callable], Callable]:
     """Add one option for each field of a model; the function gets ``name=model(...)``.
+
+    Args:
+        model: The model.
+        name: Of the function's argument.
+        without: Fields that get no option and keep their defaults.
 
     Raises:
         InputError: when the command is called with values that the model refuses.
@@ -91,10 +120,13 @@ def settings_options(model: type[BaseModel], name: str = "settings",
     def wrap(function: Callable) -> Callable:
         @functools.wraps(function)
         def body(*args: Any, **options: Any) -> Any:
-            given = {field: options.pop(f"{name}__{field}") for field in model.model_fields}
+            given = {field: options.pop(f"{name}__{field}") for field in model.model_fields
+                     if field not in without}
             values = {field: value for field, value in given.items() if value is not None}
             return function(*args, **{name: checked_settings(model, values)}, **options)
         for field_name, field in reversed(model.model_fields.items()):
+            if field_name in without:
+                continue
             body = _parameter(model, field_name, field, f"{name}__{field_name}")(body)
         return body
     return wrap

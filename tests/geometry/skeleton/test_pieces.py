@@ -1,9 +1,15 @@
 """Pieces of a scan: what is bridged, what is left away, and when it is two plants."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from limber.errors import InputError
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.reconstruct import reconstruct_cloud
+from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.contraction.pieces import join_pieces, second_base
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import SkeletonSettings, skeletonise
@@ -51,6 +57,32 @@ def test_two_plants_are_refused_however_near(distance):
     cloud = np.vstack([_plant(0), _plant(distance, seed=5)])
     with pytest.raises(InputError, match=r"two plants.*--plants largest"):
         skeletonise(cloud)
+
+
+@pytest.mark.parametrize("second", [_plant(0.1, seed=5), _plant(0.9, seed=5) + [0, 0, 0.4]])
+def test_places_are_told_in_the_coordinates_of_the_file(second):
+    """Two plants, near or far apart, in millimetres far from the origin."""
+    cloud = 1000 * (np.vstack([_plant(0), second]) + [5000.0, 300.0, 20.0])
+    with pytest.raises(InputError, match="in the scan's coordinates") as refusal:
+        reconstruct_cloud(Cloud(cloud), ReconstructSettings(unit="mm"))
+    place = [float(part) for part in
+             re.search(r"at \(([^)]*)\)", str(refusal.value))[1].split(",")]
+    assert (cloud.min(axis=0) <= place).all() and (place <= cloud.max(axis=0)).all()
+
+
+def test_warnings_have_places_in_the_coordinates_of_the_file():
+    """What a gap's warning names lies in it; the root is named by its place, not as an origin."""
+    cloud = _tube([0, 0, 0], [0, 0, 0.6], 0.01, 3000)
+    cloud = cloud[np.abs(cloud[:, 2] - 0.3) > 0.015]
+    result = skeletonise(cloud)
+    told = [text for text in result.warnings_at(lambda place: 1000 * (place + [5, 0, 0]))
+            if "gap" in text]
+    place = [float(part) for part in re.search(r"\(([^)]*)\)", told[0])[1].split(",")]
+    assert place == pytest.approx([5000, 0, 300], abs=60)
+    odd = replace(result, other_root=result.skeleton.nodes[-1])
+    text = next(text for text in odd.warnings_at(lambda place: place + [5, 0, 0])
+                if "--root" in text)
+    assert "origin" not in text and text.count("(5.0") + text.count("(4.9") == 2
 
 
 def test_largest_of_two_plants():

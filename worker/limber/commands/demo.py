@@ -1,5 +1,6 @@
 """The whole pipeline on one branch: every stage as a process, and a closing table."""
 
+import functools
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,8 +11,16 @@ import click
 
 from limber.cli import Run, stage_command
 from limber.errors import Cancelled, InputError, LimberError
+from limber.geometry.settings import ReconstructSettings
 from limber.jobs.process import run_stage
 from limber.optional import require_extra
+from limber.options import (
+    GroupedOption,
+    command_line,
+    options_of,
+    settings_options,
+    without_foreign_options,
+)
 
 # Young's modulus [Pa] at the control points for the simulated pull on a scan that comes without
 # a recording: green wood that softens towards the tip.
@@ -28,6 +37,8 @@ class _Demo:
 
     folder: Path
     run: Run
+    own: frozenset[str]
+    """The demo's options."""
     results: dict[str, dict[str, Any]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     done: float = 0.0
@@ -38,38 +49,55 @@ class _Demo:
         started = time.perf_counter()
         progress = self.run.progress.part(self.done, _ENDS[name])
         progress(0.0, title)
-        result = run_stage([str(a) for a in arguments], progress)
+        try:
+            result = run_stage([str(a) for a in arguments], progress)
+        except LimberError as error:
+            raise self._in_own_words(name, error) from error
         self.done = _ENDS[name]
         self.seconds[name] = round(time.perf_counter() - started, 1)
         self.results[name] = result
         self.run.say(f"  {title:<42} {self.seconds[name]:6.1f} s")
         for warning in result.get("warnings", []):
-            self.run.progress.warn(f"{name}: {warning}")
+            if told := without_foreign_options(warning, self.own):
+                self.run.progress.warn(f"{name}: {told}")
+
+    def _in_own_words(self, name: str, error: LimberError) -> LimberError:
+        """Return a stage's error without advice to use options that only the stage has."""
+        seen, why, fix = (without_foreign_options(part, self.own)
+                          for part in (error.seen, error.why, error.fix))
+        if (seen, why, fix) == (error.seen, error.why, error.fix):
+            return error
+        return type(error)(seen or f"{name} failed.", why, " ".join(filter(None, [
+            fix, f"`limber {name}` has more options than the demo; run it by itself on the "
+                 f"results in {self.folder}."])))
+
+
+_option = functools.partial(click.option, cls=GroupedOption, group="demo")
 
 
 @stage_command("demo")
 @click.argument("cloud", required=False, type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="Folder of the results.  [default: out/NAME]")
-@click.option("--unit", type=click.Choice(["m", "cm", "mm", "in"]),
-              help="Unit of the cloud.  [default: m]")
-@click.option("--up", type=float, nargs=3, metavar="X Y Z",
-              help="Which way is up in the cloud's axes.  [default: 0 0 1]")
-@click.option("--root", type=float, nargs=3, metavar="X Y Z",
-              help="A point near the root, in the cloud's coordinates; else the thick end.")
-@click.option("--crop", type=float, nargs=6, metavar="X Y Z X Y Z",
-              help="Lower and upper corner of the part to keep, in the cloud's coordinates.")
-@click.option("--goal", type=float, nargs=3, metavar="X Y Z",
-              help="Where the grasp shall be, in the branch's frame [m]; else a far pose.")
-@click.option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
-              show_default=True, metavar="A,B,C,D",
-              help="True Young's modulus [Pa] at the control points of your CLOUD's pull.")
-@click.option("--seed", type=int, default=1, show_default=True,
-              help="Of the generated branch, the sensor noise and the planner.")
-@click.option("--robot", is_flag=True, help="The whole loop instead, with a virtual robot that "
-              "scans, pulls and moves a generated branch, over loopback.")
-def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None, young: str,
-            seed: int, robot: bool, **wishes: tuple[float, ...] | None) -> dict[str, Any]:
+@_option("-o", "--output", type=click.Path(path_type=Path),
+         help="Folder of the results.  [default: out/NAME]")
+@_option("--crop", type=float, nargs=6, metavar="X Y Z X Y Z",
+         help="Lower and upper corner of the part to keep, in the cloud's coordinates.")
+@_option("--skeleton", type=click.Path(path_type=Path),
+         help="Your own skeleton in the cloud's coordinates, as of `limber reconstruct`.")
+@_option("--edits", type=click.Path(path_type=Path),
+         help="Edits of the skeleton, as of `limber skeleton`.")
+@_option("--goal", type=float, nargs=3, metavar="X Y Z",
+         help="Where the grasp shall be, in the branch's frame [m]; else a far pose.")
+@_option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
+         show_default=True, metavar="A,B,C,D",
+         help="True Young's modulus [Pa] at the control points of your CLOUD's pull.")
+@_option("--seed", type=int, default=1, show_default=True,
+         help="Of the generated branch, the sensor noise and the planner.")
+@_option("--force", is_flag=True, help="Reconstruct again even if nothing has changed.")
+@_option("--robot", is_flag=True, help="The whole loop instead, with a virtual robot that "
+         "scans, pulls and moves a generated branch, over loopback.")
+@settings_options(ReconstructSettings, "scan", without=("young",))
+def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed: int, robot: bool,
+            **wishes: Any) -> dict[str, Any]:
     """The whole pipeline on one branch: a generated one with known truth, or your CLOUD."""
     if robot:
         return _closed_loop(run, cloud, output or Path("out") / "robot", seed)
@@ -79,12 +107,12 @@ def command(run: Run, cloud: Path | None, output: Path | None, unit: str | None,
     # Before minutes of work, not after them.
     require_extra("report", ("matplotlib", "jinja2"), "The demo's report")
     name = cloud.stem if cloud else "generated"
-    demo = _Demo(output or Path("out") / name, run)
+    demo = _Demo(output or Path("out") / name, run,
+                 options_of(click.get_current_context().command))
     _make_folder(demo.folder)
     started = time.perf_counter()
     run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
-    branch, failure = _run_stages(demo, cloud, name, unit=unit, young=young, seed=seed,
-                                  wishes=wishes)
+    branch, failure = _run_stages(demo, cloud, name, young=young, seed=seed, wishes=wishes)
     _show_tables(demo)
     summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}
     run.say(f"\nreport  {summary['report']}\nscene   {summary['scene']}\n"
@@ -122,9 +150,8 @@ def _closed_loop(run: Run, cloud: Path | None, folder: Path, seed: int) -> dict[
     return result | {"report": report, "demo_seconds": seconds}
 
 
-def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None, young: str,
-                seed: int, wishes: Mapping[str, tuple[float, ...] | None],
-                ) -> tuple[Path, LimberError | None]:
+def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, young: str, seed: int,
+                wishes: Mapping[str, Any]) -> tuple[Path, LimberError | None]:
     """Run all stages; what fails between mesh and scene ends in a report all the same.
 
     Returns:
@@ -138,9 +165,7 @@ def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None,
         cloud = source / "cloud.ply"
     else:
         truth = ["--young", young]
-    units = ["--unit", unit] if unit else []
-    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *units,
-               *_scan_options(wishes))
+    demo.stage("scan to tetrahedra", "reconstruct", cloud, "-o", branch, *_scan_options(wishes))
     goal = ["--goal", *wishes["goal"]] if wishes.get("goal") else []
     failure = None
     try:
@@ -163,15 +188,17 @@ def _run_stages(demo: _Demo, cloud: Path | None, name: str, *, unit: str | None,
     return branch, failure
 
 
-def _scan_options(wishes: Mapping[str, tuple[float, ...] | None]) -> list[object]:
+def _scan_options(wishes: Mapping[str, Any]) -> list[object]:
     """What is known of the scan, as options of `limber reconstruct`."""
-    options: list[object] = []
-    for name in ("up", "root"):
-        if wishes.get(name):
-            options += [f"--{name}", *wishes[name]]
-    if wishes.get("crop"):
-        options += ["--crop-low", *wishes["crop"][:3], "--crop-high", *wishes["crop"][3:]]
-    return options
+    scan = wishes["scan"]
+    if wishes["crop"]:
+        scan = scan.model_copy(update={"crop_low": wishes["crop"][:3],
+                                       "crop_high": wishes["crop"][3:]})
+    options: list[object] = list(command_line(scan))
+    for name in ("skeleton", "edits"):
+        if wishes[name]:
+            options += [f"--{name}", wishes[name]]
+    return [*options, "--force"] if wishes["force"] else options
 
 
 def _make_folder(folder: Path) -> None:

@@ -126,7 +126,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
         check_explained(whole, settings.unexplained)
     # Kept beside the mesh's own, which edits of the skeleton make anew.
     told = list(prepared.warnings)
-    for text in found.warnings:
+    for text in found.warnings_at(alignment.undo):
         told.append(text)
         progress.warn(text)
     if edits:
@@ -331,7 +331,8 @@ def _skeleton(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
     scale = UNIT_METRES[settings.unit]
     root = None if settings.root is None else np.array(settings.root) * scale - prepared.origin
     return skeletonise(prepared.cloud.points, settings, root=root, up=np.array(settings.up),
-                       camera=prepared.view is not None, progress=progress)
+                       camera=prepared.view is not None, progress=progress,
+                       where=lambda place: (place + prepared.origin) / scale)
 
 
 def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSettings,

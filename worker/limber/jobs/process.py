@@ -154,7 +154,9 @@ def _failure(name: str, code: int, result: dict[str, Any], errors: TextIO,
              fix: str) -> LimberError:
     kind = _ERRORS.get(code, WorkError)
     if result.get("error"):
-        return kind(f"{name}: {result['error']}")
+        # What to do is kept apart: a command that runs others has other options.
+        advice = str(result.get("fix") or "")
+        return kind(f"{name}: {str(result['error']).removesuffix(advice).rstrip()}", "", advice)
     errors.seek(0)
     tail = " | ".join(errors.read().strip().splitlines()[-4:])
     return kind(f"{name} ended with exit code {code} and no result.", tail, fix)

@@ -1,15 +1,18 @@
 """Whether a cloud and its skeleton can be a plant: what is refused, and what is told."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from limber.errors import InputError
-from limber.geometry.cloud.own_frame import OwnFrame
 from limber.geometry.skeleton.contraction.curve_graph import CurveGraph
 from limber.geometry.skeleton.contraction.laplacian_contraction import ContractionStatus
 from limber.geometry.skeleton.skeleton import Skeleton
+
+Where = Callable[[np.ndarray], np.ndarray]
+"""Takes places, shape [..., 3], to coordinates that the user knows: those of the scan's file."""
 
 _STOUT = 0.13  # median way from the axes over the cloud's size; leafy seedlings 0.1, balls 0.2
 _ROUND = 0.3  # of the radius, up to which points may scatter and show what is round
@@ -18,7 +21,7 @@ _FIX = "Cut out one branch (--crop-low, --crop-high), or bring a skeleton (--ske
 
 
 def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
-                    own: OwnFrame) -> None:
+                    where: Where) -> None:
     """Refuse a ball, and two plants unless ``plants`` says which to take.
 
     Args:
@@ -26,7 +29,7 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
         count: Number of points that it was made of.
         diagonal: Size of the cloud [m].
         plants: ``refuse``, ``largest`` or ``joined``.
-        own: The frame that the graph's places are in.
+        where: Takes a place of the graph to the user's coordinates.
 
     Raises:
         InputError: one of these.
@@ -46,8 +49,8 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
     for plant in graph.plants:
         raise InputError(
             f"There are two plants, {plant['distance']:.3g} m apart at "
-            f"{_place(own.outside(plant['at']))}: {100 * plant['points'] / count:.0f} % of the "
-            "points stand on a base of their own.",
+            f"{_place(where(plant['at']))} in the scan's coordinates: "
+            f"{100 * plant['points'] / count:.0f} % of the points stand on a base of their own.",
             "A branch is one plant, and which of them is meant the scan does not say.",
             f"{_FIX} Or take the larger one (--plants largest), or join them (--plants joined).")
     for piece in graph.split_off:
@@ -55,7 +58,8 @@ def check_one_plant(graph: CurveGraph, count: int, diagonal: float, plants: str,
         if share > 0.2 and piece["distance"] > 0.25 * diagonal:
             raise InputError(
                 f"There are two far-apart clusters: {100 * share:.0f} % of the points lie "
-                f"{piece['distance']:.3g} m from the rest.", "A branch is in one piece.",
+                f"{piece['distance']:.3g} m from the rest, at {_place(where(piece['at']))} in the "
+                "scan's coordinates.", "A branch is in one piece.",
                 f"{_FIX} Or take the larger one (--plants largest).")
 
 
@@ -91,7 +95,13 @@ def _sheet_share(points: np.ndarray, reach: float) -> float:
     return float(np.mean(flat)) if flat else 0.0
 
 
-def warnings(result: Any) -> list[str]:
+def warnings(result: Any, where: Where) -> list[str]:
+    """Return what the user should know of a skeleton.
+
+    Args:
+        result: The skeleton and what was done to get it.
+        where: Takes its places to the user's coordinates.
+    """
     texts = []
     if result.contraction.status is ContractionStatus.given:
         far = float(np.mean(np.abs(result.residual) > 3 * result.skeleton.radius[
@@ -103,7 +113,7 @@ def warnings(result: Any) -> list[str]:
     longest = sorted(result.bridges, key=lambda bridge: -bridge["length"])
     for bridge in longest[:_NAMED]:
         texts.append(f"A gap of {1000 * bridge['length']:.0f} mm was bridged at "
-                     f"{_place(bridge['to'])}.")
+                     f"{_place(where(bridge['to']))}.")
     if len(longest) > _NAMED:
         texts.append(f"{len(longest) - _NAMED} shorter gaps were bridged "
                      f"(up to {1000 * longest[_NAMED]['length']:.0f} mm).")
@@ -114,7 +124,7 @@ def warnings(result: Any) -> list[str]:
         texts.append(
             f"{len(result.split_off)} pieces ({share:.1f} % of the points) were left away: too "
             "far from the rest for their size. The largest is "
-            f"{1000 * largest['distance']:.0f} mm off, at {_place(largest['at'])}.")
+            f"{1000 * largest['distance']:.0f} mm off, at {_place(where(largest['at']))}.")
     for loop in sorted(result.loops)[::-1][:_NAMED]:
         texts.append(f"A closed loop of {1000 * loop:.0f} mm was opened: branches touch there.")
     if len(result.loops) > _NAMED:
@@ -124,11 +134,13 @@ def warnings(result: Any) -> list[str]:
         texts.append(f"{len(result.unlikely)} twigs (up to {1000 * longest:.0f} mm) were dropped: "
                      "more likely than not they are not there (--twig-probability).")
     if result.second_base is not None:
-        texts.append(f"The plant stands on a second base, at {_place(result.second_base)}: two "
-                     "plants that touch? Cut out one of them (--crop-low, --crop-high).")
+        texts.append("The plant stands on a second base, at "
+                     f"{_place(where(result.second_base))}: two plants that touch? "
+                     "Cut out one of them (--crop-low, --crop-high).")
     if result.other_root is not None:
-        texts.append(f"The end at {_place(result.other_root)} is about as likely the root as that "
-                     "at the origin: name it (--root) if it is.")
+        texts.append(f"The end at {_place(where(result.other_root))} is about as likely the root "
+                     f"as that at {_place(where(result.skeleton.nodes[0]))}: name it (--root) if "
+                     "it is.")
     misfit = unexplained_share(result)
     if misfit > 0.15:
         texts.append(f"{100 * misfit:.0f} % of the points lie on no round axis: leaves, flying "

@@ -27,6 +27,7 @@ from limber.geometry.skeleton.contraction.pieces import second_base
 from limber.geometry.skeleton.mending.backwards import without_backward_starts
 from limber.geometry.skeleton.mending.kinks import without_kinks
 from limber.geometry.skeleton.plausibility import (
+    Where,
     check_no_sheet,
     check_one_plant,
     check_round,
@@ -105,7 +106,11 @@ class SkeletonResult:
     @property
     def warnings(self) -> list[str]:
         """What the user should know, with places in the cloud's frame."""
-        return warnings(self)
+        return self.warnings_at(lambda place: place)
+
+    def warnings_at(self, where: Where) -> list[str]:
+        """What the user should know, with places as ``where`` takes them to other coordinates."""
+        return warnings(self, where)
 
     def moved(self, move: Callable[[np.ndarray], np.ndarray]) -> "SkeletonResult":
         """Return the result in another frame; ``move`` takes points [n, 3] there."""
@@ -133,7 +138,8 @@ class SkeletonResult:
 
 def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
                 root: np.ndarray | None = None, up: np.ndarray | None = None,
-                camera: bool = False, progress: Progress = SILENT) -> SkeletonResult:
+                camera: bool = False, where: Where | None = None,
+                progress: Progress = SILENT) -> SkeletonResult:
     """Find the rooted skeleton of a cloud.
 
     Args:
@@ -142,6 +148,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
         root: Near which point [m] the root is, shape [3]; None: the thick end of the plant.
         up: Which way is up, shape [3]; None: z.
         camera: The points are a depth camera's, and scatter along its sight alone.
+        where: Takes places of the cloud to the coordinates of its file, for errors; None: they
+            are the same.
         progress: Called as it goes.
 
     Raises:
@@ -152,7 +160,8 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
     own = OwnFrame.of(points)
     up = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
     found = _of_ordered(own, settings or SkeletonSettings(),
-                        None if root is None else own.inside(root), up @ own.axes, camera, progress)
+                        None if root is None else own.inside(root), up @ own.axes, camera,
+                        where or (lambda place: place), progress)
     place, drawn = np.argsort(own.order), found.contraction
     return replace(found.moved(own.outside), contraction=replace(
         drawn, points=own.outside(drawn.points), drawn=own.outside(drawn.drawn)),
@@ -160,7 +169,7 @@ def skeletonise(points: np.ndarray, settings: SkeletonSettings | None = None, *,
 
 
 def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | None,
-                up: np.ndarray, camera: bool, progress: Progress) -> SkeletonResult:
+                up: np.ndarray, camera: bool, where: Where, progress: Progress) -> SkeletonResult:
     """The skeleton of points in the cloud's own frame; ``root`` and ``up`` are in that too."""
     points = own.places
     thin = thinned(points, settings.contraction_points)
@@ -174,7 +183,8 @@ def _of_ordered(own: OwnFrame, settings: SkeletonSettings, root: np.ndarray | No
     graph = curve_graph(points[thin], contraction.drawn, gap_factor=settings.gap_factor,
                         bridge_limit=settings.bridge_limit * diagonal, up=up,
                         join_plants=settings.plants == "joined")
-    check_one_plant(graph, len(thin), diagonal, settings.plants, own)
+    check_one_plant(graph, len(thin), diagonal, settings.plants,
+                    lambda place: where(own.outside(place)))
     start, other_root = _root_node(graph, points[thin], root, up, settings.prune)
     if is_sparse(points[thin], contraction.drawn):
         thin, loops, base = thinned(points, POINT_LIMIT), graph.loops, graph.nodes[start]
