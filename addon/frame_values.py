@@ -4,6 +4,7 @@ A .blend keeps the values of one frame alone; those of all stand in ``.viewport/
 branch folder, so that a file that was closed and moved still plays in colours.
 """
 
+import errno
 import json
 import os
 import tempfile
@@ -69,6 +70,9 @@ def _frames_sha256(folder: Path, motion: str) -> str:
 def keep(folder: Path, motion: str, values: FrameValues) -> None:
     """Write the values of a motion into the branch folder; OSError where that cannot be."""
     path = path_of(folder, motion)
+    if path.name != f"{motion}.npz" or path.parent.is_symlink():
+        # The folder, and the name in it, may come from anybody.
+        raise OSError(errno.EPERM, "a name or a link in it leads out of it")
     path.parent.mkdir(exist_ok=True)
     arrays = {f"{kind}:{name}": array for kind, named in (
         ("scalar", values.scalars), ("level", values.levels), ("palette", values.palettes))

@@ -120,6 +120,23 @@ def test_a_motion_of_another_size_is_not_shown(addon, tmp_path):
     assert [path.name for path in (tmp_path / ".viewport").iterdir()] == ["swing.npz"]
 
 
+def test_values_of_a_motion_stay_in_their_folder(addon, tmp_path):
+    """A name that leads out of it, or a link in the place of its folder, is refused."""
+    frame_values = part("frame_values")
+    values = frame_values.FrameValues({}, {}, {})
+    branch, elsewhere = tmp_path / "a.branch", tmp_path / "elsewhere"
+    branch.mkdir()
+    elsewhere.mkdir()
+    for name in ("../../out", "sub/out", str(tmp_path / "out")):
+        with pytest.raises(OSError, match="leads out"):
+            frame_values.keep(branch, name, values)
+    (branch / ".viewport").symlink_to(elsewhere)
+    with pytest.raises(OSError, match="leads out"):
+        frame_values.keep(branch, "swing", values)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [".viewport", "a.branch",
+                                                                 "elsewhere"]
+
+
 def test_what_can_be_shown_and_hidden(bpy, opened):
     """Trees are hidden at first, paths are not; what is not there is said."""
     seeing, branch = part("operators.seeing"), part("branches").branch_of(opened)

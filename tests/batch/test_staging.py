@@ -207,6 +207,30 @@ def test_a_transfer_that_was_cut_off_is_seen_and_ended(away, memory, tmp_path):
         bring_in(other, on)
 
 
+@pytest.mark.parametrize("name", ["../../victim.txt", "/victim.txt", "C:/victim.txt"])
+def test_a_branch_at_an_address_brings_no_file_outside_itself(away, memory, tmp_path, name):
+    """Its manifest, and what stands beside it there, may come from anybody."""
+    _, job = away
+    content = json.loads(memory.cat("/old/a.branch/branch.json"))
+    content["files"][name] = content["files"]["mesh.vtu"]
+    memory.pipe_file("/old/a.branch/branch.json", json.dumps(content).encode())
+    memory.pipe_file("/victim.txt", b"evil")
+    other = BranchJob("a", tmp_path / "other" / "a.branch", (), home=job.home)
+    with pytest.raises(BranchFolderError, match="lists a file"):
+        bring_in(other, on)
+    assert not other.folder.exists() and not list(tmp_path.rglob("victim.txt"))
+
+
+def test_no_file_that_a_link_names_is_put_to_an_address(away, memory, tmp_path):
+    """A link in the branch's folder would give away what it leads to."""
+    jobs, job = away
+    bring_in(job, on)
+    (job.folder / "mesh.vtu").unlink()
+    (job.folder / "mesh.vtu").symlink_to(tmp_path / "first.branch" / "branch.json")
+    with pytest.raises(BranchFolderError, match="is a link"):
+        put_out(jobs, job)
+
+
 def test_a_batch_from_addresses_to_an_address(memory, tmp_path, capsys):
     """Scans and results in fsspec's memory; again from nothing here it repeats no stage."""
     for name in ("one", "two"):
