@@ -10,8 +10,10 @@ import warnings
 import pytest
 
 from limber import caches, compiled
-from limber.cli import Run, _warnings_said, call
+from limber.cli import Run, call
 from limber.errors import DamagedCacheWarning
+from limber.jobs.pool import Pool
+from limber.progress import damage_told_to
 
 KERNEL = """
 from limber.compiled import compiled
@@ -163,10 +165,24 @@ def test_cache_clear_removes_empty_files_and_folders(kept, monkeypatch, capsys):
     assert run()[2] == []
 
 
-def test_a_command_says_it_as_its_own_warning():
-    """One line, and among the warnings of its result."""
+def test_a_command_says_it_once_as_its_own_warning():
+    """One line, and among the warnings of its result, however many processes warn."""
     said = []
     run = Run(None, said.append)
-    with _warnings_said(run):
-        warnings.warn("a file was damaged", DamagedCacheWarning, stacklevel=1)
-    assert run.warnings == ["a file was damaged"] and said == ["warning: a file was damaged"]
+    with damage_told_to(run.progress.warn):
+        for number in range(3):
+            warnings.warn(f"file {number} was damaged", DamagedCacheWarning, stacklevel=1)
+    assert run.warnings == ["file 0 was damaged"] and said == ["warning: file 0 was damaged"]
+
+
+def _damaged(number):
+    warnings.warn(f"file {number} was damaged", DamagedCacheWarning, stacklevel=1)
+    return number
+
+
+def test_processes_of_a_pool_warn_through_the_command():
+    """Two that find damage: one warning."""
+    told = []
+    with damage_told_to(told.append), Pool(2) as pool:
+        assert sorted(pool.map(_damaged, [(0,), (1,)])) == [0, 1]
+    assert len(told) == 1 and "was damaged" in told[0]

@@ -7,7 +7,6 @@ here take ``--json`` and ``--progress``, end with the exit codes of ``limber.err
 """
 
 import ast
-import contextlib
 import functools
 import importlib
 import json
@@ -16,17 +15,16 @@ import signal
 import sys
 import time
 import traceback
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from limber.errors import DamagedCacheWarning, LimberError
+from limber.errors import LimberError
 from limber.heartbeat import Heartbeat
 from limber.machine_errors import machine_error
-from limber.progress import BarSink, JsonSink, Progress, Sink
+from limber.progress import BarSink, JsonSink, Progress, Sink, damage_told_to
 from limber.stages.registry import stage_description, stage_module, stage_schema, stage_summaries
 from limber.terminal import result_lines, table_lines
 from limber.version import VERSION
@@ -202,13 +200,13 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
         if progress_style == "bar":
             with BarSink(name) as bar:
                 state = Run(bar, bar.say)
-                with _warnings_said(state):
+                with damage_told_to(state.progress.warn):
                     result = function(state, **options)
         elif lines is not None:
-            with Heartbeat(lines.say), _warnings_said(state):
+            with Heartbeat(lines.say), damage_told_to(state.progress.warn):
                 result = function(state, **options)
         else:
-            with _warnings_said(state):
+            with damage_told_to(state.progress.warn):
                 result = function(state, **options)
     except LimberError as error:
         code = error.exit_code
@@ -227,21 +225,6 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
     outcome |= {"seconds": round(time.perf_counter() - started, 3), "warnings": state.warnings}
     _print_outcome(outcome, result or {}, as_json)
     return code
-
-
-@contextlib.contextmanager
-def _warnings_said(run: Run) -> Iterator[None]:
-    """Say a warning about a damaged cache as the command's own; it comes from deep below."""
-    with warnings.catch_warnings():
-        shown = warnings.showwarning
-
-        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-            if issubclass(category, DamagedCacheWarning):
-                run.progress.warn(str(message))
-            else:
-                shown(message, category, *place, **more)
-        warnings.showwarning = show
-        yield
 
 
 def _print_outcome(outcome: dict[str, Any], result: dict[str, Any], as_json: bool) -> None:

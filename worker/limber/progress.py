@@ -9,14 +9,16 @@ is also a place where the work can stop. ``progress.part(0.2, 0.6)`` is a view f
 What the user should know though the work goes on is told with ``progress.warn(message)``.
 """
 
+import contextlib
 import json
 import sys
 import threading
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
 from typing import Any, TextIO
 
-from limber.errors import Cancelled
+from limber.errors import Cancelled, DamagedCacheWarning
 
 Sink = Callable[[float, str, dict[str, Any]], None]
 
@@ -154,3 +156,24 @@ class BarSink:
 
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+@contextlib.contextmanager
+def damage_told_to(tell: Callable[[str], None]) -> Iterator[None]:
+    """Hand the first warning about a damaged cache to ``tell``; it comes from deep below.
+
+    Where one file of a cache is damaged others mostly are too: the user reads of one.
+    """
+    told: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", DamagedCacheWarning)
+        shown = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+            if not issubclass(category, DamagedCacheWarning):
+                shown(message, category, *place, **more)
+            elif not told:
+                told.append(str(message))
+                tell(told[0])
+        warnings.showwarning = show
+        yield

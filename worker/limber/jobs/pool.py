@@ -8,6 +8,7 @@ may be killed at any moment, for its time, its memory or a crash, and only its t
 
 import atexit
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
@@ -17,10 +18,18 @@ from multiprocessing.connection import wait as wait_for_any
 from threading import Event, Lock, Thread
 from typing import Any
 
-from limber.errors import Cancelled, WorkError
+from limber.errors import Cancelled, DamagedCacheWarning, WorkError
 from limber.jobs.budget import core_budget, worker_count
 from limber.jobs.ending import kill_tree
-from limber.jobs.pool_process import Began, Failed, Reported, Returned, Task, serve
+from limber.jobs.pool_process import (
+    Began,
+    CacheDamaged,
+    Failed,
+    Reported,
+    Returned,
+    Task,
+    serve,
+)
 from limber.progress import SILENT, Progress
 
 _TICK_SECONDS = 0.1
@@ -230,6 +239,8 @@ class Pool:
     def _take(self, worker: "_Worker", said: Any) -> None:
         if isinstance(said, Began):
             worker.has_begun = True
+        elif isinstance(said, CacheDamaged):
+            warnings.warn(said.message, DamagedCacheWarning, stacklevel=2)
         elif isinstance(said, Reported) and worker.job is not None:
             worker.job.report(said)
         elif isinstance(said, Returned) and worker.job is not None:

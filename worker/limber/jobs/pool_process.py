@@ -16,7 +16,7 @@ from typing import Any
 from limber.errors import LimberError, WorkError
 from limber.jobs.budget import CORES
 from limber.jobs.ending import end_by_kernel
-from limber.progress import Progress
+from limber.progress import Progress, damage_told_to
 
 _REPORT_SECONDS = 0.05
 
@@ -51,6 +51,13 @@ class Reported:
 
 
 @dataclass(frozen=True)
+class CacheDamaged:
+    """A warning about a damaged cache, from whatever the process does."""
+
+    message: str
+
+
+@dataclass(frozen=True)
 class Returned:
     """A task's result."""
 
@@ -81,6 +88,12 @@ def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) ->
     tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
     voice = _Voice(pipe)
     threading.Thread(target=_receive, args=(pipe, tasks, voice), daemon=True).start()
+    with damage_told_to(lambda message: voice.say(CacheDamaged(message))):
+        _work(tasks, voice, begin)
+
+
+def _work(tasks: "queue.SimpleQueue[Task]", voice: "_Voice",
+          begin: tuple[Callable | None, tuple]) -> None:
     try:
         if begin[0] is not None:
             begin[0](*begin[1])
