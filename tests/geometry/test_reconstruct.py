@@ -239,3 +239,16 @@ def test_a_leafy_plants_leaves_are_cut_off(tomato_draws, seed):
     assert made.numbers["leaf_count"] == 2
     assert 0.7 < made.cloud.attributes["leaf"].mean() < 0.8
     assert made.numbers["radius_max_m"] < 0.002
+
+
+def test_columns_of_any_name_come_through(tmp_path):
+    """Titles that are no names of properties, or that mean something to Limber, lose nothing."""
+    points = generate_branch(5, fork_count=0, length=0.4, point_spacing=0.004).cloud.points
+    table = np.column_stack([np.arange(len(points)), points, np.tile([1, 2, 3], (len(points), 1))])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", comments="", encoding="utf-8",
+               header='"",x,y,z,Intensität [%],leaf,normal')
+    reconstruct(tmp_path / "a.csv", tmp_path / "a.branch")
+    cloud = read_points(Branch.open(tmp_path / "a.branch").path("cloud.ply"))
+    assert len(cloud) > 0.9 * len(points)
+    assert cloud.attributes.keys() == {"unnamed", "intensitat", "leaf_2", "normal_2",
+                                       "skeleton_node", "residual"}

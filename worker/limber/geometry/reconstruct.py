@@ -42,6 +42,7 @@ from limber.progress import SILENT, Progress
 Keep = Callable[[Alignment, Skeleton, FoundSkeleton], None]
 """Takes in a skeleton as it was found, and all that the search for it came to."""
 
+_OWN_COLUMNS = ("skeleton_node", "residual", "leaf")  # of cloud.ply, whatever the scan's are
 _LEAVES_ASKED = 0.2  # share of points on no round axis, from which leaves are looked for
 # Share of leaves that tells them by shape alone: of bare branches seen from one side up to 0.11 is
 # flat, of leafy seedlings 0.6 and more.
@@ -107,6 +108,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
     Raises:
         InputError: the scan or the skeleton cannot be used. WorkError: the work failed.
     """
+    raw = raw.with_valid_columns(_OWN_COLUMNS)
     prepared = prepare(raw, UNIT_METRES[settings.unit], settings, eye=eye,
                        up=np.array(settings.up, float))
     for text in prepared.warnings:
@@ -181,7 +183,7 @@ def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
 def labelled(cloud: Cloud, skeleton: Skeleton) -> Cloud:
     """Return a cloud that says which node each point belongs to, and how far off it lies [m]."""
     node, residual = nearest_cylinders(skeleton, cloud.points)
-    return Cloud(cloud.points, cloud.attributes | {
+    return replace(cloud, attributes=cloud.attributes | {
         "skeleton_node": node.astype(np.int32), "residual": residual.astype(np.float32)})
 
 
@@ -211,7 +213,7 @@ def _with_leaves(prepared: Prepared, leaves: list[Leaf], alignment: Alignment, s
     if "normal" in attributes:
         attributes["normal"] = (attributes["normal"] @ turn.T).astype(np.float32)
     attributes["leaf"] = leaf_mask(leaves, len(points)).astype(np.uint8)
-    return labelled(Cloud(points, attributes), skeleton)
+    return labelled(replace(prepared.cloud, points=points, attributes=attributes), skeleton)
 
 
 def _edited(found: SkeletonResult, edits: Sequence[Edit], progress: Progress) -> SkeletonResult:
@@ -345,7 +347,8 @@ def _aligned(prepared: Prepared, found: SkeletonResult, settings: ReconstructSet
         attributes["normal"] = (attributes["normal"] @ rotation.T).astype(np.float32)
     attributes["skeleton_node"] = found.node_of_point.astype(np.int32)
     attributes["residual"] = found.residual.astype(np.float32)
-    cloud = Cloud((prepared.cloud.points - root) @ rotation.T, attributes)
+    cloud = replace(prepared.cloud, points=(prepared.cloud.points - root) @ rotation.T,
+                    attributes=attributes)
     alignment = Alignment(scale=UNIT_METRES[settings.unit],
                           origin=tuple((prepared.origin + root).tolist()),
                           rotation=tuple(map(tuple, rotation.tolist())))

@@ -24,6 +24,9 @@ _LEAST_SECONDS, _SECONDS_PER_MB = 8.0, 2.0
 _LEAST_MB, _MB_PER_MB = 1500.0, 60.0
 _REFUSED = 2
 
+LAS_POINTS = "\0points"
+"""Name of a LAS file's coordinates among its dimensions."""
+
 
 def read_apart(kind: str, path: Path) -> dict[str, np.ndarray]:
     """Return what a reader of ``kind`` finds in a file or folder, as arrays.
@@ -53,7 +56,7 @@ def read_apart(kind: str, path: Path) -> dict[str, np.ndarray]:
             told = process.stderr.read().decode(errors="replace").strip().splitlines()
             process.stderr.close()
         if not trouble and process.returncode == 0 and target.exists():
-            return read_arrays(target, "points")
+            return _unpacked(read_arrays(target, "points"))
         last = told[-1][:200] if told else f"it ended with code {process.returncode}"
         raise InputError(f"{path} cannot be read ({trouble or last}).",
                          "It is damaged, cut short, or not what its suffix says.",
@@ -76,7 +79,10 @@ def _watch(process: subprocess.Popen, seconds: float, most_mb: float) -> str:
 
 
 def las_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return coordinates (``points``), ``color`` and the other dimensions of a LAS or LAZ file."""
+    """Return coordinates, ``color`` and the other dimensions of a LAS or LAZ file.
+
+    The coordinates are under :data:`LAS_POINTS`, which no dimension can be called.
+    """
     import laspy
 
     content = laspy.read(path)
@@ -90,7 +96,7 @@ def las_arrays(path: Path) -> dict[str, np.ndarray]:
         values = np.asarray(content[name])
         if values.ndim == 1 and values.any():
             attributes[name] = values
-    return {**attributes, "points": np.asarray(content.xyz, np.float64)}
+    return {**attributes, LAS_POINTS: np.asarray(content.xyz, np.float64)}
 
 
 def _c3d_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -119,8 +125,14 @@ def _main(kind: str, source: str, target: str, parent_id: str) -> int:
     except Exception as error:  # each package raises its own
         print(f"{type(error).__name__}: {error}".replace("\n", " "), file=sys.stderr)
         return _REFUSED
-    np.savez(target, **arrays)
+    np.savez(target, *arrays.values(), names=np.array(list(arrays)))
     return 0
+
+
+def _unpacked(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays by their names, which are any text, and would not all do as names within a file."""
+    names = arrays["names"].tolist()
+    return {name: arrays[f"arr_{k}"] for k, name in enumerate(names)}
 
 
 if __name__ == "__main__":

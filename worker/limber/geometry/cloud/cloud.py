@@ -1,9 +1,14 @@
 """Point clouds with attributes: the type, and its PLY file."""
 
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+
+from limber.geometry.cloud.columns import ply_columns, valid_columns
+
+_LONGEST_TITLE = 1000  # characters of a title that a file's header repeats
 
 
 @dataclass(frozen=True)
@@ -15,48 +20,48 @@ class Cloud:
         attributes: Name to array, shape [n] or [n, k]: ``normal`` [n, 3], ``color`` [n, 3] in
             0..255, and whatever scalars the file had.
         not_finite: Points of the file that were left away, since they are no numbers.
+        titles: What the file calls an attribute, where its name is another.
     """
 
     points: np.ndarray
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
     not_finite: int = 0
+    titles: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.points)
 
     def subset(self, chosen: np.ndarray) -> "Cloud":
         """Return the points at indices, or where a mask is true, with their attributes."""
-        return Cloud(self.points[chosen], {k: v[chosen] for k, v in self.attributes.items()},
-                     self.not_finite)
+        return replace(self, points=self.points[chosen],
+                       attributes={k: v[chosen] for k, v in self.attributes.items()})
 
     def with_points(self, points: np.ndarray) -> "Cloud":
         """Return the cloud with other positions, attributes kept."""
-        return Cloud(points, self.attributes, self.not_finite)
+        return replace(self, points=points)
+
+    def with_valid_columns(self, taken: Collection[str] = ()) -> "Cloud":
+        """Return the cloud with attributes that every writer can take, see :func:`valid_columns`.
+        """
+        attributes, titles = valid_columns(self.attributes, self.titles, len(self), taken)
+        return replace(self, attributes=attributes, titles=titles)
 
     def write_ply(self, path: Path, *, comment: str = "unit: m") -> None:
-        """Write a binary PLY file: positions as double, attributes in their own types."""
+        """Write a binary PLY file: positions as double, attributes in their own types.
+
+        Attributes get valid names, and comments tell what the scan's file called them.
+        """
         from plyfile import PlyData, PlyElement
 
+        valid = self.with_valid_columns()
         columns: list[tuple[str, np.ndarray]] = [
             (name, self.points[:, k].astype("<f8")) for k, name in enumerate("xyz")]
-        for name, values in self.attributes.items():
-            columns += _columns(name, values)
+        for name, values in valid.attributes.items():
+            columns += ply_columns(name, values)
         table = np.empty(len(self.points), [(name, column.dtype) for name, column in columns])
         for name, column in columns:
             table[name] = column
+        titles = [f"column {name}: {title[:_LONGEST_TITLE]!a}"
+                  for name, title in valid.titles.items()]
         PlyData([PlyElement.describe(table, "vertex")], byte_order="<",
-                comments=[comment]).write(str(path))
-
-
-def _columns(name: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    if values.dtype.kind == "b":
-        values = values.astype(np.uint8)
-    if values.dtype.itemsize == 8 and values.dtype.kind in "iu":
-        values = values.astype(np.int32)  # PLY has no 64-bit integers
-    if values.ndim == 1:
-        return [(name, values)]
-    parts = {"normal": ("nx", "ny", "nz"), "color": ("red", "green", "blue")}.get(
-        name, tuple(f"{name}_{k}" for k in range(values.shape[1])))
-    if name == "color":
-        values = values.astype(np.uint8)
-    return [(part, values[:, k]) for k, part in enumerate(parts)]
+                comments=[comment, *titles]).write(str(path))

@@ -12,8 +12,9 @@ import numpy as np
 from limber.constants import UNIT_METRES
 from limber.errors import InputError, MissingDependencyError
 from limber.geometry.cloud.announced import check_las, check_pcd, check_ply
-from limber.geometry.cloud.apart import las_arrays, read_apart
+from limber.geometry.cloud.apart import LAS_POINTS, las_arrays, read_apart
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.columns import property_names
 from limber.geometry.cloud.text import read_table
 from limber.reading import read_arrays
 
@@ -27,6 +28,8 @@ _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("R", "G", "B"))
 
 def read_points(path: Path) -> Cloud:
     """Read a cloud, in the file's own units.
+
+    Its attributes have names that every writer can take; ``titles`` has those that are the file's.
 
     Raises:
         InputError: the file is missing, empty, cut short, of an unknown format, holds text where
@@ -68,6 +71,7 @@ def _checked(path: Path, cloud: Cloud) -> Cloud:
     if len(cloud) == 0:
         raise InputError(f"{path} has no points.", "A point cloud was expected.",
                          "Export it again.")
+    cloud = cloud.with_valid_columns()
     finite = (np.abs(cloud.points) < _FARTHEST).all(axis=1)
     if not finite.any():
         raise InputError(f"{path}: none of {len(cloud)} points is finite.",
@@ -93,7 +97,7 @@ def _from_columns(names: list[str], columns: dict[str, np.ndarray]) -> Cloud:
             attributes[target] = np.stack([columns[name] for name in found], axis=1)
             used |= set(found)
     for name in names:
-        if name not in used and columns[name].ndim == 1:
+        if name not in used:
             attributes[name] = np.ascontiguousarray(columns[name])
     points = np.stack([np.asarray(columns[name], np.float64) for name in axes], axis=1)
     return Cloud(points, attributes)
@@ -130,15 +134,19 @@ def _read_pcd(path: Path) -> Cloud:
 
 def _read_text(path: Path) -> Cloud:
     """XYZ, TXT, CSV; see :mod:`limber.geometry.cloud.text`."""
-    names, table = read_table(path)
-    return _from_columns(names, {name: table[:, k] for k, name in enumerate(names)})
+    names, titles, table = read_table(path)
+    # A column of the same name as one before would take its place.
+    names = property_names(names)
+    cloud = _from_columns(names, {name: table[:, k] for k, name in enumerate(names)})
+    return replace(cloud, titles=dict(zip(names, titles, strict=True)))
 
 
 def _read_las(path: Path) -> Cloud:
     check_las(path)
     # Of a LAZ file compiled code makes points, which aborts on mangled ones.
     arrays = read_apart("las", path) if _is_packed(path) else las_arrays(path)
-    return Cloud(arrays.pop("points"), arrays)
+    points = arrays.pop(LAS_POINTS)
+    return Cloud(points, arrays)
 
 
 def _is_packed(path: Path) -> bool:
@@ -176,9 +184,7 @@ def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> Cloud:
         raise InputError(f"{path}: {key} has shape {list(points.shape)}.",
                          "Points have shape [n, 3].", "Save them so.")
     renamed = {"normals": "normal", "colors": "color"}
-    attributes = {renamed.get(k, k): v for k, v in arrays.items()
-                  if v.ndim in (1, 2) and len(v) == len(points) and v.dtype.kind in "iufb"}
-    return Cloud(points[:, :3], attributes)
+    return Cloud(points[:, :3], {renamed.get(k, k): v for k, v in arrays.items()})
 
 
 READERS: dict[str, Callable[[Path], Cloud]] = {

@@ -17,8 +17,12 @@ _UNIT = re.compile(r"[\s_]*[\[(](m|cm|mm|in)[\])]$|_(m|cm|mm)$")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 
-def read_table(path: Path) -> tuple[list[str], np.ndarray]:
-    """Read the columns of a text file: names, in lower case, and numbers, shape [n, columns].
+def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
+    """Read the columns of a text file.
+
+    Returns:
+        Names in lower case, without units, coordinates as x, y, z; the same as the file has them;
+        and the numbers, shape [n, columns].
 
     Numbers stand between blanks, tabs, commas or semicolons; a header may name the columns, the
     number of points may come first, and decimals may be commas where commas do not separate.
@@ -33,7 +37,7 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray]:
                          "Export it again.")
     # A header says little of how numbers are written.
     separator = _separator(lines[min(1, len(lines) - 1)])
-    names = _header(path, lines, separator)
+    names, titles = _header(path, lines, separator)
     if names:
         lines = lines[1:]
     elif len(lines) > 1 and lines[0].strip().isdigit():
@@ -45,9 +49,16 @@ def read_table(path: Path) -> tuple[list[str], np.ndarray]:
     if table.shape[1] < 3:
         raise InputError(f"{path} has {table.shape[1]} columns.",
                          "Coordinates need three.", "Export it again.")
+    if len(names) == table.shape[1] - 1 and _counts_up(table[:, 0]):
+        # R's write.table gives no title to its row names.
+        names, titles = ["", *names], ["", *titles]
     if len(names) != table.shape[1]:
-        names = ["x", "y", "z", *_guessed(table.shape[1] - 3)]
-    return names, table
+        names = titles = ["x", "y", "z", *_guessed(table.shape[1] - 3)]
+    return names, titles, table
+
+
+def _counts_up(column: np.ndarray) -> bool:
+    return column[0] in (0, 1) and bool((np.diff(column) == 1).all())
 
 
 def _decoded(raw: bytes) -> str:
@@ -79,21 +90,21 @@ def _parts(line: str, separator: str | None) -> list[str]:
     return parts[:-1] if len(parts) > 3 and parts[-1] == "" else parts
 
 
-def _header(path: Path, lines: list[str], separator: str | None) -> list[str]:
-    """Names of the columns, coordinates as x, y, z; empty if the first line holds numbers."""
+def _header(path: Path, lines: list[str], separator: str | None) -> tuple[list[str], list[str]]:
+    """Names and titles of the columns; both are empty if the first line holds numbers."""
     other = separator if separator is None or separator in lines[0] else _separator(lines[0])
-    names = [_UNIT.sub("", part.lower().lstrip("/#").strip())
-             for part in _parts(lines[0], other)]
+    titles = _parts(lines[0], other)
+    names = [_UNIT.sub("", title.lower().lstrip("/#").strip()) for title in titles]
     if not any(name[:1].isalpha() and name not in ("nan", "inf") for name in names):
-        return []
+        return [], []
     for axes in _AXES:
         if set(axes) <= set(names):
             known = dict(zip(axes, "xyz", strict=True))
-            return [known.get(name, name) for name in names]
+            return [known.get(name, name) for name in names], titles
     if len(names) == len(_parts(lines[min(1, len(lines) - 1)], separator)):
         raise InputError(f"{path} has columns {', '.join(names)[:200]}.", "x, y and z are missing.",
                          "Name the coordinates x, y, z.")
-    return []
+    return [], []
 
 
 def _numbers(path: Path, lines: list[str], separator: str | None, text: str) -> np.ndarray:

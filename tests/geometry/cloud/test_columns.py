@@ -1,0 +1,137 @@
+"""Columns of clouds: whatever a file calls them, everything that is written can name them."""
+
+import numpy as np
+import pytest
+
+from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.columns import property_names
+from limber.geometry.cloud.files import read_points
+
+COUNT = 40
+POINTS = np.random.default_rng(1).normal(size=(COUNT, 3)).round(3)
+VALUES = np.arange(COUNT) + 0.5
+TITLES = ("", " ", "Intensität", "反射率", "Scan Angle", "angle [deg]", "angle (deg)", "angle_deg",
+          "red", "NX", "normal", "color", "leaf", "x_2", "element", "end_header", "comment",
+          "a\tb", "a/b", "\N{PILE OF POO}", "-", "1", "n" * 500, "N" * 500, "e\u0301", "nan")
+
+
+def _random_titles(rng, count):
+    """Return titles of random letters from all over Unicode, some of them twice."""
+    letters = [chr(code) for code in (*range(32, 127), 0xA0, 0xB5, 0xDF, 0xE4, 0x3B1, 0x4E2D,
+                                      0x1F33F, 0x200B)]
+    titles = ["".join(rng.choice(letters, rng.integers(0, 70))) for _ in range(count)]
+    return titles + titles[:2]
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_any_title_becomes_a_valid_name_of_its_own(seed):
+    """Names are ASCII words, differ without regard to capitals, and are stable."""
+    titles = [*TITLES, *_random_titles(np.random.default_rng(seed), 20)]
+    names = property_names(titles, ["x", "y", "z"])
+    assert len({name.lower() for name in names} | {"x", "y", "z"}) == len(titles) + 3
+    assert all(name.isascii() and name.replace("_", "a").isalnum() for name in names)
+    assert max(map(len, names)) <= 63
+    assert property_names(names) == names
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_cloud_of_any_names_is_written_and_read_again(tmp_path, seed):
+    """No name fails the writer, no column is lost or takes another's place."""
+    rng = np.random.default_rng(seed)
+    titles = list(dict.fromkeys([*TITLES, *_random_titles(rng, 20)]))
+    attributes = {title: VALUES + 100 * k for k, title in enumerate(titles)}
+    Cloud(POINTS, attributes | {"normal": POINTS, "features": np.outer(VALUES, [1, 2])}).write_ply(
+        tmp_path / "a.ply")
+    again = read_points(tmp_path / "a.ply")
+    np.testing.assert_array_equal(again.points, POINTS)
+    np.testing.assert_allclose(again.attributes.pop("normal"), POINTS)
+    first = sorted(values[0] for name, values in again.attributes.items()
+                   if not name.startswith("features"))
+    assert first == [0.5 + 100 * k for k, title in enumerate(titles) if title != "normal"]
+    again.write_ply(tmp_path / "b.ply")
+    assert set(read_points(tmp_path / "b.ply").attributes) == set(again.attributes)
+
+
+def test_the_file_tells_the_titles(tmp_path):
+    """What a column was called stands in a comment, in ASCII."""
+    Cloud(POINTS, {"Intensität": VALUES, "plain": VALUES}).write_ply(tmp_path / "a.ply")
+    head = (tmp_path / "a.ply").read_bytes().split(b"end_header")[0].decode("ascii")
+    assert "comment column Intensitat: 'Intensit\\xe4t'" in head and "plain:" not in head
+
+
+@pytest.mark.parametrize("values", [
+    VALUES.astype(np.float16), VALUES.astype(np.longdouble), VALUES.astype(">f4"), VALUES > 3,
+    np.arange(COUNT, dtype=np.uint64) + 2**40, np.arange(COUNT).astype(">i2"),
+    np.arange(COUNT, dtype=np.int64)])
+def test_numbers_of_any_type_keep_their_values(tmp_path, values):
+    """PLY has neither half precision nor 64-bit integers."""
+    Cloud(POINTS, {"a": values}).write_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.ply").attributes["a"], values)
+
+
+HEADERS = {
+    "R write.csv": '"","x","y","z"\n', "index twice": "index,x,y,z,index\n",
+    "German": "X;Y;Z;Intensität\n", "blank": "x,y,z,Scan Angle\n",
+    "brackets": "x,y,z,time (s),time [s]\n", "one colour": "x,y,z,red\n",
+    "two colours": "x,y,z,red,r,g,b\n", "meanings": "x,y,z,normal,color,leaf,residual\n",
+    "x again": "x,y,z,X\n", "long": f"x,y,z,{'n' * 70000}\n"}
+
+
+@pytest.mark.parametrize("name", HEADERS)
+def test_text_with_any_header_is_read_and_written(tmp_path, name):
+    """Each column beside the coordinates is an attribute that can be written."""
+    header = HEADERS[name]
+    mark = ";" if ";" in header else ","
+    titles = [title.strip('"\n').lower() for title in header.split(mark)]
+    table = np.tile(VALUES[:, None], len(titles))
+    for k, axis in enumerate("xyz"):
+        table[:, titles.index(axis)] = POINTS[:, k]
+    rows = "\n".join(mark.join(f"{value:.3f}" for value in row) for row in table)
+    path = tmp_path / "a.csv"
+    path.write_text(header + (rows.replace(".", ",") if mark == ";" else rows), encoding="utf-8")
+    cloud = read_points(path)
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    kept = sum(3 if values.ndim == 2 else 1 for values in cloud.attributes.values())
+    assert kept == len(titles) - 3
+    cloud.write_ply(tmp_path / "a.ply")
+    assert len(read_points(tmp_path / "a.ply").attributes) == len(cloud.attributes)
+
+
+def test_row_names_without_a_title_are_no_coordinates(tmp_path):
+    """R's write.table has one title fewer than columns."""
+    rows = "\n".join(f"{k + 1} {x} {y} {z}" for k, (x, y, z) in enumerate(POINTS))
+    (tmp_path / "a.txt").write_text(f'"x" "y" "z"\n{rows}\n')
+    np.testing.assert_array_equal(read_points(tmp_path / "a.txt").points, POINTS)
+
+
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_extra_dimensions_of_las(tmp_path, suffix):
+    """Blanks, brackets, letters of other languages, and words of the programs."""
+    import laspy
+
+    content = laspy.create(point_format=3)
+    content.header.scales, content.header.offsets = [1e-3] * 3, [0, 0, 0]
+    titles = ["Scan Angle [deg]", "Höhe", "file", "residual"]
+    content.add_extra_dims([laspy.ExtraBytesParams(title, "f4") for title in titles])
+    content.x, content.y, content.z = POINTS.T
+    for title in titles:
+        content[title] = VALUES
+    content.write(tmp_path / f"a.{suffix}")
+    cloud = read_points(tmp_path / f"a.{suffix}")
+    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-6)
+    assert set(cloud.titles.values()) == {"Scan Angle [deg]", "Höhe"}
+    cloud.write_ply(tmp_path / "a.ply")
+    assert read_points(tmp_path / "a.ply").attributes.keys() == {
+        "color", "Scan_Angle_deg", "Hohe", "file", "residual"}
+
+
+def test_arrays_that_are_no_columns(tmp_path):
+    """Text, other lengths and other shapes than a meaning has do not reach the writer."""
+    np.savez(tmp_path / "a.npz", points=POINTS, names=np.array(["a"] * COUNT), normals=VALUES,
+             colors=np.full((COUNT, 4), 7, np.uint8), few=np.arange(3), feat=np.ones((COUNT, 2)),
+             deep=np.ones((COUNT, 2, 2)), complex=VALUES * 1j)
+    cloud = read_points(tmp_path / "a.npz")
+    cloud.write_ply(tmp_path / "a.ply")
+    assert cloud.attributes.keys() == {"normal_2", "color", "feat_0", "feat_1", "deep_0", "deep_1",
+                                       "deep_2", "deep_3"}
+    assert cloud.attributes["color"].shape == (COUNT, 3)
