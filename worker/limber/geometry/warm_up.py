@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from limber.geometry.skeleton.contraction.pieces import join_pieces
 from limber.geometry.skeleton.radii.axis_fit import fit_axes
 from limber.geometry.skeleton.radii.fit_kernels import reach_on_circle
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -20,5 +21,9 @@ def warm_up(progress: Progress = SILENT) -> None:
     surface, _, _ = smooth_forks(branch_surface(skeleton), skeleton)
     distance_to_surface(skeleton.nodes, surface)
     fit_axes(skeleton, surface.vertices, rounds=1, settled=True)
+    line = np.array([[0, 0, 0.01 * k] for k in (*range(4), *range(6, 10))])
+    join_pieces(line, np.array([[0, 1], [1, 2], [2, 3], [4, 5], [5, 6], [6, 7]]), np.full(8, 0.01),
+                np.full(8, 20), np.full(8, 0.01), gap=0.03, bridge_limit=0.1,
+                up=np.array([0.0, 0.0, 1.0]), join_plants=False)
     reach_on_circle(np.zeros(1), np.ones(1), np.ones(1), 1.0, 0.5)  # of one-sided scans alone
     progress(1.0, "compiling the surface's loops")

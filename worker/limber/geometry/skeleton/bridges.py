@@ -10,20 +10,15 @@ first, so that stems come before twigs, and what they fill in can carry the next
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+
+from limber.geometry.skeleton.bridge_kernels import nearest_others, priced
 
 _CHAIN = 6.0  # radii of an end that tell its direction
 _CHAIN_NODES = 4  # and so many nodes at least
 _UNSURE = 2  # nodes of a piece that tell none
 _BEYOND, _LONG = 3, 0.9  # nodes past a fork that tell how its axis comes; of a length as long
-_TURN = np.deg2rad(35.0)  # a turn that doubles the price
-_SIDE = 0.25  # what a fork costs against going on
-_STAND = np.deg2rad(45.0), np.deg2rad(60.0)  # angle that twigs stand at, and what doubles the price
-_RATIO = 0.7  # price of a radius e times another
 _BLIND = 5.0  # price of a bridge that no direction speaks for
 _BLIND_NEAR = 3  # nodes of other pieces that each node is tried with
-_FARTHER = 2.0  # an end may reach that times the limit, if it points at what it reaches
-_POINTS_AT = np.deg2rad(25.0)
 _STRAIGHT = np.deg2rad(45.0)  # ends that turn more tell no direction to a bridge
 
 
@@ -67,7 +62,8 @@ class Hypotheses:
 
 
 def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
-              joints: np.ndarray | None = None) -> Ends:
+              joints: np.ndarray | None = None, known: dict[int, "KnownEnd"] | None = None,
+              ) -> Ends:
     """Find the ends of all pieces and where they point.
 
     Args:
@@ -76,7 +72,10 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
         thickness: First radii [m], shape [n].
         joints: Those of the edges by which a bridge joined a side, the bridge's node first, shape
             [j, 2]: a twig that came to a stem's end does not close that.
+        known: What earlier calls found of ends, with fewer edges between the same nodes; what this
+            one finds is added.
     """
+    known = {} if known is None else known
     near: list[list[int]] = [[] for _ in nodes]
     for a, b in edges.tolist():
         near[a].append(b)
@@ -87,17 +86,47 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
         near[side].remove(bridge)
         reaching.add(bridge)
     ends = [node for node, others in enumerate(near) if len(others) <= 1 and node not in reaching]
-    direction, radius = np.zeros((len(ends), 3)), np.empty(len(ends))
-    for place, end in enumerate(ends):
-        # Points are missing beside an end too, where it looks thinner than it is.
-        chain = _straight_chain(nodes, near, end, _CHAIN * thickness[end])
-        chain = _straight_chain(nodes, near, end, _CHAIN * float(thickness[chain].max()))
-        # What hangs beside a longer axis has neither its thickness nor its direction.
-        chain = chain[:_beside(nodes, near, thickness, chain)]
-        radius[place] = float(np.median(thickness[chain]))
-        if len(chain) > _UNSURE:
-            direction[place] = _direction(nodes[chain])
-    return Ends(np.array(ends, np.int64), direction, radius)
+    for end in ends:
+        if end not in known or not known[end].holds(near):
+            known[end] = _end(nodes, _Neighbours(near), thickness, end)
+    return Ends(np.array(ends, np.int64),
+                np.array([known[end].direction for end in ends]).reshape(-1, 3),
+                np.array([known[end].radius for end in ends], float))
+
+
+@dataclass(frozen=True)
+class KnownEnd:
+    """What was found of an end, and all the neighbours that this depended on."""
+
+    direction: np.ndarray
+    radius: float
+    asked: dict[int, list[int]]
+
+    def holds(self, near: list[list[int]]) -> bool:
+        """Whether those neighbours are the same still."""
+        return all(near[node] == others for node, others in self.asked.items())
+
+
+class _Neighbours:
+    """Neighbours of nodes, and a record of which were asked for."""
+
+    def __init__(self, near: list[list[int]]) -> None:
+        self._near = near
+        self.asked: dict[int, list[int]] = {}
+
+    def __getitem__(self, node: int) -> list[int]:
+        self.asked[node] = self._near[node]
+        return self._near[node]
+
+
+def _end(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, end: int) -> KnownEnd:
+    # Points are missing beside an end too, where it looks thinner than it is.
+    chain = _straight_chain(nodes, near, end, _CHAIN * thickness[end])
+    chain = _straight_chain(nodes, near, end, _CHAIN * float(thickness[chain].max()))
+    # What hangs beside a longer axis has neither its thickness nor its direction.
+    chain = chain[:_beside(nodes, near, thickness, chain)]
+    direction = _direction(nodes[chain]) if len(chain) > _UNSURE else np.zeros(3)
+    return KnownEnd(direction, float(np.median(thickness[chain])), near.asked)
 
 
 def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, label: np.ndarray,
@@ -115,23 +144,11 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
     """
     end_of = np.full(len(nodes), -1)
     end_of[ends.node] = np.arange(len(ends.node))
-    axis = _axes(nodes, edges)
+    nodes, label = np.ascontiguousarray(nodes, float), label.astype(np.int64)
     single = np.bincount(label)[label] <= _UNSURE
-    largest = int(np.argmax(weight))
-    rest = np.flatnonzero(label != largest)
-    trees = {True: (cKDTree(nodes[rest]), rest), False: (cKDTree(nodes), np.arange(len(nodes)))}
-    parts = []
-    for place, end in enumerate(ends.node):
-        direction = ends.direction[place]
-        if not direction.any():
-            continue
-        tree, index = trees[bool(label[end] == largest)]
-        others = index[tree.query_ball_point(nodes[end], _FARTHER * limit)]
-        others = others[label[others] != label[end]]
-        if len(others):
-            parts.append(_priced(
-                nodes, thickness, axis, single, ends, end_of, place, others, limit))
-    parts.append(_blind(nodes, label, largest, limit))
+    parts = [priced(nodes, thickness, _axes(nodes, edges), single, label, ends.node,
+                    ends.direction, ends.radius, end_of, float(limit)),
+             _blind(nodes, label, int(np.argmax(weight)), limit)]
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     thick = thickness.copy()
     thick[ends.node] = ends.radius
@@ -172,7 +189,7 @@ def filled(nodes: np.ndarray, thickness: np.ndarray, ends: Ends, one: int, other
     return curve, thick
 
 
-def _straight_chain(nodes: np.ndarray, near: list[list[int]], end: int, reach: float,
+def _straight_chain(nodes: np.ndarray, near: _Neighbours, end: int, reach: float,
                     before: int = -1) -> list[int]:
     """Nodes inwards from an end, straight on at forks, as far as ``reach`` [m].
 
@@ -194,7 +211,7 @@ def _straight_chain(nodes: np.ndarray, near: list[list[int]], end: int, reach: f
     return chain
 
 
-def _beside(nodes: np.ndarray, near: list[list[int]], thickness: np.ndarray, chain: list[int],
+def _beside(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, chain: list[int],
             ) -> int:
     """How many of an end's nodes belong to a stub beside a longer axis; all if it is none.
 
@@ -241,58 +258,16 @@ def _axes(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(sums)[1][:, :, 2] * (np.trace(sums, axis1=1, axis2=2) > 0)[:, None]
 
 
-def _turned(direction: np.ndarray, way: np.ndarray, radius: float) -> np.ndarray:
-    """Angle [rad] from a direction to each way [k, 3]; aside by up to a radius is no turn."""
-    along = way @ direction
-    aside = np.linalg.norm(way - along[:, None] * direction, axis=1)
-    return np.arctan2(np.maximum(aside - radius, 0.0), along)
-
-
-def _priced(nodes: np.ndarray, thickness: np.ndarray, axis: np.ndarray, single: np.ndarray,
-            ends: Ends, end_of: np.ndarray, place: int, others: np.ndarray, limit: float,
-            ) -> tuple[np.ndarray, ...]:
-    """What it costs to join one end to each of ``others``: columns of :class:`Hypotheses`."""
-    own, direction, radius = ends.node[place], ends.direction[place], ends.radius[place]
-    way = nodes[others] - nodes[own]
-    length = np.maximum(np.linalg.norm(way, axis=1), 1e-12)
-    turn = _turned(direction, way, radius)
-    stand = np.arccos(np.clip(np.abs(np.einsum("kj,kj->k", way, axis[others])) / length, 0, 1))
-    stand = np.where(axis[others].any(axis=1), stand, _STAND[0])
-    # Of a single patch of skin the contraction tells no thickness.
-    thicker = np.where(single[others], 0.0, np.log(radius / np.maximum(thickness[others], 1e-12)))
-    side = _SIDE + ((stand - _STAND[0]) / _STAND[1])**2 + _RATIO * np.maximum(thicker, 0)
-    other_end = end_of[others]
-    comes = np.full(len(others), np.inf)
-    for k in np.flatnonzero(other_end >= 0):
-        end = other_end[k]
-        if ends.direction[end].any():
-            angle = _turned(ends.direction[end], -way[k:k + 1], ends.radius[end])[0]
-            comes[k] = (angle / _TURN)**2 + _RATIO * abs(np.log(radius / ends.radius[end]))
-    price = length * (1 + (turn / _TURN)**2 + np.minimum(side, comes))
-    able = length <= np.where(turn < _POINTS_AT, _FARTHER, 1.0) * limit
-    return (np.full(able.sum(), own), others[able], length[able], price[able], turn[able],
-            (comes < side)[able].astype(np.int8))
-
-
 def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,
            ) -> tuple[np.ndarray, ...]:
     """The shortest ways from each piece to others, whatever the directions."""
-    one, other, length = [], [], []
-    for piece in np.setdiff1d(np.unique(label), largest):
-        own, others = np.flatnonzero(label == piece), np.flatnonzero(label != piece)
-        distance, near = cKDTree(nodes[others]).query(
-            nodes[own], k=min(_BLIND_NEAR, len(others)), distance_upper_bound=limit)
-        distance, near = distance.reshape(len(own), -1), near.reshape(len(own), -1)
-        place, which = np.nonzero(distance < np.inf)
-        one.append(own[place])
-        other.append(others[near[place, which]])
-        length.append(distance[place, which])
-    if not one:
-        return (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0), np.empty(0),
-                np.empty(0), np.empty(0, np.int8))
-    length = np.concatenate(length)
-    return (np.concatenate(one), np.concatenate(other), length, (1 + _BLIND) * length,
-            np.full(len(length), np.pi), np.zeros(len(length), np.int8))
+    own = np.argsort(label, kind="stable")
+    own = own[label[own] != largest]
+    near, distance = nearest_others(nodes, label, own, float(limit), _BLIND_NEAR)
+    place, which = np.nonzero(near >= 0)
+    length = distance[place, which]
+    return (own[place], near[place, which], length, (1 + _BLIND) * length,
+            np.full(len(length), np.pi), np.zeros(len(length), np.int64))
 
 
 def _lead(ends: Ends, node: int, way: np.ndarray) -> np.ndarray | None:

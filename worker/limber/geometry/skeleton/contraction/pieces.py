@@ -1,13 +1,21 @@
 """Pieces of a scan: which belong to one plant and are bridged, and which are left away."""
 
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from limber.geometry.skeleton.bridges import Ends, Hypotheses, filled, free_ends, hypotheses
+from limber.geometry.skeleton.bridges import (
+    Ends,
+    Hypotheses,
+    KnownEnd,
+    filled,
+    free_ends,
+    hypotheses,
+)
 from limber.geometry.skeleton.skeleton import Skeleton
 
 _SHORT = 0.5  # of the longest bridge allowed, up to which a piece may be of any size
@@ -25,6 +33,7 @@ _CLEARLY = 0.98  # of what all bridges cost, under which others are better
 _PLANT_SHARE = 0.2  # of all points, from which a piece may be a plant of its own
 _BASE_SHARE = 0.12  # of a piece's reach, up to which a bridge starts at its base
 _FAR_SHARE = 0.3  # from which it starts far from its base
+_AT_ONCE = 1024  # hypotheses that are looked through together
 _THICK = 0.45  # of a piece's thickest part, from which the base may be there
 _GROUND = 0.2  # of the scan's height, up to which a base stands on the ground
 
@@ -47,6 +56,8 @@ class Joined:
         joints: Edges by which bridges joined the side of a piece, the bridge's node first, shape
             [j, 2].
         piece: Which of the given pieces each node is of, -1 along bridges, shape [n].
+        known_ends: What was found of ends on the way here.
+        rounds: How it came to this, see :class:`_Round`.
     """
 
     nodes: np.ndarray
@@ -60,10 +71,16 @@ class Joined:
     label: np.ndarray
     joints: np.ndarray
     piece: np.ndarray
+    known_ends: dict[int, KnownEnd] = field(default_factory=dict)
+    rounds: list["_Round"] = field(default_factory=list)
+
+    def copy(self, rounds: list["_Round"]) -> "Joined":
+        """A state that goes on by itself, after these ``rounds``."""
+        return replace(self, known_ends=dict(self.known_ends), rounds=list(rounds))
 
     def ends(self) -> Ends:
         """The free ends of the pieces."""
-        return free_ends(self.nodes, self.edges, self.thickness, self.joints)
+        return free_ends(self.nodes, self.edges, self.thickness, self.joints, self.known_ends)
 
     def lengths(self) -> np.ndarray:
         """Of each bridge [m], shape [b]."""
@@ -73,6 +90,22 @@ class Joined:
     def cost(self) -> float:
         """What all bridges cost [m]."""
         return float(self.prices @ self.lengths())
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A round of bridges.
+
+    Attributes:
+        before: What there was before it.
+        alone: Whether pieces that tell no direction had to wait.
+        decisive: The pairs of given pieces between which a hypothesis mattered. Without those of
+            any other pair the round is the same.
+    """
+
+    before: Joined
+    alone: bool
+    decisive: set[tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -111,21 +144,20 @@ def join_pieces(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, sup
                    np.empty(0), np.empty((0, 2), np.int64), label, np.empty((0, 2), np.int64),
                    label)
     rules = _Rules(gap, bridge_limit, up, join_plants)
-    state = _reconsidered(first, _joined(first, rules), rules)
+    state = _reconsidered(_joined(first, rules), rules)
     plants = _apart(state.nodes, state.thickness, state.support, state.label, up)
     state.plants = np.array(plants, np.int64).reshape(-1, 2)
     return state
 
 
 def _joined(first: Joined, rules: _Rules, refused: frozenset[tuple[int, int]] = frozenset(),
-            dearest: float = np.inf) -> Joined:
+            dearest: float = np.inf, alone: bool = True) -> Joined:
     """Bridge after bridge from what was given; those between ``refused`` pieces are not made.
 
-    It ends early once they cost ``dearest`` [m].
+    It ends early once they cost ``dearest`` [m]. One node or two tell no direction: as long as
+    ``alone`` holds, they are joined only to ends that go straight on to them.
     """
-    state = replace(first)
-    # One node or two tell no direction: unless an end goes straight on to them, they come last.
-    alone = True
+    state = first.copy(first.rounds)
     while True:
         weight = np.bincount(state.label, state.support)
         if len(weight) == 1 or state.cost() >= dearest:
@@ -133,7 +165,8 @@ def _joined(first: Joined, rules: _Rules, refused: frozenset[tuple[int, int]] = 
         ends = state.ends()
         found = _unrefused(hypotheses(state.nodes, state.edges, state.thickness, state.label,
                                       weight, rules.bridge_limit, ends), state.piece, refused)
-        chosen = _mutual(found, state, ends, weight, rules, alone)
+        chosen, decisive = _mutual(found, state, ends, weight, rules, alone)
+        state.rounds.append(_Round(state.copy([]), alone, decisive))
         if not chosen and alone:
             alone = False
             continue
@@ -145,7 +178,19 @@ def _joined(first: Joined, rules: _Rules, refused: frozenset[tuple[int, int]] = 
     return state
 
 
-def _reconsidered(first: Joined, state: Joined, rules: _Rules) -> Joined:
+def _without(state: Joined, pair: tuple[int, int], rules: _Rules,
+             refused: frozenset[tuple[int, int]], dearest: float) -> Joined:
+    """As ``state`` was joined, but for bridges between a ``pair`` of pieces, ``refused`` as well.
+
+    All is the same up to the first round that such a bridge mattered in.
+    """
+    at = next(k for k, past in enumerate(state.rounds) if pair in past.decisive)
+    past = state.rounds[at]
+    start = past.before.copy(state.rounds[:at])
+    return _joined(start, rules, refused | {pair}, dearest, past.alone)
+
+
+def _reconsidered(state: Joined, rules: _Rules) -> Joined:
     """The bridges without one that left an odd one to others, if all together then cost less.
 
     A stem's end takes the foot of a twig that happens to be nearer than the stem's next patch;
@@ -156,7 +201,7 @@ def _reconsidered(first: Joined, state: Joined, rules: _Rules) -> Joined:
         best, without = state, refused
         for pair in _doubted(state, rules.gap):
             dearest = _CLEARLY * best.cost()
-            other = _joined(first, rules, refused | {pair}, dearest)
+            other = _without(state, pair, rules, refused, dearest)
             if other.label.max() <= best.label.max() and other.cost() < dearest:
                 best, without = other, refused | {pair}
         if without == refused:
@@ -186,47 +231,84 @@ def _unrefused(found: Hypotheses, piece: np.ndarray, refused: frozenset[tuple[in
 
 
 def _mutual(found: Hypotheses, state: Joined, ends: Ends, weight: np.ndarray, rules: _Rules,
-            alone: bool) -> list[int]:
+            alone: bool) -> tuple[list[int], set[tuple[int, int]]]:
     """Hypotheses that are the cheapest one allowed for both of their pieces, cheapest first.
 
     Stems are joined before twigs; where two pieces belong together, a price counts more than how
     thick the end is that names it: a knob of the stem that points past a twig is no foot of it.
+
+    Returns:
+        Their places, and the pairs of given pieces whose hypotheses decided on them.
     """
     pairs = np.sort(state.label[np.stack([found.one, found.other])], axis=0)
     own_price = found.price / np.sqrt(found.thick)
     best: dict[int, int] = {}
     first: list[tuple[int, int, int]] = []
+    decisive: set[tuple[int, int]] = set()
     single = np.bincount(state.label) <= _SINGLE
+    reaches: dict[tuple[int, int], float] = {}
 
     def able(place: int, a: int, b: int) -> bool:
         odd = found.price[place] > _STRAIGHT_ON * found.length[place]
         return not (alone and odd and (single[a] or single[b])) and _allowed(
-            found, place, state, ends, weight, rules)
+            found, place, state, ends, weight, rules, reaches)
 
-    for place, (one, other) in enumerate(zip(found.one, found.other, strict=True)):
-        a, b = int(state.label[one]), int(state.label[other])
-        if (a in best and b in best) or not able(place, a, b):
+    def decide(place: int) -> None:
+        one, other = sorted(state.piece[[found.one[place], found.other[place]]].tolist())
+        decisive.add((one, other))
+
+    for place, a, b in _unsettled(pairs, best, len(weight)):
+        if not able(place, a, b):
             continue
+        decide(place)
         if a not in best and b not in best:
-            same = np.flatnonzero((pairs[0] == min(a, b)) & (pairs[1] == max(a, b)))
+            same = np.flatnonzero((pairs[0] == a) & (pairs[1] == b))
             place = next(other for other in same[np.argsort(own_price[same], kind="stable")]
                          if able(other, a, b))
+            decide(place)
             first.append((place, a, b))
         best.setdefault(a, place)
         best.setdefault(b, place)
-    return [place for place, a, b in first if best[a] == best[b] == place]
+    return [place for place, a, b in first if best[a] == best[b] == place], decisive
+
+
+def _unsettled(pairs: np.ndarray, best: dict[int, int], count: int,
+               ) -> Iterator[tuple[int, int, int]]:
+    """Hypotheses, in their order, for pairs of pieces not both of which have a ``best`` by then.
+
+    Args:
+        pairs: The pieces of each, shape [2, h].
+        best: Grows in between.
+        count: Number of pieces.
+    """
+    has = np.zeros(count, bool)
+    for start in range(0, pairs.shape[1], _AT_ONCE):
+        if len(best) == count:
+            return
+        has[list(best)] = True
+        part = pairs[:, start:start + _AT_ONCE]
+        places = np.flatnonzero(~has[part].all(axis=0))
+        for place, a, b in zip((start + places).tolist(), *part[:, places].tolist(), strict=True):
+            if a not in best or b not in best:
+                yield place, a, b
 
 
 def _allowed(found: Hypotheses, place: int, state: Joined, ends: Ends, weight: np.ndarray,
-             rules: _Rules) -> bool:
-    """Whether the smaller piece is large enough for the bridge, and no plant of its own."""
+             rules: _Rules, reaches: dict[tuple[int, int], float]) -> bool:
+    """Whether the smaller piece is large enough for the bridge, and no plant of its own.
+
+    ``reaches`` keeps how far a piece reaches from an end, for all hypotheses of a round.
+    """
     pair = int(found.one[place]), int(found.other[place])
     length, price = float(found.length[place]), float(found.price[place])
     a, b = state.label[list(pair)]
     small, end = (a, pair[0]) if weight[a] <= weight[b] else (b, pair[1])
-    own = state.label == small
-    reach = float((np.linalg.norm(state.nodes[own] - state.nodes[end], axis=1)
-                   + np.maximum(state.spread, state.thickness)[own]).max())
+    if (small, end) not in reaches:
+        own = state.label == small
+        reaches[small, end] = float((
+            np.linalg.norm(state.nodes[own] - state.nodes[end], axis=1)
+            + np.maximum(state.spread, state.thickness)[own]).max())
+    reach = reaches[small, end]
     # An end may go far straight on to what is left of its tip; that itself points anywhere.
     straight = price < _STRAIGHT_ON * length and a != small
     farthest = max((_REACH_STRAIGHT if straight else _REACH) * reach, _SHORT * rules.bridge_limit)

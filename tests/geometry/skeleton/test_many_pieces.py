@@ -1,0 +1,70 @@
+"""A crown in very many pieces: joined in seconds, and as if nothing had been remembered."""
+
+import time
+
+import numpy as np
+
+from limber.geometry.skeleton.contraction import pieces
+from limber.geometry.skeleton.contraction.pieces import join_pieces
+
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def _crown(twigs, seed=0):
+    """Chains of a stem and its twigs with gaps, some askew: nodes, edges and radii."""
+    rng = np.random.default_rng(seed)
+    nodes, edges, radii = [], [], []
+
+    def chain(line, radius):
+        begin, count = sum(map(len, nodes)), len(line)
+        nodes.append(line)
+        radii.append(np.full(count, radius))
+        edges.append(begin + np.stack([np.arange(count - 1), np.arange(1, count)], axis=1))
+
+    height = np.arange(0, 2, 0.01)
+    stem = np.stack([0.03 * np.sin(3 * height), 0.02 * height, height], axis=1)
+    for part in np.array_split(stem, 4):
+        chain(part[:-6], 0.02)
+    for k in range(twigs):
+        way = rng.normal(size=3) * [1, 1, 0.3] + [0, 0, 0.6]
+        way /= np.linalg.norm(way)
+        start = stem[int(len(stem) * (0.15 + 0.8 * k / twigs))]
+        along = np.arange(0.05, 0.4, 0.01)[:, None]
+        line = start + along * way + 0.1 * along**2 * rng.normal(size=3)
+        for part in np.array_split(line, 2):
+            chain(part[:-5] + rng.normal(size=3) * 0.012, 0.006)
+    return np.vstack(nodes), np.vstack(edges), np.concatenate(radii)
+
+
+def _joined(twigs, seed=0):
+    nodes, edges, radius = _crown(twigs, seed)
+    return join_pieces(nodes, edges, radius, np.full(len(nodes), 20), radius, gap=0.03,
+                       bridge_limit=0.3, up=Z, join_plants=True)
+
+
+def test_a_crown_of_many_pieces_is_joined_in_seconds():
+    """Every trial without a bridge once joined all pieces again, pricing all of them each time."""
+    _joined(2)  # compiles
+    started = time.process_time()
+    state = _joined(22)
+    assert time.process_time() - started < 7
+    assert state.label.max() == 0 and len(state.bridges) == 47
+
+
+def test_what_is_remembered_changes_nothing(monkeypatch):
+    """Rounds taken over and ends known from before give what joining all anew gives."""
+    states = [_joined(8, seed) for seed in range(4)]
+    tried = []
+
+    def anew(state, pair, rules, refused, dearest):
+        tried.append(pair)
+        return pieces._joined(state.rounds[0].before.copy([]), rules, refused | {pair}, dearest)
+
+    monkeypatch.setattr(pieces, "_without", anew)
+    monkeypatch.setattr(pieces.Joined, "ends", lambda state: pieces.free_ends(
+        state.nodes, state.edges, state.thickness, state.joints))
+    for seed, state in enumerate(states):
+        again = _joined(8, seed)
+        for name in ("nodes", "edges", "bridges", "prices", "joints", "label"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(state, name))
+    assert tried
