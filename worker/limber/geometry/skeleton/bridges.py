@@ -7,7 +7,7 @@ that is from what was found prices a hypothesis; the cheapest ones for their thi
 first, so that stems come before twigs, and what they fill in can carry the next.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -62,7 +62,7 @@ class Hypotheses:
 
 
 def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
-              joints: np.ndarray | None = None, known: dict[int, "KnownEnd"] | None = None,
+              joints: np.ndarray | None = None, known: "Known | None" = None,
               ) -> Ends:
     """Find the ends of all pieces and where they point.
 
@@ -72,11 +72,11 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
         thickness: First radii [m], shape [n].
         joints: Those of the edges by which a bridge joined a side, the bridge's node first, shape
             [j, 2]: a twig that came to a stem's end does not close that.
-        known: What earlier calls found of ends, with fewer edges between the same nodes; what this
-            one finds is added.
+        known: What earlier calls found, with fewer edges between the same nodes; what this one
+            finds is added.
     """
-    known = {} if known is None else known
-    near: list[list[int]] = [[] for _ in nodes]
+    found = {} if known is None else known.ends
+    near: list[list[int]] = [[] for _ in range(len(nodes))]
     for a, b in edges.tolist():
         near[a].append(b)
         near[b].append(a)
@@ -87,11 +87,30 @@ def free_ends(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray,
         reaching.add(bridge)
     ends = [node for node, others in enumerate(near) if len(others) <= 1 and node not in reaching]
     for end in ends:
-        if end not in known or not known[end].holds(near):
-            known[end] = _end(nodes, _Neighbours(near), thickness, end)
+        if end not in found or not found[end].holds(near):
+            found[end] = _end(nodes, _Neighbours(near), thickness, end)
     return Ends(np.array(ends, np.int64),
-                np.array([known[end].direction for end in ends]).reshape(-1, 3),
-                np.array([known[end].radius for end in ends], float))
+                np.array([found[end].direction for end in ends]).reshape(-1, 3),
+                np.array([found[end].radius for end in ends], float))
+
+
+@dataclass
+class Known:
+    """What earlier calls found, which holds where nothing has changed since.
+
+    Attributes:
+        ends: Of each end.
+        sums: Squares of the edges at each node [m^2], shape [n, 3, 3].
+        axes: Direction of the axis that these tell, shape [n, 3].
+    """
+
+    ends: dict[int, "KnownEnd"] = field(default_factory=dict)
+    sums: np.ndarray = field(default_factory=lambda: np.empty((0, 3, 3)))
+    axes: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+
+    def copy(self) -> "Known":
+        """The same, to which other findings are added."""
+        return Known(dict(self.ends), self.sums, self.axes)
 
 
 @dataclass(frozen=True)
@@ -130,7 +149,8 @@ def _end(nodes: np.ndarray, near: _Neighbours, thickness: np.ndarray, end: int) 
 
 
 def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, label: np.ndarray,
-               weight: np.ndarray, limit: float, ends: Ends) -> Hypotheses:
+               weight: np.ndarray, limit: float, ends: Ends, known: Known | None = None,
+               ) -> Hypotheses:
     """Price the ways in which pieces can be joined.
 
     Args:
@@ -141,13 +161,15 @@ def hypotheses(nodes: np.ndarray, edges: np.ndarray, thickness: np.ndarray, labe
         weight: Points of each piece, shape [pieces].
         limit: No bridge is longer [m], unless an end points straight at what it reaches.
         ends: The pieces' free ends.
+        known: What earlier calls found; what this one finds is added.
     """
+    axes = _axes(nodes, edges, known or Known())
     end_of = np.full(len(nodes), -1)
     end_of[ends.node] = np.arange(len(ends.node))
     nodes, label = np.ascontiguousarray(nodes, float), label.astype(np.int64)
     single = np.bincount(label)[label] <= _UNSURE
-    parts = [priced(nodes, thickness, _axes(nodes, edges), single, label, ends.node,
-                    ends.direction, ends.radius, end_of, float(limit)),
+    parts = [priced(nodes, thickness, axes, single, label, ends.node, ends.direction, ends.radius,
+                    end_of, float(limit)),
              _blind(nodes, label, int(np.argmax(weight)), limit)]
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     thick = thickness.copy()
@@ -248,14 +270,20 @@ def _direction(chain: np.ndarray) -> np.ndarray:
     return line if out.any() else np.zeros(3)
 
 
-def _axes(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
+def _axes(nodes: np.ndarray, edges: np.ndarray, known: Known) -> np.ndarray:
     """Direction of the axis at each node, without sign; zero at single nodes, shape [n, 3]."""
     sums = np.zeros((len(nodes), 3, 3))
     way = nodes[edges[:, 1]] - nodes[edges[:, 0]]
     square = way[:, :, None] * way[:, None, :]
     np.add.at(sums, edges[:, 0], square)
     np.add.at(sums, edges[:, 1], square)
-    return np.linalg.eigh(sums)[1][:, :, 2] * (np.trace(sums, axis1=1, axis2=2) > 0)[:, None]
+    axes = np.zeros((len(nodes), 3))
+    axes[:len(known.axes)] = known.axes
+    fresh = np.trace(sums, axis1=1, axis2=2) > 0
+    fresh[:len(known.sums)] &= (sums[:len(known.sums)] != known.sums).any(axis=(1, 2))
+    axes[fresh] = np.linalg.eigh(sums[fresh])[1][:, :, 2]
+    known.sums, known.axes = sums, axes
+    return axes
 
 
 def _blind(nodes: np.ndarray, label: np.ndarray, largest: int, limit: float,

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from limber.geometry.skeleton.bridges import (
     Ends,
     Hypotheses,
-    KnownEnd,
+    Known,
     filled,
     free_ends,
     hypotheses,
@@ -56,7 +56,7 @@ class Joined:
         joints: Edges by which bridges joined the side of a piece, the bridge's node first, shape
             [j, 2].
         piece: Which of the given pieces each node is of, -1 along bridges, shape [n].
-        known_ends: What was found of ends on the way here.
+        known: What was found of ends and axes on the way here.
         rounds: How it came to this, see :class:`_Round`.
     """
 
@@ -71,16 +71,16 @@ class Joined:
     label: np.ndarray
     joints: np.ndarray
     piece: np.ndarray
-    known_ends: dict[int, KnownEnd] = field(default_factory=dict)
+    known: Known = field(default_factory=Known)
     rounds: list["_Round"] = field(default_factory=list)
 
     def copy(self, rounds: list["_Round"]) -> "Joined":
         """A state that goes on by itself, after these ``rounds``."""
-        return replace(self, known_ends=dict(self.known_ends), rounds=list(rounds))
+        return replace(self, known=self.known.copy(), rounds=list(rounds))
 
     def ends(self) -> Ends:
         """The free ends of the pieces."""
-        return free_ends(self.nodes, self.edges, self.thickness, self.joints, self.known_ends)
+        return free_ends(self.nodes, self.edges, self.thickness, self.joints, self.known)
 
     def lengths(self) -> np.ndarray:
         """Of each bridge [m], shape [b]."""
@@ -164,7 +164,8 @@ def _joined(first: Joined, rules: _Rules, refused: frozenset[tuple[int, int]] = 
             break
         ends = state.ends()
         found = _unrefused(hypotheses(state.nodes, state.edges, state.thickness, state.label,
-                                      weight, rules.bridge_limit, ends), state.piece, refused)
+                                      weight, rules.bridge_limit, ends, state.known),
+                           state.piece, refused)
         chosen, decisive = _mutual(found, state, ends, weight, rules, alone)
         state.rounds.append(_Round(state.copy([]), alone, decisive))
         if not chosen and alone:
