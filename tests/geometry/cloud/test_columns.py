@@ -135,3 +135,20 @@ def test_arrays_that_are_no_columns(tmp_path):
     assert cloud.attributes.keys() == {"normal_2", "color", "feat_0", "feat_1", "deep_0", "deep_1",
                                        "deep_2", "deep_3"}
     assert cloud.attributes["color"].shape == (COUNT, 3)
+
+
+@pytest.mark.parametrize("coding", ["latin-1", "utf-8"])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_ply_with_other_letters_in_its_header(tmp_path, coding, kind):
+    """In a comment and in a property's name, as text and as numbers."""
+    head = (f"ply\nformat {kind} 1.0\ncomment gemessen von Prüfstelle\nelement vertex {COUNT}\n"
+            "property float x\nproperty float y\nproperty float z\nproperty float Höhe\n"
+            "property float Hohe\nend_header\n").encode(coding)
+    table = np.column_stack([POINTS, VALUES, 2 * VALUES]).astype(np.float32)
+    body = table.tobytes() if kind != "ascii" else "\n".join(
+        " ".join(map(str, row)) for row in table).encode()
+    (tmp_path / "a.ply").write_bytes(head + body)
+    cloud = read_points(tmp_path / "a.ply")
+    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-6)
+    assert sorted(values[1] for values in cloud.attributes.values()) == [1.5, 3.0]
+    assert "Höhe" in cloud.titles.values()

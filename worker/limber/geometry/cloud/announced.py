@@ -105,6 +105,16 @@ def check_las(path: Path) -> None:
 
 def _text_header(path: Path, end: bytes) -> tuple[list[str], int]:
     """Return the lines of a header that ends with the line of ``end``, and where that ends."""
+    head, stop = header_bytes(path, end)
+    return re.split(r"[\r\n]+", head.decode("latin-1").rstrip("\r\n")), stop
+
+
+def header_bytes(path: Path, end: bytes) -> tuple[bytes, int]:
+    """Return a header up to the line of ``end``, with it, and where that ends.
+
+    Raises:
+        InputError: there is no such line.
+    """
     with open(path, "rb") as stream:
         head = stream.read(_LONGEST_HEADER)
     at = head.find(end)
@@ -112,7 +122,7 @@ def _text_header(path: Path, end: bytes) -> tuple[list[str], int]:
     if stop < 0:
         raise InputError(f"{path} has no header.", "It is cut short, or not what its suffix says.",
                          "Export it again.")
-    return re.split(r"[\r\n]+", head[:stop].decode("latin-1")), stop + 1
+    return head[:stop + 1], stop + 1
 
 
 def _count(path: str | os.PathLike, word: str) -> int:
