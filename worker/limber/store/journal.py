@@ -44,8 +44,8 @@ def unfinished_error(folder: Path) -> BranchFolderError:
     return BranchFolderError(
         f"{folder} has results of an interrupted command that are not in place yet "
         f"({_COMMIT}).", "This command only reads, and changes nothing in the folder.",
-        f"Run `limber verify {shlex.quote(str(folder))} --finish`, which puts them in place, then "
-        "this again.")
+        f"Run `limber verify {shlex.quote(str(folder))} --finish`, or any stage that writes to the "
+        "folder: it puts them in place. Then run this again.")
 
 
 def commit(folder: Path, work: Path, manifest: Manifest) -> None:
