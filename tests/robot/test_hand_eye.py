@@ -87,6 +87,10 @@ def test_what_cannot_be_told_is_refused():
     flat[:, 3:5] = 0.0
     with pytest.raises(InputError, match="about a second axis"):
         fit_camera(*views(8, "stand", robot=flat), "stand")
+    plane = robot.copy()
+    plane[:, 2:4] = 0.3, 0.0
+    with pytest.raises(InputError, match="seen in a plane"):
+        fit_camera(plane, (plane[:, :3] @ matrices(STANDING)[:3, :3]) + 0.1, "stand")
     mixed = seen.copy()
     mixed[[2, 5]] = seen[[5, 2]]
     with pytest.raises(InputError, match=r"View \d is off by"):

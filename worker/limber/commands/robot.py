@@ -84,10 +84,11 @@ def calibrate(run: Run, cell_file: Path, branch_folder: Path, points_file: Path 
               largest_residual: float) -> dict[str, Any]:
     """Write the robot's base in the branch's frame into the cell file, from points or views.
 
-    Points are touched with the middle of the gripper, the robot guided by hand; its pose is read
-    when Enter is pressed. Views are of a board or marker, found in the camera's pictures by
-    another program (OpenCV's solvePnP gives such poses): the branch's scan is in the frame of that
-    camera, so nothing need be touched.
+    Points are touched with the middle of the gripper, the robot guided by hand; the controller's
+    own pose is read when Enter is pressed. Four or more points that lie in no plane are needed:
+    others fit a mirrored frame as well. Views are of a board or marker, found in the camera's
+    pictures by another program (OpenCV's solvePnP gives such poses): the branch's scan is in the
+    frame of that camera, so nothing need be touched.
     """
     from limber.errors import InputError
     from limber.robot.cell import read_cell
@@ -152,9 +153,11 @@ def _by_seeing(run: Run, cell_file: Path, cell: Any, branch: Any, views_file: Pa
 def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file: Path,
                  largest_residual: float) -> dict[str, Any]:
     from limber.errors import InputError
-    from limber.robot.calibration import fit_base
+    from limber.robot.calibration import fit_base, require_frame
 
     names, on_branch, touched = _points(points_file)
+    # Before anybody touches them.
+    require_frame(on_branch, names, "on the branch", largest_residual)
     version = cell.robot.version
     if touched is None:
         if not sys.stdin.isatty():
@@ -162,15 +165,17 @@ def _by_touching(run: Run, cell_file: Path, cell: Any, branch: Any, points_file:
                              "terminal.", "", "Run it in a terminal, or give the robot's poses "
                              "in the points file.")
         touched, version = _touch(run, cell, names)
-    fit = fit_base(touched, on_branch, largest_residual=largest_residual)
+    fit = fit_base(touched, on_branch, largest_residual=largest_residual, names=names)
     cell = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": version})})
     _write_base(cell_file, cell, branch.uuid, fit.pose, fit.position_sigma, fit.rotation_sigma,
                 fit.residual)
     run.show("Touched points", [["point", "off [mm]"], *(
         [name, f"{1000 * off:.2f}"] for name, off in zip(names, fit.residuals, strict=True))])
     return {"cell": str(cell_file), "branch": branch.uuid, "base_pose": fit.pose,
-            "residual_m": fit.residual, "position_sigma_m": fit.position_sigma,
-            "rotation_sigma_rad": fit.rotation_sigma}
+            "residual_m": fit.residual,
+            "points": [{"name": name, "residual_m": float(off)}
+                       for name, off in zip(names, fit.residuals, strict=True)],
+            "position_sigma_m": fit.position_sigma, "rotation_sigma_rad": fit.rotation_sigma}
 
 
 def _write_base(cell_file: Path, cell: Any, branch: str, pose: np.ndarray, position_sigma: float,
@@ -218,7 +223,8 @@ def _is_number(text: str) -> bool:
 
 def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
     """Read the tool's position at each point; the arm is guided by hand, nothing is sent to it."""
-    from limber.robot.kinematics import matrices
+    from limber.errors import WorkError
+    from limber.robot.calibration import touched_place
     from limber.robot.samples import SampleStream
 
     touched = []
@@ -228,14 +234,10 @@ def _touch(run: Run, cell: Any, names: list[str]) -> tuple[np.ndarray, str]:
         for name in names:
             input(f"Touch {name} with the middle of the gripper, then press Enter ")
             stream.skip()
-            sample = stream.read(1.0)[-1]
-            # The flange by nominal kinematics would be millimetres off: the controller's own pose
-            # counts, for the tool that is set there.
-            from limber.robot.kinematics import forward, inverted
-
-            set_tool = inverted(forward(cell.arm, sample.joints)) @ matrices(sample.pose)
-            flange = matrices(sample.pose) @ inverted(set_tool)
-            touched.append((flange @ matrices(np.array(cell.tool.grasp_pose)))[:3, 3])
+            samples = stream.read(1.0)
+            if not samples:
+                raise WorkError("The robot sends no data.", "", "Restart its controller.")
+            touched.append(touched_place(cell, samples[-1]))
     finally:
         stream.close()
     return np.array(touched), version

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
+from limber.robot.calibration import least_depth, spread_of
 from limber.robot.kinematics import inverted, matrices, pose_vectors
 
 CameraOn = Literal["stand", "gripper"]
@@ -94,6 +95,8 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
                          "ten tell how exactly.", "Move the arm to more poses.")
     moves = matrices(robot) if camera_on == "stand" else inverted(matrices(robot))
     _require_turns(moves, what)
+    if what == "marker":
+        _require_depth(seen, largest_residual)
     starts = sorted((_started(turn, moves, seen) for turn in Rotation.random(
         _STARTS, rng=np.random.default_rng(0)).as_matrix()), key=lambda start: start[0])
     found = min((least_squares(_off, start, args=(moves, seen), x_scale="jac", xtol=1e-13,
@@ -120,6 +123,18 @@ def _require_turns(moves: np.ndarray, what: str) -> None:
             f"The arm was turned by {np.degrees(spread[1]):.1f} degrees about a second axis.",
             f"Camera and {what} could slide along the first one and be seen the same.",
             "Tilt the gripper about two axes, by 20 degrees or more each way.")
+
+
+def _require_depth(places: np.ndarray, largest_residual: float) -> None:
+    """Refuse places [n, 3] in a plane, which fit as well where the camera's axes are mirrored."""
+    spread = spread_of(places)[2]
+    needed = least_depth(largest_residual)
+    if spread < needed:
+        raise InputError(
+            f"The marker was seen in a plane: its places spread by {1000 * spread:.1f} mm out of "
+            f"it (root mean square); {1000 * needed:.0f} mm are needed.",
+            "A mirrored frame would fit as well.",
+            "Move the marker to poses in front of and behind that plane.")
 
 
 def _started(turn: np.ndarray, moves: np.ndarray, seen: np.ndarray) -> tuple[float, np.ndarray]:

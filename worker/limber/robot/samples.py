@@ -22,6 +22,7 @@ _MOST_AT_ONCE = 8
 _NAMES = ("timestamp", "actual_q", "actual_qd", "actual_TCP_pose", "actual_TCP_speed",
           "actual_TCP_force", "robot_mode", "safety_mode", "runtime_state",
           "target_speed_fraction")
+_TOOL = "tcp_offset"
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Sample:
             about the tool's centre [N, N m], shape [6].
         robot_mode, safety_mode, runtime_state: The controller's numbers (7, 1 and 2 are well).
         slider: Speed slider, 0 to 1.
+        tool: Tool that is set in the controller, the flange's frame [m, rad], shape [6]; None where
+            its version does not tell it.
     """
 
     clock: float
@@ -50,6 +53,7 @@ class Sample:
     safety_mode: int
     runtime_state: int
     slider: float
+    tool: np.ndarray | None = None
 
 
 class SampleStream:
@@ -88,11 +92,14 @@ class SampleStream:
             raise ValueError("protocol version 2 refused")
         self.version = struct.unpack(">4I", self._ask(rtde.CONTROL_VERSION, b"", timeout))
         self.rate = 125.0 if self.version[0] <= 3 else 500.0
+        names = _NAMES
+        if rtde.output_types([_TOOL], self.version) != ["NOT_FOUND"]:
+            names = (*_NAMES, _TOOL)
         reply = self._ask(rtde.OUTPUT_SETUP,
-                          struct.pack(">d", self.rate) + ",".join(_NAMES).encode(), timeout)
+                          struct.pack(">d", self.rate) + ",".join(names).encode(), timeout)
         if not reply or reply[0] == 0 or b"NOT_FOUND" in reply:
             raise ValueError(f"outputs refused: {reply[1:].decode('ascii', 'replace')}")
-        self._recipe = rtde.Recipe.of(reply[0], _NAMES, rtde.OUTPUT_TYPES)
+        self._recipe = rtde.Recipe.of(reply[0], names, rtde.OUTPUT_TYPES)
         if self._ask(rtde.START, b"", timeout) != b"\1":
             raise ValueError("data was not started")
         self._socket.setblocking(False)
@@ -153,7 +160,8 @@ class SampleStream:
             speed=np.array(values["actual_TCP_speed"]),
             wrench=np.array(values["actual_TCP_force"]), robot_mode=values["robot_mode"],
             safety_mode=values["safety_mode"], runtime_state=values["runtime_state"],
-            slider=values["target_speed_fraction"])
+            slider=values["target_speed_fraction"],
+            tool=np.array(values[_TOOL]) if _TOOL in values else None)
 
     def close(self) -> None:
         """Close the connection."""

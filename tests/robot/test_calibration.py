@@ -1,0 +1,107 @@
+"""The base from touched points: by the controller's own pose, and no mirrored frame passes."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.commands.robot import command
+from limber.errors import InputError
+from limber.robot.calibration import fit_base, touched_place
+from limber.robot.cell import Cell, read_cell, write_cell
+from limber.robot.frames import pose_of
+from limber.robot.kinematics import forward, matrices, pose_vectors
+from limber.robot.samples import Sample
+from limber.robot.virtual.controller import HOME
+
+GRASP = (0.01, 0.0, 0.15, 0.0, 0.0, 0.3)
+BASE = np.array([0.6, -0.2, 0.1, 0.3, -0.4, 1.2])
+ON_BRANCH = np.array([[0.1, 0, 0], [-0.1, 0.08, 0], [-0.05, -0.1, 0], [0, 0, 0.3], [0.02, 0, 0.5]])
+
+
+def touched_at(on_branch: np.ndarray) -> np.ndarray:
+    frame = matrices(BASE)
+    return (on_branch - frame[:3, 3]) @ frame[:3, :3]
+
+
+def sample_with(tool: tuple[float, ...], joints: np.ndarray, *, tells_it: bool = False) -> Sample:
+    """What the controller of an arm says whose links are millimetres off their nominal measures."""
+    arm = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}).arm
+    true = replace(arm, a=tuple(np.array(arm.a) * 1.004), d=tuple(np.array(arm.d) * 1.01))
+    pose = pose_of(forward(true, joints) @ matrices(np.array(tool)))
+    nothing = np.zeros(6)
+    return Sample(1.0, 1.0, joints, nothing, pose, nothing, nothing, 7, 1, 2, 1.0,
+                  np.array(tool) if tells_it else None)
+
+
+@pytest.mark.parametrize("tool, tells_it", [(GRASP, False), ((0,) * 6, False),
+                                            ((0.03, 0, 0.05, 0.4, 0, 0), True)])
+def test_a_touched_place_is_the_controllers_own(tool, tells_it):
+    """Links 2 to 4 mm longer than nominal: not a micrometre of that is left."""
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"grasp_pose": GRASP})
+    joints = np.array(HOME) + 0.1
+    true = sample_with(GRASP, joints).pose[:3]
+    sample = sample_with(tool, joints, tells_it=tells_it)
+    assert touched_place(cell, sample) == pytest.approx(true, abs=1e-9)
+    nominal = (forward(cell.arm, joints) @ matrices(np.array(GRASP)))[:3, 3]
+    assert np.linalg.norm(nominal - true) > 2e-3
+
+
+def test_a_pose_of_another_tool_is_refused():
+    cell = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}, tool={"grasp_pose": GRASP})
+    with pytest.raises(InputError, match=r"tool.grasp_pose at \(10, 0, 150\) mm"):
+        touched_place(cell, sample_with((0.0, 0.0, 0.2, 0, 0, 0), np.array(HOME)))
+
+
+@pytest.mark.parametrize("on_branch, told", [
+    (ON_BRANCH[:3], "3 points on the branch. Four or more"),
+    (np.vstack([ON_BRANCH[:3], [[0.02, 0.05, 0.0]]]), r"spread by 0\.0 mm out of.*5 mm are needed"),
+    (np.vstack([ON_BRANCH[:3], [[0.02, 0.05, 0.008]]]), "lie in a plane"),
+    (ON_BRANCH[[0, 1, 2, 3, 3]], r"Points 4 and 5 are 0\.0 mm apart"),
+    (np.vstack([ON_BRANCH, ON_BRANCH[:1] + 0.003]), r"Points 1 and 6 are 5\.2 mm apart"),
+    (np.outer(np.arange(5), [0.1, 0.02, 0.05]), "across their line"),
+])
+def test_points_that_leave_a_frame_open_are_refused(on_branch, told):
+    with pytest.raises(InputError, match=told):
+        fit_base(touched_at(on_branch), on_branch)
+
+
+def test_points_touched_in_one_place_are_refused():
+    with pytest.raises(InputError, match=r"Points rim-1 and rim-2 are 0\.0 mm apart as they were"):
+        fit_base(np.zeros((5, 3)), ON_BRANCH, names=[f"rim-{k + 1}" for k in range(5)])
+
+
+@pytest.mark.parametrize("mirror", [np.diag([1, -1, 1]), np.eye(3)[[1, 0, 2]]])
+def test_mirrored_points_are_named_as_such(mirror):
+    """A y axis with the wrong sign; two columns that were swapped."""
+    with pytest.raises(InputError, match="fit in a mirror alone"):
+        fit_base(touched_at(ON_BRANCH), ON_BRANCH @ mirror)
+    # As flat as is accepted at all, they are off by more than is allowed.
+    flat = np.vstack([ON_BRANCH[:3], [[0.02, 0.05, 0.0132]]])
+    assert fit_base(touched_at(flat), flat).residual < 1e-9
+    with pytest.raises(InputError, match="fit in a mirror alone"):
+        fit_base(touched_at(flat), flat @ mirror)
+
+
+def test_the_command_states_each_points_residual(branch_folder, tmp_path, capfd):
+    """And refuses three points before anything is touched."""
+    write_cell(tmp_path / "cell.toml", Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}))
+    touched = touched_at(ON_BRANCH) + [[0.001, 0, 0], *np.zeros((4, 3))]
+
+    def run(count: int) -> tuple[int, dict]:
+        rows = np.hstack([ON_BRANCH, touched, np.zeros((5, 3))])[:count]
+        (tmp_path / "points.csv").write_text("".join(
+            ",".join([f"p{k}", *map(str, row)]) + "\n" for k, row in enumerate(rows)))
+        with pytest.raises(SystemExit) as stop:
+            command.main(["calibrate", str(tmp_path / "cell.toml"), str(branch_folder), "--points",
+                          str(tmp_path / "points.csv"), "--json"], standalone_mode=False)
+        return stop.value.code, json.loads(capfd.readouterr().out.splitlines()[-1])
+    code, told = run(5)
+    assert code == 0 and [point["name"] for point in told["points"]] == [f"p{k}" for k in range(5)]
+    off = np.array([point["residual_m"] for point in told["points"]])
+    assert off.argmax() == 0 and np.sqrt(np.mean(off**2)) == pytest.approx(told["residual_m"])
+    held = matrices(np.array(read_cell(tmp_path / "cell.toml").base.pose))
+    assert pose_vectors(held) == pytest.approx(BASE, abs=5e-3)
+    code, told = run(3)
+    assert code == 2 and "Four or more" in told["error"]
