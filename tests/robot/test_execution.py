@@ -16,6 +16,7 @@ from limber.robot.cell import Cell
 from limber.robot.execution import across, followed, robot_motion
 from limber.robot.expected import Predicted
 from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
+from limber.robot.virtual.controller import HOME
 from limber.stages.execute import (
     ExecuteOptions,
     ExecuteSettings,
@@ -296,7 +297,8 @@ def test_a_plan_for_another_robot_branch_or_base_is_refused(changes, told):
         check_plan(made_for | changes, cell)
 
 
-def armed(planned_folder, tmp_path, address, *, unexpected: float):
+def armed(planned_folder, tmp_path, address, *, unexpected: float, stands=None):
+    """Execute the plan; the arm stands with its start's joints, or those of ``stands`` [rad, 6]."""
     pytest.importorskip("rtde_control")
     branch = Branch.open(planned_folder)
     # The gripper stands where the approach begins, and comes as the cell's robot was put.
@@ -307,7 +309,10 @@ def armed(planned_folder, tmp_path, address, *, unexpected: float):
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
     settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
     path = cell_file(cell, tmp_path)
+    dry = execute(planned_folder, "path", path, settings, ExecuteOptions())
+    joints = dry["start_joints_rad"] if stands is None else stands(dry["start_joints_rad"])
     with robot_holding(branch, cell, tmp_path) as robot:
+        robot.ask("stand", joints=list(map(float, joints)))
         try:
             result = execute(planned_folder, "path", path, settings,
                              ExecuteOptions(arm=True, confirm="path"))
@@ -347,3 +352,16 @@ def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, tmp
     found = Branch.open(planned_folder).manifest.stages["execute:path"].result
     assert not found["reached"] and found["stop_reason"]
     assert found["peak_force_n"] is None or found["peak_force_n"] < 10
+
+
+@pytest.mark.parametrize("stands, told", [
+    (lambda joints: HOME, r"joint 3 \(elbow\) is at 90\.0 degrees, and 54\.0 was expected"),
+    (lambda joints: joints + np.r_[np.zeros(5), np.radians(50)],
+     r"turned by 50\.0 degrees.*joint 6 \(wrist 3\)")])
+def test_an_arm_in_another_configuration_does_not_move(planned_folder, tmp_path, worker_address,
+                                                       stands, told):
+    """At the start's pose by another branch; at its place, with the wrist turned."""
+    with pytest.raises(SafetyStop, match=told) as stop:
+        armed(planned_folder, tmp_path, worker_address, unexpected=3.0, stands=stands)
+    assert "start_joints_rad" in str(stop.value)
+    assert "execute:path" not in Branch.open(planned_folder).manifest.stages

@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.half_open import DIRECTIONS, Cable
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
     FAULTS,
@@ -19,6 +20,8 @@ from benchmarks.robot_faults import (
 )
 from limber.compiled import cache_folder
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.progress import SILENT
+from limber.robot.attendant import retreat_if_chosen
 from limber.robot.cell import Cell
 from limber.robot.expected import ExpectedWrench
 from limber.robot.link import COLUMNS, RobotLink
@@ -45,6 +48,41 @@ def test_every_fault_ends_in_standstill_and_a_report(moving_robot, name):
     outcome = provoke(name, moving_robot, cell_for(moving_robot.address))
     assert outcome.report
     assert outcome.standstill_s < 0.6 and outcome.way_m < 0.03
+
+
+@pytest.mark.parametrize("moving", [True, False])
+@pytest.mark.parametrize("direction", DIRECTIONS)
+def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(moving_robot, direction,
+                                                                       moving):
+    """Told at once; then nothing that is asked of the driver takes longer either."""
+    address = f"127.0.0.{int(moving_robot.address.split('.')[-1]) + 20}"
+    with Cable(address, moving_robot.address) as cable, RobotLink(cell_for(address)) as link:
+        time.sleep(0.3)
+        link.tare()
+        if moving:
+            link.start(straight(moving_robot, (0.0, 0.2, 0.0)))
+            time.sleep(0.6)
+        began = time.monotonic()
+        cable.cut(direction)
+        assert link.wait("stopped", seconds=5)["reason"]
+        assert time.monotonic() - began < 1.0
+        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3 or moving
+        if direction == "from the robot":
+            assert link.process.wait(5.0) is not None
+            assert time.monotonic() - began < 2.0
+        began = time.monotonic()
+        with pytest.raises(LimberError):
+            link.retreat()
+        assert time.monotonic() - began < 2.0
+        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
+
+
+def test_a_call_that_never_comes_back_is_told_as_a_safety_stop(moving_robot):
+    """The driver is ended by its deadline before it could say a word."""
+    with RobotLink(cell_for(moving_robot.address)) as link:
+        link.process.send_signal(signal.SIGALRM)
+        with pytest.raises(SafetyStop, match="did not answer its driver"):
+            link.wait("stopped", seconds=5)
 
 
 def test_a_killed_controller_is_reported(worker_address):
@@ -126,6 +164,45 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(worker_address):
         # The program that was uploaded anew is watched like the first.
         assert robot.state["watchdog_s"] == pytest.approx(0.1)
         assert np.allclose(robot.state["pose"][:3], begin[:3], atol=1e-4)
+
+
+def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_robot):
+    """It pauses, goes back some centimetres under the same force, stops and lets go."""
+    cell = cell_for(moving_robot.address)
+    cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
+        "gripper": "digital_output", "grip_seconds": 0.2})})
+    with RobotLink(cell) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.gripper(close=True)
+        link.start(straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
+        time.sleep(1.2)
+        moving_robot.ask("added_wrench", wrench=[0, 0, 14.0, 0, 0, 0])
+        assert "soft force" in link.wait("paused", "stopped", seconds=5)["reason"]
+        paused = moving_robot.state
+        told = retreat_if_chosen(cell, link, "retreat", SILENT)
+        ended = moving_robot.state
+    assert not told["retreated"] and told["gripper_opened"]
+    assert "force does not fall" in told["outcome"] and "14." in told["outcome"]
+    assert told["force_n"] == pytest.approx(14.0, abs=1.0)
+    assert paused["outputs"] == 1 and ended["outputs"] == 0
+    way = np.subtract(paused["pose"][:3], ended["pose"][:3])
+    assert 0.015 < way[1] < 0.03 and np.linalg.norm(ended["tool_speed"]) < 1e-3
+
+
+def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(moving_robot):
+    with RobotLink(cell_for(moving_robot.address)) as link:
+        time.sleep(0.2)
+        link.tare()
+        link.start(straight(moving_robot, (0.0, 0.1, 0.0)))
+        time.sleep(0.6)
+        link.stop()
+        link.wait("stopped", seconds=5)
+        moving_robot.ask("stand", joints=list(np.add(moving_robot.state["joints"],
+                                                     [0.2, 0, 0, 0, 0, 0])))
+        time.sleep(0.1)
+        with pytest.raises(SafetyStop, match=r"mm and .* degrees from the way"):
+            link.retreat()
 
 
 @pytest.mark.parametrize("held_up, ends", [("both", "reached"), ("the robot", "stopped")])

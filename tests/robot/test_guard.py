@@ -305,3 +305,78 @@ def test_motion_after_a_stop_needs_acknowledge_and_begin_in_any_order_of_events(
             assert event == "resume"
         if before == State.IDLE and bench.guard.state == State.MOVING:
             assert event == "begin"
+
+
+def wrench_of(force: float) -> np.ndarray:
+    return np.array([0.0, force, 0.0, 0.0, 0.0, 0.0])
+
+
+def going_back(bench: Bench, forces: np.ndarray, way: float = 0.03):
+    """Give samples of a retreat, 800 over ``way`` [m]; return what ended it, and at which."""
+    for number, force in enumerate(forces):
+        grasp = INSIDE + [0, -way * number / 800, 0]
+        decision = bench.look(force=(0, force, 0), grasp=grasp)
+        if decision.verdict != Verdict.GO:
+            return decision, number
+    return decision, len(forces)
+
+
+@pytest.mark.parametrize("start", [14.0, 38.0])
+def test_a_retreat_goes_on_while_the_force_falls(start):
+    """Over the soft or the hard limit; the pause or stop that led to it does not hold it back."""
+    bench = Bench()
+    bench.guard.begin()
+    assert bench.look(force=(0, start, 0)).verdict != Verdict.GO
+    bench.guard.begin_retreat(wrench_of(start))
+    assert bench.guard.feel(wrench_of(start)).verdict == Verdict.GO
+    assert going_back(bench, np.linspace(start, 0, 800))[0].verdict == Verdict.GO
+    bench.guard.end()
+    assert bench.guard.state == State.IDLE
+    # Afterwards the limits hold as ever.
+    bench.guard.begin()
+    assert bench.look(force=(0, 14, 0)).verdict == Verdict.PAUSE
+
+
+@pytest.mark.parametrize("forces, told, before", [
+    (np.linspace(38, 60, 800), "the force rises on the way back", 200),
+    (np.r_[np.linspace(38, 20, 400), np.linspace(20, 38, 400)], "the force rises", 500),
+    (np.full(800, 38.0), "the force does not fall on the way back", 600),
+    (np.r_[np.linspace(38, 2, 400), np.full(400, 12.0)], "the force rises", 410),
+    (np.r_[np.full(50, 38.0), 60.0], "the force rises", 51),
+    (np.r_[np.full(50, 38.0), np.nan], "no number", 51)])
+def test_a_retreat_stops_where_the_force_rises_or_stays(forces, told, before):
+    bench = Bench()
+    bench.guard.begin()
+    bench.look(force=(0, 38, 0))
+    bench.guard.begin_retreat(wrench_of(38.0))
+    decision, number = going_back(bench, forces)
+    assert decision.verdict == Verdict.STOP and told in str(decision) and number < before
+    assert bench.guard.state == State.STOPPED
+
+
+def test_a_retreat_leads_out_of_a_place_over_its_limit_and_no_farther_in():
+    """A joint at its limit, a singularity, outside of the workspace: each while it gets better."""
+    for good, bad, name in (
+            ({"joints": JOINTS}, {"joints": JOINTS + [6.165, 0, 0, 0, 0, 0]}, "joint 1"),
+            ({"joints": JOINTS}, {"joints": JOINTS * [1, 1, 1, 1, 0.012, 1]}, "singularity"),
+            ({"grasp": INSIDE}, {"grasp": INSIDE + [0.51, 0, 0]}, "workspace")):
+        key = next(iter(good))
+        parts = [(1 - part) * bad[key] + part * good[key] for part in np.linspace(-0.01, 0.05, 60)]
+        for order, stops in ((parts[10:], False), (parts[10::-1], True)):
+            bench = Bench()
+            bench.guard.begin()
+            stopped = bench.look(**bad)
+            assert stopped.verdict == Verdict.STOP and name in str(stopped)
+            bench.guard.begin_retreat(np.zeros(6))
+            seen = [bench.look(**{key: value}).verdict for value in order]
+            assert seen[0] == Verdict.GO and (Verdict.STOP in seen) == stops
+
+
+def test_a_retreat_needs_a_force_that_is_known_and_an_arm_that_stands():
+    bench = Bench()
+    bench.guard.begin()
+    with pytest.raises(SafetyStop, match="moving"):
+        bench.guard.begin_retreat(np.zeros(6))
+    bench.guard.event("test")
+    with pytest.raises(SafetyStop, match="not known"):
+        bench.guard.begin_retreat(np.r_[np.inf, np.zeros(5)])

@@ -102,6 +102,30 @@ def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, worker_address)
     assert read_pull(branch_folder / "pulls" / "stopped").entry.observation == "none"
 
 
+def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,
+                                                                   worker_address):
+    """Along its axis a branch is stiff: 30 N within a millimetre or two, and more on the way."""
+    branch = Branch.open(branch_folder)
+    cell = standing_at(branch, worker_address)
+    skeleton = load_skeleton(branch)
+    axis = skeleton.point_at(0.92) - skeleton.point_at(0.87)
+    with robot_holding(branch, cell, tmp_path) as robot:
+        done = subprocess.run(
+            [sys.executable, "-m", "limber", "record", str(branch_folder), "--cell",
+             str(cell_file(cell, tmp_path)), "--name", "stiff", "--confirm", "stiff",
+             "--after-stop", "retreat", "--shape", "straight", "--direction", *map(str, axis),
+             "--distance", "0.03", "--speed", "0.005", "--json"],
+            capture_output=True, check=False, text=True, timeout=100)
+        state = robot.state
+    told = json.loads(done.stdout.splitlines()[-1])
+    assert done.returncode == 4, (told, done.stderr, state)
+    assert "force limit" in told["ended"] and told["peak_force_n"] > 30
+    after = told["after_stop"]
+    assert after["choice"] == "retreat" and after["retreated"] and not after["gripper_opened"]
+    assert after["force_n"] < 3
+    assert after["outcome"] in told["error"] and after["outcome"] in done.stderr
+
+
 def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, worker_address):
     """kill -9 in the middle: the arm stops, all but the last second is there afterwards."""
     branch = Branch.open(branch_folder)

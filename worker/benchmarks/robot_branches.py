@@ -151,7 +151,9 @@ def _executed_in(folder: Path, seed: int, address: str,
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
     settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
     path = cell_file(cell, folder)
+    dry = execute(branch.folder, "path", path, settings, ExecuteOptions())
     with robot_holding(branch, cell, folder, seed=seed, young=young) as robot:
+        robot.ask("stand", joints=list(map(float, dry["start_joints_rad"])))
         largest = [0.0]
         ended = threading.Event()
         watcher = threading.Thread(target=_watch, args=(robot, largest, ended, fault))

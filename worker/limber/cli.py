@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from limber.errors import LimberError
+from limber.errors import LimberError, SafetyStop
 from limber.heartbeat import Heartbeat
 from limber.machine_errors import machine_error
 from limber.progress import BarSink, JsonSink, Progress, Sink, damage_told_to
@@ -210,6 +210,8 @@ def _execute(name: str, function: Callable[..., dict[str, Any]], as_json: bool,
                 result = function(state, **options)
     except LimberError as error:
         code = error.exit_code
+        if isinstance(error, SafetyStop):
+            result = error.result
         outcome |= {"status": error.status, "error": str(error), "fix": error.fix}
     except KeyboardInterrupt:
         code = 130

@@ -3,6 +3,8 @@
 Every message has three parts: what was seen, why it is wrong, what to do.
 """
 
+from typing import Any
+
 
 class LimberError(Exception):
     """Base of all errors that a user can meet. Not raised itself."""
@@ -55,9 +57,17 @@ class MissingDependencyError(WorkError):
 
 
 class SafetyStop(LimberError):
-    """A robot was stopped, or not started, for safety (exit code 4)."""
+    """A robot was stopped, or not started, for safety (exit code 4).
+
+    ``result`` holds what was found up to then; it is part of the command's JSON.
+    """
 
     exit_code = 4
+
+    def __init__(self, seen: str, why: str = "", fix: str = "", *,
+                 result: dict[str, Any] | None = None):
+        super().__init__(seen, why, fix)
+        self.result = result or {}
 
 
 class DamagedCacheWarning(UserWarning):

@@ -17,7 +17,7 @@ import signal
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -26,13 +26,21 @@ import numpy as np
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.robot.cell import Cell
 from limber.robot.connecting import WATCHDOG_HZ, checked, connect, require
+from limber.robot.deadline import (
+    CONNECT_SECONDS,
+    RenewedDeadline,
+    clear_deadline,
+    set_deadline,
+)
 from limber.robot.expected import ExpectedWrench
 from limber.robot.frames import frame_of, pose_of, turn_between
 from limber.robot.guard import PLAYING, Decision, Guard, GuardSettings, State, Verdict
 from limber.robot.real_time import claim_real_time, keep_awake, spare_what_is_loaded
 from limber.robot.samples import Dashboard, Sample, SampleStream
 from limber.robot.sensors import ForceTorqueSensor, WrenchChain, open_sensor
+from limber.robot.start import require_start
 from limber.robot.trajectory import Trajectory
+from limber.robot.way_back import WayBack
 from limber.robot.words import Words
 
 PARENT_SECONDS = 1.0
@@ -40,8 +48,8 @@ PARENT_SECONDS = 1.0
 
 _LOOKAHEAD, _GAIN = 0.06, 900.0
 _STOP_DECELERATION = 8.0  # rad/s^2 of the joints
-_START_TOLERANCE = 0.005  # m
-_PROGRAM_SECONDS = 2.0
+_PROGRAM_SECONDS = 1.5
+_GONE_SECONDS = 1.0  # of silence; from the first of them on the arm is being stopped
 _BATCH_SECONDS = 0.02
 _SECOND_CHANNEL_SECONDS = 0.15
 _LONG_STEP_SECONDS = 0.004
@@ -92,17 +100,21 @@ class Driver:
         self._warm_up()
         # Now: where it has just compiled this takes longer than the watchdog would wait.
         self.facts |= {"kept_in_memory": spare_what_is_loaded(), "kept_awake": keep_awake()}
+        set_deadline(CONNECT_SECONDS)
         self._control, self._io = connect(cell, self._stream.rate)
+        self._deadline = RenewedDeadline()
+        self._deadline.renew()
         # Before ur-rtde's own threads, which have what was claimed before they began.
         claim_real_time(_LOOP_PRIORITY)
         self._following: Following | None = None
-        self._gone: Trajectory | None = None
+        self._way_back = WayBack()
         self._stopped_at: float | None = None
         self._dashboard_was_used = False
         self._command: np.ndarray | None = None
         self._held_for: np.ndarray | None = None
         self._held_at = np.zeros(6)
         self._tare_until: float | None = None
+        self._smooth = _NOTHING
         self._batch: list[np.ndarray] = []
         self._batch_since = time.monotonic()
         self._last: Sample | None = None
@@ -134,6 +146,7 @@ class Driver:
             guard.state = State.MOVING
             guard.permit(sample.pose, sample.pose + 1e-3, 0.002)
             pose_of(self._base @ frame_of(sample.pose))
+        _walked_back(samples[0])
         # Loaded now, to be kept in memory with the rest.
         import_module("rtde_control")
 
@@ -144,6 +157,7 @@ class Driver:
         quiet = 2.0 / self._stream.rate + 0.005
         self._stream.skip()
         while not self.ended:
+            self._deadline.renew()
             try:
                 samples = self._stream.read(quiet, self._sensor.connections)
             except ConnectionError as error:
@@ -159,8 +173,12 @@ class Driver:
                 if beside and select.select(beside, [], [], 0.0)[0]:
                     self._feel(self._last)
             elif self._last is not None:
+                age = time.monotonic() - self._last.arrived
                 if not self._has_just_woken:
-                    self._judge(self.guard.silence(time.monotonic() - self._last.arrived))
+                    self._judge(self.guard.silence(age), at_once=True)
+                    if age > _GONE_SECONDS:
+                        self._lost(f"no data came from the robot for {age:.1f} s")
+                        return
                 self._feel(self._last)
             self._take(orders)
             if samples and not self.ended:
@@ -215,7 +233,9 @@ class Driver:
             self._begin(Trajectory(
                 np.array(order["times"], float), np.array(order["poses"], float),
                 None if order.get("expected") is None else ExpectedWrench(**{
-                    part: np.array(value, float) for part, value in order["expected"].items()})))
+                    part: np.array(value, float) for part, value in order["expected"].items()})),
+                None if order.get("start_joints") is None
+                else np.array(order["start_joints"], float))
         elif name == "stop":
             self._judge(self.guard.event("asked to stop"))
         elif name == "resume":
@@ -240,11 +260,13 @@ class Driver:
             self._judge(self.guard.event(str(error)))
             return
         now, smooth = self._chain.wrench(sample, reading)
+        self._smooth = smooth
         # First what must not wait for the rest.
         self._judge(self.guard.feel(now), sample)
         following = self._following
         expected = doubt = sent = None
         if following is not None:
+            self._way_back.note(sample)
             # The arm is where its target was a look-ahead ago.
             behind = max(following.time - _LOOKAHEAD * following.rate, 0.0)
             planned = following.trajectory.pose(behind)
@@ -276,7 +298,7 @@ class Driver:
             self._sensor.connections = ()
             self._judge(self.guard.event(str(error)))
             return
-        self._judge(self.guard.feel(self._chain.between(sample, reading)), is_between=True)
+        self._judge(self.guard.feel(self._chain.between(sample, reading)), at_once=True)
 
     def _expected(self, trajectory: Trajectory, time: float, planned: np.ndarray,
                   pose: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -292,12 +314,17 @@ class Driver:
         return wrench + slopes @ np.concatenate((turn @ off[:3], turn @ off[3:])), covariance
 
     def _judge(self, decision: Decision, sample: Sample | None = None, *,
-               is_between: bool = False) -> None:
+               at_once: bool = False) -> None:
+        """Act on a decision.
+
+        Args:
+            at_once: Stop by the dashboard as well: no step of the controller is near.
+        """
         if decision.verdict == Verdict.STOP and self._stopped_at is None:
             if self._following is not None:
                 # ur-rtde hands a command over with the controller's next step, 8 ms of a CB3's.
                 is_slow = sample is not None and 1.0 / self._stream.rate > _LONG_STEP_SECONDS
-                if is_between or is_slow:
+                if at_once or is_slow:
                     self._stop_by_dashboard(f"it does not wait for a step: {decision.reason}")
                 self._stop(decision, sample)
             else:
@@ -310,16 +337,16 @@ class Driver:
     def _stop(self, decision: Decision, sample: Sample | None) -> None:
         following = self._following
         assert following is not None
-        self._gone = following.trajectory.until(following.time)
         self._following = None
         self._stopped_at = time.monotonic()
         came = sample.arrived if sample is not None else self._stopped_at
         latency = self._stopped_at - came
-        self._stop_arm()
+        # Before the arm's stop, from which this process does not come back where no answer comes.
         self.tell(event="stopped", reason=str(decision), moving=True, value=decision.value,
                   limit=decision.limit, command_after_s=latency,
                   clock=sample.clock if sample is not None else None,
                   at_s=following.time)
+        self._stop_arm()
 
     def _stop_arm(self) -> None:
         """First channel: the control program; second, where it fails: the dashboard."""
@@ -350,38 +377,50 @@ class Driver:
 
     # Motion
 
-    def _begin(self, trajectory: Trajectory) -> None:
+    def _begin(self, trajectory: Trajectory, start_joints: np.ndarray | None) -> None:
         sample = self._require_sample()
-        away = float(np.linalg.norm(trajectory.poses[0, :3] - sample.pose[:3]))
-        if away > _START_TOLERANCE:
-            raise SafetyStop(f"The path starts {1000 * away:.1f} mm from where the robot is.",
-                             f"At most {1000 * _START_TOLERANCE:.0f} mm are bridged.",
-                             "Move the robot to the start, or plan from its actual pose.")
+        require_start(sample.pose, sample.joints, trajectory.poses[0], start_joints)
+        self._require_program(sample)
+        self.guard.begin()
+        self._way_back.begin(sample, trajectory)
+        rest = None if trajectory.expected is None else trajectory.expected.rest_pose
+        if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
+            # Here the gripper closed on the resting branch: ways are measured from here.
+            self._held_for, self._held_at = rest, sample.pose.copy()
+        self._set_off(trajectory)
+
+    def _retreat(self) -> None:
+        sample = self._require_sample()
+        way = self._way_back.from_here(sample, self.cell.limits.acceleration_m_s2)
+        self._require_program(sample)
+        self.guard.begin_retreat(self._smooth)
+        self._set_off(way)
+
+    def _set_off(self, trajectory: Trajectory) -> None:
+        self._stopped_at, self._dashboard_was_used = None, False
+        self._following = Following(trajectory)
+        self._command = self._require_sample().pose.copy()
+        # Starting a program takes its time, and is no hold-up.
+        self._listened = time.monotonic()
+        self.tell(event="started", seconds=trajectory.duration)
+
+    def _require_program(self, sample: Sample) -> None:
         if sample.slider <= 0.0:
             raise SafetyStop("The speed slider stands at 0.", "The robot would not move.",
                              "Raise it on the pendant.")
         if not self._control.isProgramRunning():
             self._start_program()
-        self.guard.begin()
-        self._stopped_at, self._dashboard_was_used = None, False
-        self._following = Following(trajectory)
-        self._command = sample.pose.copy()
-        rest = None if trajectory.expected is None else trajectory.expected.rest_pose
-        if rest is None or self._held_for is None or np.abs(rest - self._held_for).max() > 0:
-            # Here the gripper closed on the resting branch: ways are measured from here.
-            self._held_for, self._held_at = rest, sample.pose.copy()
-        # Starting a program takes its time, and is no hold-up.
-        self._listened = time.monotonic()
-        self.tell(event="started", seconds=trajectory.duration)
 
     def _start_program(self) -> None:
         """Upload the control program once more, and see that it runs: ur-rtde does not wait."""
         started = self._control.reuploadScript()
+        self._deadline.renew()
         given_up = time.monotonic() + _PROGRAM_SECONDS
         while not (self._control.isProgramRunning()
                    and self._require_sample().runtime_state == PLAYING):
             if not started or time.monotonic() > given_up:
                 raise WorkError("The control program does not run.", "", "See the pendant.")
+            self._deadline.renew()
             for sample in self._stream.read(1.0 / self._stream.rate):
                 self._look(sample)
                 self._last = sample
@@ -417,7 +456,6 @@ class Driver:
             self._finish(following)
 
     def _finish(self, following: Following) -> None:
-        self._gone = following.trajectory.until(following.trajectory.duration)
         self._following = None
         self.guard.end()
         if not self._control.servoStop(_STOP_DECELERATION):
@@ -435,15 +473,6 @@ class Driver:
             if late and moving:
                 self._stop_by_dashboard("the robot still moves after its stop")
                 self._stopped_at = time.monotonic()
-
-    def _retreat(self) -> None:
-        if self._gone is None:
-            raise SafetyStop("There is no way back.", "Nothing was followed yet.", "")
-        self.guard.acknowledge()
-        gone, sample = self._gone, self._require_sample()
-        poses = np.vstack([sample.pose, gone.poses[1:]])
-        # Half as fast as it came.
-        self._begin(Trajectory(2.0 * gone.times, poses))
 
     def _grip(self, close: bool) -> None:
         if self._io is None:
@@ -490,6 +519,7 @@ class Driver:
 
     def close(self) -> None:
         """Stop what moves and let go of the robot."""
+        set_deadline()
         if self._following is not None:
             self._following = None
             self._stop_arm()
@@ -499,6 +529,15 @@ class Driver:
         self._control.disconnect()
         self._stream.close()
         self._dashboard.close()
+
+
+def _walked_back(sample: Sample) -> Trajectory:
+    """Go a millimetre and the way back in thought, so that all that it takes is loaded."""
+    way = WayBack()
+    there = replace(sample, pose=sample.pose + np.r_[0.002, np.zeros(5)])
+    way.begin(sample, Trajectory(np.array([0.0, 1.0]), np.array([sample.pose, there.pose])))
+    way.note(there)
+    return way.from_here(there, 0.1)
 
 
 def _read_orders(orders: "queue.SimpleQueue[dict[str, Any] | None]") -> None:
@@ -535,6 +574,8 @@ def main() -> int:
     finally:
         if driver is not None and not driver.ended:
             driver.close()
+        # From here on nothing waits for the robot: the last words may take their time.
+        clear_deadline()
         words.close()
     # What ur-rtde's threads still wait for is not waited for.
     os._exit(0)

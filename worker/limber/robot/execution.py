@@ -1,7 +1,7 @@
 """A planned path as motion of a robot: joints, times, expected wrenches, approach and return."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -47,8 +47,7 @@ class RobotMotion:
     @property
     def leaving(self) -> Trajectory:
         """The approach reversed."""
-        approach = self.approach
-        return Trajectory(approach.duration - approach.times[::-1], approach.poses[::-1])
+        return replace(self.approach.backwards(), expected=None)
 
 
 @dataclass(frozen=True)
@@ -154,8 +153,12 @@ def _timed(cell: Cell, predicted: Predicted, way: _Way, speed: float) -> RobotMo
     dense = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1))]
     expected = at_places(predicted, ways, dense).felt(cell, path[0])
     coming = along(way.approach, speed, limits.acceleration_m_s2)
-    return RobotMotion(Trajectory(coming, way.approach, ExpectedWrench.nothing(way.approach)),
-                       Trajectory(times, path, expected), way.joints, way.rotation)
+    first = len(way.approach)
+    # The last pose of the approach is the first of the path.
+    coming_joints, joints = way.joints.joints[:first], way.joints.joints[first - 1:]
+    return RobotMotion(Trajectory(coming, way.approach, ExpectedWrench.nothing(way.approach),
+                                  coming_joints),
+                       Trajectory(times, path, expected, joints), way.joints, way.rotation)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ safety function and claims no standard: the controller's own limits and the butt
 are what protects people.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -25,7 +25,9 @@ _SAME = 1e-9  # N, N m
 _DEVIATIONS = 2.0  # of a prediction that are allowed for
 _MOSTLY = 0.8  # cosine of the angle to the predicted force, against which a difference lies
 _MOSTLY_AT_ONCE = 0.5  # the same of what changed at once: a piece that slides pulls askew
+_PLACE_SLACK = 0.01  # rad of a joint, or of the distance from a singularity, on a retreat
 _NO_DOUBT = np.zeros((6, 6))
+_RISES = "the {} rises on the way back"
 _UNLIKE = "force unlike the predicted one [N]"
 _SHORT = "less force than predicted: the branch slipped, broke or is softer [N]"
 _FELL = "the predicted force fell at once: the branch slipped, broke or came loose [N]"
@@ -84,6 +86,9 @@ class GuardSettings:
         loss_time: Time in which such a loss counts as sudden [s].
         least_force: Force below which a loss is not told from noise [N].
         largest_torque_error: Of the torque against the predicted one [N m].
+        relief_way: Way of a retreat on which a force over the soft limit falls by ``least_force``
+            at least [m].
+        relief_time: The same for a slow one [s].
     """
 
     limits: LimitsEntry
@@ -97,6 +102,26 @@ class GuardSettings:
     loss_time: float = 0.5
     least_force: float = 1.0
     largest_torque_error: float = 1.0
+    relief_way: float = 0.02
+    relief_time: float = 10.0
+
+
+@dataclass
+class _Relief:
+    """What a retreat has brought down of what was over its limit.
+
+    Attributes:
+        force, torque: Least ones since it began [N], [N m].
+        excess: Least excess over each limit of the arm's place.
+        marked_force, marked_clock, marked_grasp: From where a fall is measured next.
+    """
+
+    force: float
+    torque: float
+    excess: dict[str, float] = field(default_factory=dict)
+    marked_force: float = np.inf
+    marked_clock: float = -np.inf
+    marked_grasp: np.ndarray | None = None
 
 
 @dataclass
@@ -111,6 +136,7 @@ class _Memory:
     usual_off: np.ndarray | None = None
     grasp: np.ndarray | None = None
     way: np.ndarray | None = None
+    relief: _Relief | None = None
 
 
 class Guard:
@@ -151,8 +177,32 @@ class Guard:
         self.state = State.MOVING
         self._memory = _Memory()
 
+    def begin_retreat(self, wrench: np.ndarray) -> None:
+        """Allow a motion back along the way that was followed: a person has chosen it.
+
+        It is needed where something is over its limit. So each limit that is passed when it begins
+        gives way to the least value since then, plus what is allowed of a force that differs from
+        the predicted one: the motion stops where a force rises, or does not fall.
+
+        Args:
+            wrench: What the gripper exerts on the branch, smoothed [N, N m], shape [6].
+
+        Raises:
+            SafetyStop: the robot moves, or the force is not known.
+        """
+        if self.state == State.MOVING:
+            raise SafetyStop("The robot is moving.", "", "Stop it before it goes back.")
+        if not np.isfinite(wrench).all():
+            raise SafetyStop("The force is not known: the sensor shows no number, or is at the end "
+                             "of its range.", "Whether it falls on the way back could not be "
+                             "seen.", "Open the gripper.")
+        self.state = State.IDLE
+        self.begin()
+        self._memory.relief = _Relief(length(wrench[:3]), length(wrench[3:]))
+
     def end(self) -> None:
         """The motion is over."""
+        self._memory.relief = None
         if self.state in (State.MOVING, State.PAUSED):
             self.state = State.IDLE
 
@@ -209,6 +259,8 @@ class Guard:
                       self._check_expected(wrench, expected, doubt)):
             if check.verdict == Verdict.STOP:
                 return check
+        if self._memory.relief is not None:
+            return self._check_relief(self._memory.relief, sample, wrench, grasp)
         force = length(wrench[:3])
         if self.state == State.MOVING and force > self._settings.limits.soft_force_n:
             self.state = State.PAUSED
@@ -285,11 +337,64 @@ class Guard:
         if np.isnan(wrench).any():
             return self._stop("a sensor shows no number")
         force, torque = length(wrench[:3]), length(wrench[3:])
-        if force > limits.hard_force_n:
-            return self._stop("hard force limit [N]", force, limits.hard_force_n)
-        if torque > limits.hard_torque_nm:
-            return self._stop("hard torque limit [N m]", torque, limits.hard_torque_nm)
+        most_force, most_torque = limits.hard_force_n, limits.hard_torque_nm
+        told = "hard {} limit"
+        if (relief := self._memory.relief) is not None:
+            told = _RISES
+            most_force = max(most_force, self._relieved_force(relief))
+            most_torque = max(most_torque, self._relieved_torque(relief))
+        if force > most_force:
+            return self._stop(told.format("force") + " [N]", force, most_force)
+        if torque > most_torque:
+            return self._stop(told.format("torque") + " [N m]", torque, most_torque)
         return _GO
+
+    def _relieved_force(self, relief: _Relief) -> float:
+        return relief.force + max(self._settings.limits.unexpected_force_n,
+                                  self._settings.least_force)
+
+    def _relieved_torque(self, relief: _Relief) -> float:
+        return relief.torque + self._settings.largest_torque_error
+
+    def _check_relief(self, relief: _Relief, sample: Sample, wrench: np.ndarray,
+                      grasp: np.ndarray | None) -> Decision:
+        """Judge a sample of a retreat: what is over a limit falls, or it stops."""
+        settings, limits = self._settings, self._settings.limits
+        smooth = self._filtered(wrench)
+        force, torque = length(smooth[:3]), length(smooth[3:])
+        relief.force, relief.torque = min(relief.force, force), min(relief.torque, torque)
+        most = max(limits.soft_force_n, self._relieved_force(relief))
+        if force > most:
+            return self._stop(_RISES.format("force") + " [N]", force, most)
+        most = max(limits.hard_torque_nm, self._relieved_torque(relief))
+        if torque > most:
+            return self._stop(_RISES.format("torque") + " [N m]", torque, most)
+        mark = relief.marked_grasp
+        has_gone = (mark is not None and grasp is not None
+                    and length(grasp - mark) > settings.relief_way)
+        if mark is None or has_gone or sample.clock - relief.marked_clock > settings.relief_time:
+            if force > limits.soft_force_n and force > relief.marked_force - settings.least_force:
+                return self._stop("the force does not fall on the way back [N]", force,
+                                  limits.soft_force_n)
+            relief.marked_force, relief.marked_clock, relief.marked_grasp = (
+                force, sample.clock, grasp)
+        return _GO
+
+    def _is_over(self, name: str, excess: float, slack: float) -> bool:
+        """Whether the arm is past a limit of its place by ``excess``; on a retreat it may be, as
+        long as that does not grow by more than ``slack``."""
+        relief = self._memory.relief
+        if excess <= 0 or relief is None:
+            return excess > 0
+        least = relief.excess[name] = min(relief.excess.get(name, excess), excess)
+        return excess > least + slack
+
+    def _filtered(self, wrench: np.ndarray) -> np.ndarray:
+        """Return the force [6] that is compared with the predicted one; ``wrench`` enters it."""
+        kept = np.exp(-self._step / self._settings.filter_time)
+        before = wrench if self._memory.filtered is None else self._memory.filtered
+        self._memory.filtered = kept * before + (1 - kept) * wrench
+        return self._memory.filtered
 
     def _check_place(self, sample: Sample, grasp: np.ndarray | None, sent: np.ndarray | None,
                      ) -> Decision:
@@ -299,16 +404,20 @@ class Guard:
             return self._stop("speed [m/s]", speed, limits.speed_m_s)
         margin = np.minimum(sample.joints - settings.joint_limits[:, 0],
                             settings.joint_limits[:, 1] - sample.joints)
-        if margin.min() < 0.5 * limits.joint_margin_rad:
-            return self._stop(f"joint {int(margin.argmin()) + 1} at its limit")
+        joint = int(margin.argmin())
+        if self._is_over(f"joint {joint}", 0.5 * limits.joint_margin_rad - float(margin[joint]),
+                         _PLACE_SLACK):
+            return self._stop(f"joint {joint + 1} at its limit")
         distance = float(singularity_distance(self._arm, sample.joints).min())
-        if self.state == State.MOVING and distance < 0.5 * limits.singularity:
+        if self.state == State.MOVING and self._is_over(
+                "singularity", 0.5 * limits.singularity - distance, _PLACE_SLACK):
             return self._stop("singularity", distance, 0.5 * limits.singularity)
         box = settings.workspace
-        if box is not None and grasp is not None and self.state == State.MOVING and (
-                np.any(grasp < np.array(box.low_m) - 1e-3)
-                or np.any(grasp > np.array(box.high_m) + 1e-3)):
-            return self._stop("the grasp left the workspace")
+        if box is not None and grasp is not None and self.state == State.MOVING:
+            outside = float(np.maximum(np.array(box.low_m) - grasp,
+                                       grasp - np.array(box.high_m)).max())
+            if self._is_over("workspace", outside - 1e-3, 1e-3):
+                return self._stop("the grasp left the workspace")
         if sent is not None and self.state == State.MOVING:
             off = length(sample.pose[:3] - sent)
             if off > settings.off_path:
@@ -320,9 +429,10 @@ class Guard:
         settings, memory = self._settings, self._memory
         if self.state not in (State.MOVING, State.PAUSED):
             return _GO
-        kept = np.exp(-self._step / settings.filter_time)
-        before = wrench if memory.filtered is None else memory.filtered
-        memory.filtered = filtered = kept * before + (1 - kept) * wrench
+        if memory.relief is not None:
+            # A force that falls at once is what a retreat is for.
+            return _GO
+        filtered = self._filtered(wrench)
         force = length(filtered[:3])
         if expected is None:
             # Nothing is predicted while E is being measured: a sudden loss still tells a slip, but
@@ -385,6 +495,7 @@ class Guard:
 
     def _stop(self, reason: str, value: float = 0.0, limit: float = 0.0) -> Decision:
         decision = Decision(Verdict.STOP, reason, value, limit)
+        self._memory.relief = None
         if self.state != State.STOPPED:
             self.state = State.STOPPED
             self.reason = str(decision)

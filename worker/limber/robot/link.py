@@ -13,10 +13,12 @@ import numpy as np
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.jobs.ending import end_by_closing
 from limber.robot.cell import Cell
+from limber.robot.deadline import CALL_SECONDS, ended_by_deadline
 from limber.robot.trajectory import Trajectory
 
 _CONNECT_SECONDS = 25.0
 _BEAT_SECONDS = 0.2
+_STANDS_SECONDS = 0.3
 _ERRORS: dict[int, type[LimberError]] = {2: InputError, 4: SafetyStop}
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad",
@@ -100,6 +102,8 @@ class RobotLink:
         expected = trajectory.expected
         self._order(order="follow", times=trajectory.times.tolist(),
                     poses=trajectory.poses.tolist(),
+                    start_joints=None if trajectory.joints is None
+                    else trajectory.joints[0].tolist(),
                     expected=None if expected is None else {
                         name: value.tolist() for name, value in vars(expected).items()})
         self.wait("started", seconds=5.0)
@@ -116,7 +120,17 @@ class RobotLink:
         return self.wait("reached", "stopped", "paused", seconds=10 * trajectory.duration + 30.0)
 
     def retreat(self) -> dict[str, Any]:
-        """Go back the way it came, slower; a person has asked for it."""
+        """Go back the way it came, slower; a person has asked for it.
+
+        Returns:
+            The event that ended it: ``reached``, or ``stopped`` with its reason, as where the force
+            does not fall on the way.
+
+        Raises:
+            SafetyStop: there is no way back, or the arm left it. WorkError: the driver is gone.
+        """
+        # Until the arm stands, and the smoothed force is that of where it stands.
+        time.sleep(_STANDS_SECONDS)
         self._order(order="retreat")
         self.wait("started", seconds=5.0)
         return self.wait("reached", "stopped", "paused", seconds=600.0)
@@ -162,14 +176,27 @@ class RobotLink:
                     if kind in ("warning", "second_channel"):
                         self.warnings.append(event.get("text") or event["reason"])
                 if self._ended:
-                    raise WorkError("The robot's driver has ended.", "Its connection broke.",
-                                    "Look at the robot; its own watchdog has stopped it.")
+                    raise self._why_it_ended()
                 left = end - time.monotonic()
                 if left <= 0:
                     raise WorkError(f"The robot's driver says nothing of {' or '.join(kinds)} "
                                     f"for {seconds:.0f} s.", "A port may be silent.",
                                     "Look at the robot.")
                 self._news.wait(left)
+
+    def _why_it_ended(self) -> LimberError:
+        try:
+            code = self.process.wait(1.0)
+        except subprocess.TimeoutExpired:
+            code = None
+        if ended_by_deadline(code):
+            return SafetyStop(
+                "The robot was stopped: the controller did not answer its driver for "
+                f"{CALL_SECONDS:g} s, and the driver was ended.", "Its connection carries one way "
+                "alone, or not at all.", "Look at the robot, which its own watchdog has stopped; "
+                "check the cable and the network before connecting again.")
+        return WorkError("The robot's driver has ended.", "Its connection broke.",
+                         "Look at the robot; its own watchdog has stopped it.")
 
     def abandon(self) -> None:
         """Close the pipe without a word, as a program does that is killed."""

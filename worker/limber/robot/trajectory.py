@@ -7,7 +7,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.robot.expected import ExpectedWrench
-from limber.robot.frames import pose_between
+from limber.robot.frames import length, pose_between, turn_between
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,14 @@ class Trajectory:
         poses: Of the tool's centre, the robot's base frame [m, rad], shape [n, 6].
         expected: What the gripper will feel of the branch at each pose, or None where nothing is
             predicted.
+        joints: Joint angles for which reach, limits and obstacles were checked at each pose [rad],
+            shape [n, 6]; None where nothing was checked.
     """
 
     times: np.ndarray
     poses: np.ndarray
     expected: ExpectedWrench | None = None
+    joints: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shaped = (self.times.ndim == 1 and len(self.times) >= 2
@@ -38,10 +41,23 @@ class Trajectory:
                     self.expected.wrenches, self.expected.slopes, self.expected.covariance))):
             raise InputError("Expected wrenches that do not fit the poses.",
                              "Each pose has one of six numbers.", "Check the plan.")
+        if self.joints is not None and (self.joints.shape != self.poses.shape
+                                        or not np.isfinite(self.joints).all()):
+            raise InputError(f"Joint angles of shape {self.joints.shape} for {len(self.poses)} "
+                             "poses, or not finite.", "Each pose has six.", "Check the path.")
 
     @property
     def duration(self) -> float:
         return float(self.times[-1])
+
+    @property
+    def greatest_speeds(self) -> np.ndarray:
+        """Of the tool's centre [m/s] and of its turns [rad/s], shape [2]."""
+        steps = np.diff(self.times)
+        ways = np.linalg.norm(np.diff(self.poses[:, :3], axis=0), axis=1)
+        turns = np.array([length(turn_between(first, second))
+                          for first, second in pairwise(self.poses)])
+        return np.array([(ways / steps).max(), (turns / steps).max()])
 
     def pose(self, time: float) -> np.ndarray:
         """Return the pose at a time [s]; the last one afterwards, shape [6]."""
@@ -55,16 +71,8 @@ class Trajectory:
     def backwards(self) -> "Trajectory":
         """Return it from its end to its start, as fast, with what is expected on it."""
         return Trajectory(self.duration - self.times[::-1], self.poses[::-1],
-                          None if self.expected is None else self.expected.reversed())
-
-    def until(self, time: float) -> "Trajectory":
-        """Return the way back: what was gone until ``time`` [s], reversed in time."""
-        kept = np.flatnonzero(self.times < time)
-        times = np.r_[self.times[kept], time]
-        poses = np.vstack([self.poses[kept], self.pose(time)])
-        if len(times) < 2:
-            times, poses = np.r_[0.0, max(time, 1e-3)], np.vstack([poses[-1], poses[-1]])
-        return Trajectory(times[-1] - times[::-1], poses[::-1])
+                          None if self.expected is None else self.expected.reversed(),
+                          None if self.joints is None else self.joints[::-1])
 
     def _place(self, time: float) -> tuple[int, float]:
         time = min(max(time, 0.0), self.duration)

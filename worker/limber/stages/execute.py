@@ -84,9 +84,10 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     path is followed, held and gone back, the gripper opens and the robot leaves.
 
     Returns:
-        ``armed``, ``reached``, ``stop_reason``, ``peak_force_n``, ``path_error_m`` (None in a dry
-        run) and what was computed: duration, predicted peak force, distances from singularities
-        and joint limits, where the robot has to stand.
+        ``armed``, ``reached``, ``stop_reason``, ``after_stop`` (as
+        :func:`limber.robot.attendant.retreat_if_chosen` returns it), ``peak_force_n``,
+        ``path_error_m`` (None in a dry run) and what was computed: duration, predicted peak force,
+        distances from singularities and joint limits, where the robot has to stand.
 
     Raises:
         InputError: plan, cell and branch do not belong together, or nobody confirmed.
@@ -132,7 +133,7 @@ def execute(folder: Path, name: str, cell_file: Path, settings: ExecuteSettings,
     if not options.arm:
         _write_preview(branch, name, settings, cell, motion)
         return result | {"armed": False, "reached": None, "stop_reason": None,
-                         "peak_force_n": None, "path_error_m": None}
+                         "after_stop": None, "peak_force_n": None, "path_error_m": None}
     require_confirmation(name, options.confirm)
     return _armed(branch, cell, name, settings, options, motion, result, progress)
 
@@ -367,6 +368,7 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
         result = summary | {
             "armed": True, "reached": reached,
             "stop_reason": None if reached else event["reason"],
+            "after_stop": event.get("after_stop"),
             "peak_force_n": found.peak_force if found else None,
             "path_error_m": found.path_error if found else None,
             "force_error_of_peak": found.force_error if found else None,
@@ -380,9 +382,9 @@ def _armed(branch: Branch, cell: Cell, name: str, settings: ExecuteSettings,
             stage.result.update(result)
     if not reached:
         raise SafetyStop(f"The robot was stopped: {event['reason']}.",
-                         f"Its log is in executions/{name}.",
+                         f"{event['after_stop']['outcome']} Its log is in executions/{name}.",
                          "Look at the branch and the robot before anything moves; plan again from "
-                         "where it is.")
+                         "where it is.", result=result)
     return result
 
 
@@ -407,8 +409,8 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
         if title == "path":
             on_path = (begin, sum(map(len, batches)))
         if event["event"] != "reached":
-            retreat_if_chosen(link, options.after_stop)
-            return event, on_path
+            after = retreat_if_chosen(cell, link, options.after_stop, progress)
+            return event | {"after_stop": after}, on_path
         if title == "approach":
             grip(cell, link, close=True, progress=progress)
         elif title == "path":

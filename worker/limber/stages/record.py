@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from limber.errors import InputError, SafetyStop, WorkError
+from limber.errors import InputError, LimberError, SafetyStop, WorkError
 from limber.progress import SILENT, Progress
 from limber.robot.attendant import AfterStop, grip, require_confirmation, retreat_if_chosen
 from limber.settings import Groups, Settings
@@ -90,7 +90,8 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
     the last second.
 
     Returns:
-        ``ended`` (``reached`` or the reason of a stop), ``sample_count``, ``seconds``,
+        ``ended`` (``reached`` or the reason of a stop), ``after_stop`` (after a stop, as
+        :func:`limber.robot.attendant.retreat_if_chosen` returns it), ``sample_count``, ``seconds``,
         ``peak_force_n``, ``marker_frames``.
 
     Raises:
@@ -123,8 +124,9 @@ def record(folder: Path, cell_file: Path, name: str, settings: RecordSettings,
         result = _finish(branch, name, settings, ended)
     if ended["ended"] != "reached":
         raise SafetyStop(f"The recording was stopped: {ended['ended']}.",
-                         f"{result['sample_count']} samples are in pulls/{name}.",
-                         "Look at the branch and the robot before anything moves.")
+                         f"{ended['after_stop']['outcome']} {result['sample_count']} samples are "
+                         f"in pulls/{name}.",
+                         "Look at the branch and the robot before anything moves.", result=result)
     return result
 
 
@@ -149,11 +151,12 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 recorders[0].take(rows)
             live.take(rows)
         with live, RobotLink(cell, take) as link:
-            point = _grasp_point(branch, cell, link)
+            sample = link.wait_for_samples()
+            point = _grasp_point(branch, sample[1:4])
             recorder = PullRecorder(stream, point, cell.tool.compliance_m_per_n)
             recorders.append(recorder)
             # Before the tare: what takes long would be drift.
-            trajectory = _pull(branch, cell, point, link.wait_for_samples(), settings, blocked,
+            trajectory = _pull(branch, cell, point, sample, settings, blocked,
                                progress.part(0.02, 0.1))
             progress(0.1, "taring: keep the gripper free")
             live.at("taring")
@@ -174,7 +177,7 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                 _write_markers(tracker, marker_lines, recorder)
                 grip(cell, link, close=False, progress=progress)
             else:
-                retreat_if_chosen(link, options.after_stop)
+                ended["after_stop"] = retreat_if_chosen(cell, link, options.after_stop, progress)
             ended |= {"peak_force_n": recorder.peak_force, "sample_count": recorder.count}
             return ended
     finally:
@@ -196,8 +199,8 @@ def _watched(link: RobotLink, tracker: MarkerStream | None, lines: Stream | None
     while True:
         try:
             return link.wait("reached", "stopped", "paused", seconds=0.05)
-        except WorkError:
-            if link.process.poll() is not None or \
+        except LimberError as error:
+            if not isinstance(error, WorkError) or link.process.poll() is not None or \
                     time.monotonic() - begin > 3 * trajectory.duration + 30:
                 raise
         except BaseException:
@@ -248,12 +251,10 @@ def _pull(branch: Branch, cell: Cell, point: np.ndarray, sample: np.ndarray,
                           pause=settings.pause, start=joints, blocked=blocked)
 
 
-def _grasp_point(branch: Branch, cell: Cell, link: RobotLink) -> np.ndarray:
-    """The branch's axis nearest to the gripper [m], shape [3]."""
-    from limber.robot.kinematics import matrices
+def _grasp_point(branch: Branch, gripper: np.ndarray) -> np.ndarray:
+    """The branch's axis nearest to the gripper's middle [3], branch frame [m], shape [3]."""
     from limber.stages.loading import load_skeleton
 
-    gripper = (matrices(np.array(cell.base.pose)) @ matrices(_tool_pose(cell, link)))[:3, 3]
     skeleton = load_skeleton(branch)
     nearest, distance = skeleton.nodes[0], np.inf
     for child, parent in enumerate(skeleton.parent):
@@ -269,14 +270,6 @@ def _grasp_point(branch: Branch, cell: Cell, link: RobotLink) -> np.ndarray:
                          "It would close on nothing, or the calibration is off.",
                          "Move it onto the branch, or calibrate again.")
     return nearest
-
-
-def _tool_pose(cell: Cell, link: RobotLink) -> np.ndarray:
-    """Where the gripper's middle is by the robot's joints, base frame [m, rad], shape [6]."""
-    from limber.robot.kinematics import forward, matrices, pose_vectors
-
-    flange = forward(cell.arm, np.array(link.facts["joints"]))
-    return pose_vectors(flange @ matrices(np.array(cell.tool.grasp_pose)))
 
 
 def _write_entry(lines: Stream, cell: Cell, point: np.ndarray, tared: dict[str, Any],

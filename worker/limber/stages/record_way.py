@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from limber.errors import InputError
+from limber.errors import InputError, SafetyStop
 from limber.progress import Progress
 from limber.reading import read_columns, read_json_as
 from limber.recordings.recording import POSE_COLUMNS
@@ -13,6 +13,7 @@ from limber.robot.cell import Cell
 from limber.robot.execution import Blocked
 from limber.robot.joint_path import joint_path
 from limber.robot.kinematics import inverted, matrices, pose_vectors
+from limber.robot.start import different_joints, in_degrees
 from limber.robot.trajectory import Trajectory, along, densely
 from limber.store import Branch
 
@@ -138,24 +139,32 @@ def there_and_back(cell: Cell, frames: np.ndarray, *, speed: float, cycles: int,
 
     Raises:
         NoPathError: the arm cannot follow it, or is blocked; says where and why.
+        SafetyStop: it could from another configuration than it stands in.
     """
     out = densely(pose_vectors(inverted(matrices(np.array(cell.base.pose))) @ frames))
     flange = matrices(out) @ inverted(matrices(np.array(cell.tool.grasp_pose)))
     taken = joint_path(cell.arm, flange, start=start, joint_limits=cell.joint_limits,
                        singularity_margin=cell.limits.singularity,
                        joint_margin=cell.limits.joint_margin_rad)
+    if start is not None and (told := different_joints(start, taken.joints[0])):
+        raise SafetyStop(f"The arm cannot go this way as it stands: {'; '.join(told)}.",
+                         "In its own configuration it would come to a limit or a singularity.",
+                         f"Move the joints to {in_degrees(taken.joints[0])} degrees, or choose "
+                         "another way.")
     met = None if blocked is None else blocked(flange, taken.joints)
     if met is not None:
         raise met
     passed = along(out, speed, cell.limits.acceleration_m_s2,
                    turn_speed=0.8 * cell.limits.turn_speed_rad_s)
     # The way back is the way out in time as well, so that speeds fit where it turns.
-    legs = ((passed, out), (passed[-1] - passed[::-1], out[::-1]))
-    times, poses, begin = [], [], 0.0
+    legs = ((passed, out, taken.joints),
+            (passed[-1] - passed[::-1], out[::-1], taken.joints[::-1]))
+    times, poses, joints, begin = [], [], [], 0.0
     for _ in range(cycles):
-        for leg_times, leg in legs:
+        for leg_times, leg, leg_joints in legs:
             times.append(begin + leg_times)
             poses.append(leg)
+            joints.append(leg_joints)
             # The last pose of a leg is the first of the next, after the pause.
             begin += float(leg_times[-1]) + max(pause, 0.02)
-    return Trajectory(np.concatenate(times), np.concatenate(poses))
+    return Trajectory(np.concatenate(times), np.concatenate(poses), joints=np.concatenate(joints))

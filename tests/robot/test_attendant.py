@@ -1,0 +1,84 @@
+"""What follows a stop: what was done and what force is left is told, also where nothing worked."""
+
+import json
+
+import numpy as np
+import pytest
+
+from limber.cli import stage_command
+from limber.errors import SafetyStop, WorkError
+from limber.progress import SILENT
+from limber.robot.attendant import retreat_if_chosen
+from limber.robot.cell import Cell
+
+
+class Link:
+    """A robot that goes back to ``left`` [N], or ends with an event or error."""
+
+    def __init__(self, ends=None, left=0.0, gone=False):
+        self._ends, self._left, self._gone = ends, left, gone
+        self._force = 38.0
+        self.opened = False
+
+    def retreat(self):
+        if isinstance(self._ends, Exception):
+            raise self._ends
+        self._force = self._left
+        return self._ends or {"event": "reached"}
+
+    def wait_for_samples(self, seconds):
+        if self._gone:
+            raise WorkError("The robot's driver sends no samples.")
+        return np.r_[np.zeros(13), self._force, np.zeros(23)]
+
+    def gripper(self, close):
+        if self._gone:
+            raise WorkError("The robot's driver is gone.")
+        self.opened, self._force = not close, 0.5
+
+
+def cell_with(gripper: str) -> Cell:
+    return Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6},
+                tool={"gripper": gripper, "grip_seconds": 0.01})
+
+
+STOPPED = {"event": "stopped", "reason": "the force rises on the way back [N] (41, allowed 38)"}
+
+
+@pytest.mark.parametrize("link, gripper, retreated, opened, told", [
+    (Link(), "digital_output", True, False, "went back the way it came; 0.0 N are"),
+    (Link(STOPPED, 39.0), "digital_output", False, True,
+     "could not go back: the force rises on the way back [N] (41, allowed 38); 39.0 N are on the "
+     "branch. The gripper was opened; 0.5 N"),
+    (Link(SafetyStop("There is no way back.")), "digital_output", False, True, "no way back"),
+    # It went back, and something still pulls.
+    (Link(left=12.0), "digital_output", True, True, "way it came; 12.0 N"),
+    (Link(STOPPED, 39.0), "by_hand", False, False, "is by_hand): free the branch by hand; 39.0 N"),
+    (Link(STOPPED, 39.0), "none", False, False, "free the branch by hand; 39.0 N"),
+    (Link(WorkError("The driver is gone."), gone=True), "digital_output", False, False,
+     "The gripper did not open (The robot's driver is gone): free the branch by hand; the force "
+     "on the branch is not known"),
+])
+def test_the_outcome_of_a_retreat_is_told(link, gripper, retreated, opened, told):
+    found = retreat_if_chosen(cell_with(gripper), link, "retreat", SILENT)
+    assert found["retreated"] == retreated and found["gripper_opened"] == opened == link.opened
+    assert told in found["outcome"]
+
+
+@pytest.mark.parametrize("choice", ["hold", "ask"])
+def test_an_arm_that_holds_tells_its_force(choice):
+    """Nobody is at a terminal here."""
+    found = retreat_if_chosen(cell_with("digital_output"), Link(), choice, SILENT)
+    assert found == {"choice": "hold", "retreated": False, "gripper_opened": False, "force_n": 38.0,
+                     "outcome": "The arm holds where it stopped; 38.0 N are on the branch."}
+
+
+def test_what_a_stopped_command_found_is_in_its_json(capfd):
+    @stage_command("stopped")
+    def stopped(run):
+        raise SafetyStop("It was stopped.", result={"after_stop": {"force_n": 1.5}})
+    with pytest.raises(SystemExit) as stop:
+        stopped.main(["--json"], standalone_mode=False)
+    told = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert stop.value.code == 4 and told["after_stop"] == {"force_n": 1.5}
+    assert told["error"] == "It was stopped."

@@ -1,0 +1,113 @@
+"""A cable to a robot of which one direction can be cut: connections stay, what is sent vanishes.
+
+The relay is a process of its own, ``python -m benchmarks.half_open ADDRESS ROBOT``, since a hold-up
+of its parent would be one of the robot. It takes directions to cut as lines on standard input and
+ends with it.
+"""
+
+import selectors
+import socket
+import subprocess
+import sys
+from typing import Literal
+
+from limber.jobs.ending import end_by_closing
+from limber.robot.real_time import (
+    VIRTUAL_ROBOT_PRIORITY,
+    claim_real_time,
+    spare_what_is_loaded,
+)
+
+Direction = Literal["to the robot", "from the robot"]
+DIRECTIONS: tuple[Direction, ...] = ("to the robot", "from the robot")
+_PORTS = (30004, 30003, 29999)  # of e-Series arms; importing them would load the whole controller
+_CONNECT_SECONDS = 1.0
+
+
+class Cable:
+    """A relay from one loopback address to another; a context manager.
+
+    Args:
+        address: Where clients connect.
+        robot: Where the controller listens.
+    """
+
+    def __init__(self, address: str, robot: str):
+        self.address = address
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "benchmarks.half_open", address, robot], text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._hear()
+
+    def __enter__(self) -> "Cable":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        end_by_closing(self._process)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def cut(self, direction: Direction) -> None:
+        """From now on what is sent in ``direction`` vanishes, also on new connections."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(direction + "\n")
+        self._process.stdin.flush()
+        self._hear()
+
+    def _hear(self) -> None:
+        assert self._process.stdout is not None
+        if self._process.stdout.readline() != "ready\n":
+            raise RuntimeError("the relay has ended")
+
+
+class _Relay:
+    def __init__(self, address: str, robot: str):
+        self._robot = robot
+        self._cut: set[str] = set()
+        self._selector = selectors.DefaultSelector()
+        for port in _PORTS:
+            self._selector.register(socket.create_server((address, port)),
+                                    selectors.EVENT_READ, port)
+        self._selector.register(sys.stdin, selectors.EVENT_READ)
+
+    def run(self) -> None:
+        print("ready", flush=True)
+        while True:
+            for key, _ in self._selector.select():
+                if key.fileobj is sys.stdin:
+                    if not (line := sys.stdin.readline()):
+                        return
+                    self._cut.add(line.strip())
+                    print("ready", flush=True)
+                elif isinstance(key.data, int):
+                    self._accept(key.fileobj, key.data)
+                elif key.fileobj in self._selector.get_map():
+                    self._pass(key.fileobj, *key.data)
+
+    def _accept(self, listener: socket.socket, port: int) -> None:
+        client, _ = listener.accept()
+        robot = socket.create_connection((self._robot, port), _CONNECT_SECONDS)
+        for near, far, direction in ((client, robot, "to the robot"),
+                                     (robot, client, "from the robot")):
+            near.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._selector.register(near, selectors.EVENT_READ, (far, direction))
+
+    def _pass(self, near: socket.socket, far: socket.socket, direction: str) -> None:
+        try:
+            data = near.recv(65536)
+            if data and direction not in self._cut:
+                far.sendall(data)
+        except ConnectionError:
+            # One of the two was closed: that is passed on.
+            data = b""
+        if not data:
+            for end in (near, far):
+                self._selector.unregister(end)
+                end.close()
+
+
+if __name__ == "__main__":
+    claim_real_time(VIRTUAL_ROBOT_PRIORITY)
+    relay = _Relay(*sys.argv[1:])
+    spare_what_is_loaded()
+    relay.run()
