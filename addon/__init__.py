@@ -39,6 +39,7 @@ MODULES = (
     "frame_colours",
     "overlays.cloud",
     "relative_paths",
+    "last_used",
     "command",
 )
 

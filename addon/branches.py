@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -11,6 +12,7 @@ from mathutils import Vector
 from .bridge import skeletons
 
 FOLDER_KEY = "limber_folder"
+"""The branch folder of a branch's collection, of a scan, and of a scene: the last used one."""
 SCAN_KEY = "limber_scan_sha256"
 NAME_KEY = "limber_name"
 INFO_KEY = "limber_info"
@@ -46,9 +48,13 @@ def branches(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
 
 
 def branch_of(thing: bpy.types.Object) -> bpy.types.Collection | None:
-    """Return the collection of the branch that an object belongs to."""
-    return next((collection for collection in thing.users_collection if FOLDER_KEY in collection),
-                None)
+    """Return the collection of the branch that an object, or what carries it, belongs to."""
+    while thing is not None:
+        for collection in bpy.data.collections:
+            if FOLDER_KEY in collection and collection.all_objects.get(thing.name) == thing:
+                return collection
+        thing = thing.parent
+    return None
 
 
 def surface_of(branch: bpy.types.Collection) -> bpy.types.Object | None:
@@ -68,19 +74,101 @@ def _parsed(text: str) -> dict[str, Any]:
 
 
 def find_surface(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the surface of the branch that is meant: the active one, else that opened last."""
-    shown = branches(scene)
-    layer = scene.view_layers[0] if bpy.context.scene != scene else bpy.context.view_layer
-    active = layer.objects.active
-    chosen = branch_of(active) if active is not None else None
-    if chosen in shown and (surface := surface_of(chosen)) is not None:
-        return surface
-    found = (surface_of(branch) for branch in reversed(shown))
-    return next((surface for surface in found if surface is not None), None)
+    """Return the surface of the current branch; None where that branch is not shown."""
+    branch, _ = _current(scene)
+    return None if branch is None else surface_of(branch)
+
+
+def current_folder(scene: bpy.types.Scene) -> Path | None:
+    """Return the folder of the current branch, absolute; None where the scene has none.
+
+    Whatever works on a branch asks here, or :func:`find_surface`, which one. It is that of the
+    active object: a part of a branch, or a scan. Else it is the one last used, which may not be
+    shown yet; else the one opened last.
+    """
+    path = current_path(scene)
+    return Path(bpy.path.abspath(path)) if path else None
+
+
+def current_path(scene: bpy.types.Scene) -> str:
+    """Return :func:`current_folder` as Blender keeps it: relative to a saved .blend, or empty."""
+    return _current(scene)[1]
+
+
+def use_folder(scene: bpy.types.Scene, path: str) -> None:
+    """Make ``path`` the folder of the current branch; none where it is empty.
+
+    The branch of that folder becomes active. Where it is not shown, no other branch stays active.
+    """
+    scene[FOLDER_KEY] = path
+    branch = _shown_from(scene, path)
+    if branch is not None:
+        activate(scene, surface_of(branch))
+    elif not _is_same_folder(current_path(scene), path):
+        activate(scene, None)
+
+
+def activate(scene: bpy.types.Scene, thing: bpy.types.Object | None) -> None:
+    """Make ``thing`` the active object, and the only one selected; in Object Mode."""
+    layer = layer_of(scene)
+    before = layer.objects.active
+    if thing == before:
+        return
+    if before is not None and before.mode != "OBJECT":
+        bpy.ops.object.mode_set(mode="OBJECT")
+    for other in layer.objects:
+        other.select_set(other == thing)
+    # In a collection that is left out of the view layer it cannot be active.
+    layer.objects.active = thing if thing is None or thing.name in layer.objects else None
+
+
+def remember(scene: bpy.types.Scene) -> None:
+    """Keep the folder of the active object: it stays the current one when a lamp is chosen."""
+    path = _path_of_active(scene)
+    if path and scene.get(FOLDER_KEY) != path:
+        scene[FOLDER_KEY] = path
+
+
+def _current(scene: bpy.types.Scene) -> tuple[bpy.types.Collection | None, str]:
+    """Return the collection of the current branch, None where it is not shown, and its folder."""
+    path = _path_of_active(scene) or scene.get(FOLDER_KEY)
+    if path is not None:
+        return _shown_from(scene, path), path
+    # No branch was used here yet: a file that `limber scene` made, or appended branches.
+    branch = next((one for one in reversed(branches(scene)) if surface_of(one) is not None), None)
+    return branch, "" if branch is None else branch[FOLDER_KEY]
+
+
+def _path_of_active(scene: bpy.types.Scene) -> str:
+    """Return the branch folder that the active object stands for, or nothing."""
+    active = layer_of(scene).objects.active
+    if active is None:
+        return ""
+    branch = branch_of(active)
+    if branch is not None and branch in branches(scene) and surface_of(branch) is not None:
+        return branch[FOLDER_KEY]
+    return active.get(FOLDER_KEY, "") if SCAN_KEY in active else ""
+
+
+def _shown_from(scene: bpy.types.Scene, path: str) -> bpy.types.Collection | None:
+    """Return the branch that shows the folder ``path``, with its surface; None without."""
+    return next((branch for branch in reversed(branches(scene)) if surface_of(branch) is not None
+                 and _is_same_folder(branch[FOLDER_KEY], path)), None)
+
+
+def _is_same_folder(one: str, other: str) -> bool:
+    if not one or not other:
+        return one == other
+    return Path(bpy.path.abspath(one)) == Path(bpy.path.abspath(other))
+
+
+def layer_of(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
+    """Return the view layer in use of a scene."""
+    return bpy.context.view_layer if bpy.context.scene == scene else scene.view_layers[0]
 
 
 def in_branch(scene: bpy.types.Scene, place: Vector) -> Vector:
-    """Return a place of the world in the frame of the branch that is meant [m].
+    """Return a place of the world in the frame of the current branch [m].
 
     They differ where branches stand side by side; without a branch they are one.
     """
@@ -89,7 +177,7 @@ def in_branch(scene: bpy.types.Scene, place: Vector) -> Vector:
 
 
 def find_skeleton(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Return the skeleton of the branch last opened in ``scene``, if it has one."""
+    """Return the skeleton of the current branch, if it has one."""
     surface = find_surface(scene)
     return None if surface is None else next(
         (thing for thing in branch_of(surface).objects

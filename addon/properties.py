@@ -47,12 +47,22 @@ def _color_again(settings: bpy.types.PropertyGroup, _context) -> None:
         bpy.ops.limber.color_by(scalar=name, each_frame=settings.each_frame)
 
 
+def _folder_in_sight(settings: bpy.types.PropertyGroup) -> str:
+    return branches.current_path(settings.id_data)
+
+
+def _choose_folder(settings: bpy.types.PropertyGroup, path: str) -> None:
+    branches.use_folder(settings.id_data, path)
+
+
 class LimberSettings(bpy.types.PropertyGroup):
     """Choices of one scene; the settings of each stage stand below its name."""
 
     branch_folder: bpy.props.StringProperty(
         name="Branch folder", subtype="DIR_PATH", options=compat.PATH_OPTIONS,
-        description="NAME.branch: where the worker keeps everything about one branch")
+        get=_folder_in_sight, set=_choose_folder,
+        description="NAME.branch, where the worker keeps everything about one branch: that of the "
+                    "active object, else the one last used")
     live_weight: bpy.props.BoolProperty(
         name="Own weight", default=True,
         description="While the branch is held: it bears its weight, and was scanned so")

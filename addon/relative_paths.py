@@ -24,12 +24,11 @@ def _before_saving(path: str, *_) -> None:
         modifier = thing.modifiers.get(animation.MODIFIER)
         if modifier is not None:
             modifier.filepath = animation.relative_path(modifier.filepath, Path(path).parent)
-    for collection in bpy.data.collections:
-        if FOLDER_KEY in collection:
-            collection[FOLDER_KEY] = _moved(collection[FOLDER_KEY], Path(path).parent)
+    for holder in (*bpy.data.collections, *bpy.data.objects, *bpy.data.scenes):
+        if FOLDER_KEY in holder:
+            holder[FOLDER_KEY] = _moved(holder[FOLDER_KEY], Path(path).parent)
     for scene in bpy.data.scenes:
         settings = scene.limber
-        settings.branch_folder = _moved(settings.branch_folder, Path(path).parent)
         settings.reconstruct.cloud = _moved(settings.reconstruct.cloud, Path(path).parent)
 
 
@@ -52,11 +51,11 @@ def _after_import(context: "bpy.types.BlendImportContext", *_) -> None:
         if thing is None or thing.library is not None or library is None:
             continue
         there = Path(bpy.path.abspath(library.filepath)).parent
-        if isinstance(thing, bpy.types.Collection) and FOLDER_KEY in thing:
+        if isinstance(thing, bpy.types.Collection | bpy.types.Object | bpy.types.Scene) and (
+                FOLDER_KEY in thing):
             thing[FOLDER_KEY] = _moved(thing[FOLDER_KEY], here, there)
-        elif isinstance(thing, bpy.types.Scene):
+        if isinstance(thing, bpy.types.Scene):
             settings = thing.limber
-            settings.branch_folder = _moved(settings.branch_folder, here, there)
             settings.reconstruct.cloud = _moved(settings.reconstruct.cloud, here, there)
 
 

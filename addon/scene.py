@@ -60,6 +60,7 @@ def show_branch(scene: bpy.types.Scene, data: SceneData, scalar: str | None = No
         bpy.ops.object.mode_set(mode="OBJECT")
     before = _remove_shown(scene, data)
     shown = _new_branch(scene, data, scalar)
+    scene[FOLDER_KEY] = shown.collection[FOLDER_KEY]
     _add_paths(shown, data)
     _add_trees(shown, data)
     _add_skeleton(shown, data, before)

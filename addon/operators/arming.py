@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import bpy
 
-from .. import branch_folder, jobs, properties
+from .. import branch_folder, branches, jobs, properties
 from ..stages import stages
 from ..steps import MOVES_ROBOT
-from .run_stage import StageOperator, folder_of, stage_operator
+from .run_stage import StageOperator, stage_operator
 
 _WIDTH = 420
 _WARNING = ("The robot will move. Clear its workspace, and keep a hand",
@@ -94,7 +94,9 @@ class LIMBER_OT_arm(MovesRobot, bpy.types.Operator):
 
 def why_not_armed(context: bpy.types.Context) -> str:
     """Return why the plan may not be followed yet: it was not checked as it is now; or nothing."""
-    stage, folder = stages()["execute"], folder_of(context)
+    stage, folder = stages()["execute"], branches.current_folder(context.scene)
+    if folder is None:
+        return "Open a branch first"
     group = properties.group_of(context.scene, stage)
     outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("status") != "done":

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, scans
-from ..branches import OFFSET_KEY, SCAN_KEY, add_object
+from .. import branch_folder, branches, scans
+from ..branches import FOLDER_KEY, OFFSET_KEY, SCAN_KEY, add_object
 from ..bridge import meshes
 from ..overlays.cloud import COLOUR
 from .viewing import look_at
@@ -87,9 +87,10 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             settings.reconstruct.unit = "mm"
         cloud.scale = [_METRES[settings.reconstruct.unit]] * 3
         settings.reconstruct.cloud = str(path)
-        chosen = settings.branch_folder
-        if not (chosen and branch_folder.is_of(Path(bpy.path.abspath(chosen)), scan.sha256)):
-            settings.branch_folder = str(scan.folder)
+        chosen = branches.current_folder(context.scene)
+        cloud[FOLDER_KEY] = branches.current_path(context.scene) if (
+            chosen is not None and branch_folder.is_of(chosen, scan.sha256)) else str(scan.folder)
+        branches.use_folder(context.scene, cloud[FOLDER_KEY])
         settings.show_scan = True
         look_at(context, cloud)
         unit = settings.reconstruct.unit

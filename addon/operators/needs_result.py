@@ -1,8 +1,10 @@
-"""What an operator of an opened result needs before it can be pressed."""
+"""What an operator of a branch needs before it can run: an opened result, or a branch folder."""
+
+from pathlib import Path
 
 import bpy
 
-from .. import branches
+from .. import branch_folder, branches, jobs
 
 
 def is_open(operator: type, thing: bpy.types.Object | None) -> bool:
@@ -10,6 +12,22 @@ def is_open(operator: type, thing: bpy.types.Object | None) -> bool:
     if thing is None:
         operator.poll_message_set("Open a result first")
     return thing is not None
+
+
+def needed_folder(scene: bpy.types.Scene) -> Path:
+    """Return the folder of the current branch; ValueError where there is none to work in.
+
+    One that a job is about to make will do.
+    """
+    folder = branches.current_folder(scene)
+    if folder is None:
+        raise ValueError("This scene has no branch folder. Choose a branch folder with Open "
+                         "Result in the panel Branch, or enter its path under Folder there.")
+    if not (folder / branch_folder.MANIFEST).is_file() and not jobs.works_in(str(folder)):
+        raise ValueError(f"{folder} holds no file {branch_folder.MANIFEST}. Choose a branch folder "
+                         "under Folder in the panel Branch. If it was moved, Find the Folder "
+                         "Again there looks for it.")
+    return folder
 
 
 class NeedsBranch:

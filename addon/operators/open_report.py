@@ -1,8 +1,8 @@
 """Open the report in the browser."""
 
-from pathlib import Path
-
 import bpy
+
+from .. import branches
 
 
 class LIMBER_OT_open_report(bpy.types.Operator):
@@ -12,11 +12,11 @@ class LIMBER_OT_open_report(bpy.types.Operator):
     bl_label = "Open Report"
 
     def execute(self, context):
-        folder = bpy.path.abspath(context.scene.limber.branch_folder)
-        page = Path(folder, "report.html").resolve()
-        if not folder or not page.is_file():
+        folder = branches.current_folder(context.scene)
+        if folder is None or not (folder / "report.html").is_file():
             self.report({"ERROR"}, "There is no report yet: write it first.")
             return {"CANCELLED"}
+        page = (folder / "report.html").resolve()
         if not bpy.app.background:
             bpy.ops.wm.url_open(url=page.as_uri())
         return {"FINISHED"}

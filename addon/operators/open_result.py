@@ -6,8 +6,9 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, frame_colours, properties, scene, scene_data
+from .. import branch_folder, branches, frame_colours, properties, scene, scene_data
 from ..stages import stages
+from .needs_result import needed_folder
 from .viewing import look_at
 from .worker_operator import WorkerOperator
 
@@ -25,7 +26,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
     _is_asked = False
 
     def invoke(self, context, event):
-        if not (self.directory or context.scene.limber.branch_folder or bpy.app.background):
+        if not (self.directory or branches.current_path(context.scene) or bpy.app.background):
             self._is_asked = True
             context.window_manager.fileselect_add(self)
             return {"RUNNING_MODAL"}
@@ -39,12 +40,13 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
         return super().execute(context)
 
     def arguments(self, context):
-        settings = context.scene.limber
         if self.directory:
-            settings.branch_folder = self.directory
-        folder = Path(bpy.path.abspath(settings.branch_folder)) if settings.branch_folder else None
-        if folder is None or not (folder / "branch.json").is_file():
-            raise ValueError("Choose a branch folder: one that holds a file branch.json.")
+            folder = Path(bpy.path.abspath(self.directory))
+            if not (folder / branch_folder.MANIFEST).is_file():
+                raise ValueError(f"{folder} is not a branch folder: it holds no file "
+                                 f"{branch_folder.MANIFEST}. Choose another folder.")
+        else:
+            folder = needed_folder(context.scene)
         self._temporary = tempfile.TemporaryDirectory(prefix="limber-open-")
         stage = stages()["scene"]
         values = properties.values_of(properties.group_of(context.scene, stage), stage,
@@ -59,6 +61,7 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
                                  f"{json.dumps(result)} {' '.join(self._job.log)}")
             data = scene_data.read_scene_data(self._data_path)
         shown = scene.show_branch(context.scene, data)
+        branches.use_folder(context.scene, shown.collection[branches.FOLDER_KEY])
         if trouble := frame_colours.keep(data):
             self.report({"WARNING"}, trouble)
         if scene.place_scans(context.scene, data):

@@ -6,7 +6,7 @@ from typing import ClassVar
 import bpy
 
 from .. import branch_folder
-from .run_stage import folder_of
+from .needs_result import needed_folder
 from .worker_operator import WorkerOperator
 
 
@@ -23,7 +23,7 @@ class LIMBER_OT_replay_pull(WorkerOperator, bpy.types.Operator):
     _folder: Path | None = None
 
     def arguments(self, context):
-        folder = folder_of(context)
+        folder = needed_folder(context.scene)
         if self.pull not in pulls_of(branch_folder.read_record(folder)):
             raise ValueError(f"The branch has no pull {self.pull!r}: import one first.")
         self._folder = folder

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, jobs, properties
+from .. import branch_folder, branches, properties
 from ..stages import SettingError, Stage, stages
 from ..steps import MOVES_ROBOT, NOT_FROM_HERE, RUN, button_of
+from .needs_result import needed_folder
 from .worker_operator import WorkerOperator
 
 _registered: list[type] = []
@@ -52,22 +53,18 @@ class StageOperator(WorkerOperator):
 
     def arguments(self, context):
         self._take_keywords(context)
-        stage, settings = self.stage, context.scene.limber
+        stage, scene = self.stage, context.scene
         if _makes_branch(stage):
             values = properties.values_of(properties.group_of(context.scene, stage), stage)
             trouble = self._foreign(context)
             if trouble and not self.replace:
                 raise ValueError(f"{trouble} Choose another branch folder, or run it with "
                                  "replace=True.")
-            if not settings.branch_folder:
-                settings.branch_folder = str(branch_folder.folder_for(self._source(context)))
-            values["output"] = bpy.path.abspath(settings.branch_folder)
-            self._folder = folder_of(context)
-            return stage.arguments(values)
-        if branch_folder.read_record(folder_of(context)) is None and (
-                not jobs.works_in(str(folder_of(context)))):
-            raise ValueError("Choose a branch folder: one that holds a file branch.json.")
-        self._folder = folder_of(context)
+            if branches.current_folder(scene) is None:
+                branches.use_folder(scene, str(branch_folder.folder_for(self._source(context))))
+            self._folder = branches.current_folder(scene)
+            return stage.arguments({**values, "output": str(self._folder)})
+        self._folder = needed_folder(scene)
         self._given = properties.arguments_of(context.scene, stage, str(self._folder))
         self._name = getattr(properties.group_of(context.scene, stage), "name", "")
         return self._given
@@ -113,7 +110,7 @@ class StageOperator(WorkerOperator):
             if not self.properties.is_property_set(name):
                 continue
             if name == ("output" if _makes_branch(self.stage) else "branch_folder"):
-                context.scene.limber.branch_folder = getattr(self, name)
+                branches.use_folder(context.scene, getattr(self, name))
                 continue
             setattr(group, name, getattr(self, name))
             if hasattr(group, properties.OPEN + name):
@@ -134,17 +131,10 @@ class StageOperator(WorkerOperator):
         if not _makes_branch(self.stage):
             return ""
         source = self._source(context)
-        if not context.scene.limber.branch_folder:
-            return ""
-        folder = folder_of(context)
-        if branch_folder.belongs(folder, branch_folder.file_sha256(source)):
+        folder = branches.current_folder(context.scene)
+        if folder is None or branch_folder.belongs(folder, branch_folder.file_sha256(source)):
             return ""
         return f"{folder.name} was not made of {source.name}: its results would be overwritten."
-
-
-def folder_of(context) -> Path:
-    """Return the branch folder that the scene names, absolute."""
-    return Path(bpy.path.abspath(context.scene.limber.branch_folder))
 
 
 def _makes_branch(stage: Stage) -> bool:

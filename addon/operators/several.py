@@ -30,13 +30,8 @@ class LIMBER_OT_choose_branch(NeedsBranch, bpy.types.Operator):
         if surface is None:
             self.report({"ERROR"}, f"There is no branch {self.branch!r}.")
             return {"CANCELLED"}
-        if context.mode != "OBJECT":
-            bpy.ops.object.mode_set(mode="OBJECT")
-        for other in context.selected_objects:
-            other.select_set(False)
-        surface.select_set(True)
-        context.view_layer.objects.active = surface
-        context.scene.limber.branch_folder = found[branches.FOLDER_KEY]
+        branches.use_folder(context.scene, found[branches.FOLDER_KEY])
+        branches.activate(context.scene, surface)
         return {"FINISHED"}
 
 
@@ -102,12 +97,8 @@ class LIMBER_OT_relink(NeedsBranch, bpy.types.Operator):
             what = "no branch folder" if record is None else f"the folder of {record.name}"
             self.report({"ERROR"}, f"{folder} is {what}, not that of {branch.name}.")
             return {"CANCELLED"}
-        was = bpy.path.abspath(branch[branches.FOLDER_KEY])
         _set_folder(branch, folder)
-        settings = context.scene.limber
-        if not settings.branch_folder or (
-                Path(bpy.path.abspath(settings.branch_folder)) == Path(was)):
-            settings.branch_folder = str(folder)
+        branches.use_folder(context.scene, branch[branches.FOLDER_KEY])
         trouble = animation.cache_trouble(branches.surface_of(branch))
         if animation.MODIFIER in branches.surface_of(branch).modifiers and trouble:
             self.report({"WARNING"}, trouble)

@@ -2,19 +2,19 @@
 
 import bpy
 
+from .. import branches
+
 
 def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:
     """Make ``thing`` active, and let the 3D views show it whole, in its colours; one undo step.
 
-    Not selected: an outline would lie over the colours of thin twigs. Nothing happens without a
-    window.
+    Not selected: an outline would lie over the colours of thin twigs. Without a window there is
+    no view to set.
     """
+    branches.activate(context.scene, thing)
     if bpy.app.background or context.window is None:
         return
-    for other in context.selected_objects:
-        other.select_set(False)
     thing.select_set(True)
-    context.view_layer.objects.active = thing
     for area in context.window.screen.areas:
         if area.type != "VIEW_3D":
             continue

@@ -1,7 +1,5 @@
 """The part of the pulls' panel that plays recordings over the branch."""
 
-from pathlib import Path
-
 import bpy
 
 from .. import branch_folder, branches
@@ -10,8 +8,8 @@ from ..operators.replay import pulls_of
 
 def draw_pulls(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Draw the recordings of the branch; of that in sight, when it is and what is measured."""
-    folder = bpy.path.abspath(context.scene.limber.branch_folder)
-    names = pulls_of(branch_folder.read_record(Path(folder)) if folder else None)
+    folder = branches.current_folder(context.scene)
+    names = pulls_of(None if folder is None else branch_folder.read_record(folder))
     if not names:
         return
     surface = branches.find_surface(context.scene)

@@ -21,6 +21,8 @@ class LIMBER_PT_result(SidebarPanel, bpy.types.Panel):
         settings = context.scene.limber
         surface = branches.find_surface(context.scene)
         self.layout.prop(settings, "branch_folder", text="Folder")
+        if surface is None and branches.branches(context.scene):
+            self.layout.label(text="Not shown: press Open Result", icon="INFO")
         draw_branches(self.layout, context)
         if surface is not None:
             self.layout.prop(settings.scene, "plan")

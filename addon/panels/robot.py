@@ -4,7 +4,7 @@ from pathlib import Path
 
 import bpy
 
-from .. import jobs, live_force
+from .. import branches, jobs, live_force
 from ..operators.arming import LIMBER_OT_arm, why_not_armed
 from ..operators.worker_operator import redraw_sidebars
 from ..steps import MOVES_ROBOT, button_of
@@ -18,10 +18,9 @@ _seen: dict[str, bool] = {}
 
 def draw_robot(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Draw the live force where a robot moves, else the button that lets it."""
+    is_ours = _moving() is not None
     folder = _folder(context)
     live = live_force.read(folder) if folder is not None else None
-    job = jobs.current()
-    is_ours = job is not None and job.state is jobs.JobState.RUNNING and job.title in _TITLES
     if live is not None:
         _draw_force(layout, live)
     if is_ours:
@@ -52,9 +51,17 @@ def _draw_force(layout: bpy.types.UILayout, live: live_force.LiveForce) -> None:
     column.label(text=f"Peak {live.peak:.2f} N{expected}")
 
 
+def _moving() -> jobs.Job | None:
+    """Return the job in which a robot moves now."""
+    job = jobs.current()
+    return job if job is not None and job.state is jobs.JobState.RUNNING and (
+        job.title in _TITLES) else None
+
+
 def _folder(context: bpy.types.Context) -> Path | None:
-    folder = context.scene.limber.branch_folder
-    return Path(bpy.path.abspath(folder)) if folder else None
+    """Return the folder of the branch that our robot moves, whichever is the current one."""
+    job = _moving()
+    return branches.current_folder(context.scene) if job is None else Path(job.folder)
 
 
 def _look() -> float:

@@ -13,7 +13,7 @@ class LIMBER_PT_start(SidebarPanel, bpy.types.Panel):
 
     @classmethod
     def poll(cls, context):
-        return not context.scene.limber.branch_folder and not any(
+        return not branches.current_path(context.scene) and not any(
             branches.SCAN_KEY in thing for thing in context.scene.objects) and (
             branches.find_surface(context.scene) is None)
 

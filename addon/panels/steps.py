@@ -1,11 +1,10 @@
 """One panel a step of the work, drawn from the stages' schema."""
 
 import textwrap
-from pathlib import Path
 
 import bpy
 
-from .. import branch_folder, jobs, properties
+from .. import branch_folder, branches, jobs, properties
 from ..branch_folder import BranchRecord, StageRecord
 from ..stages import Field, Stage, stages
 from ..steps import (
@@ -84,8 +83,8 @@ class StepPanel(SidebarPanel):
 def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord | None]:
     """Return how far a stage is for the branch of ``scene``, and what its folder has of it."""
     stage = stages()[name]
-    folder = bpy.path.abspath(scene.limber.branch_folder)
-    record = branch_folder.read_record(Path(folder)) if folder else None
+    folder = branches.current_folder(scene)
+    record = None if folder is None else branch_folder.read_record(folder)
     group = properties.group_of(scene, stage)
     values = properties.values_of(group, stage, {"name"})
     entry = record.of(stage, values) if record else None
@@ -94,7 +93,7 @@ def state_of(scene: bpy.types.Scene, name: str) -> tuple[StepState, StageRecord 
         return StepState.RUNNING, entry
     if any(job.title == button_of(name) for job in jobs.waiting()):
         return StepState.WAITING, entry
-    outcome = properties.outcome_of(scene, stage, folder)
+    outcome = properties.outcome_of(scene, stage, str(folder))
     if outcome.get("status") == "failed":
         return StepState.FAILED, entry
     if entry is None:
@@ -139,15 +138,15 @@ def _draw_stage(layout: bpy.types.UILayout, context: bpy.types.Context, view: St
                  icon="PLAY" if is_primary else "NONE")
     if state is not StepState.NOT_RUN:
         layout.label(text=state.words[0].upper() + state.words[1:], icon=state.icon)
-    folder = bpy.path.abspath(context.scene.limber.branch_folder)
-    outcome = properties.outcome_of(context.scene, stage, folder)
+    folder = branches.current_folder(context.scene)
+    outcome = properties.outcome_of(context.scene, stage, str(folder))
     if outcome.get("error"):
         _draw_text(layout, outcome["error"], "ERROR")
     for warning in outcome.get("warnings", []):
         _draw_text(layout, warning, "INFO")
     result = outcome.get("result", {}) if entry is None else entry.result
     if view.stage == "plan":
-        draw_paths(layout, result, branch_folder.read_record(Path(folder)))
+        draw_paths(layout, result, branch_folder.read_record(folder) if folder else None)
     elif view.stage == "estimate":
         draw_moduli(layout, result)
     if is_primary and view.stage in _GRAPHS and result:

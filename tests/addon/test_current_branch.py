@@ -1,0 +1,148 @@
+"""Which branch is meant: panels, steps and sessions all ask once, and get the one in sight."""
+
+import importlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from limber.cli import call
+
+BLEND_FILES = Path(__file__).parents[2] / "blend_files"
+
+
+def part(name):
+    return importlib.import_module(f"limber_addon.{name}")
+
+
+def _targets(folder):
+    path = folder / "targets.json"
+    return [each["name"] for each in json.loads(path.read_text())["targets"]] if (
+        path.is_file()) else []
+
+
+@pytest.fixture()
+def two(bpy, registered, bare_beam):
+    """Two opened branches, the second one last: their folders and their collections."""
+    other = bare_beam.folder.with_name("b.branch")
+    shutil.copytree(bare_beam.folder, other)
+    folders = (bare_beam.folder, other)
+    for folder in folders:
+        assert bpy.ops.limber.open_result(directory=str(folder)) == {"FINISHED"}
+    return folders, part("branches").branches(bpy.context.scene)
+
+
+def _mark(bpy, parent):
+    """Return an empty of the user's that hangs on an object, outside the branch's collection."""
+    empty = bpy.data.objects.new("mark", None)
+    bpy.context.scene.collection.objects.link(empty)
+    empty.parent = parent
+    return empty
+
+
+@pytest.mark.parametrize("chosen", ["surface", "another part", "what hangs on it"])
+def test_a_step_works_on_the_branch_of_the_active_object(bpy, two, chosen):
+    """a opened, then b, then a made active: the target goes into a, and all else says a too."""
+    folders, (first, _) = two
+    scene, branches = bpy.context.scene, part("branches")
+    surface = branches.surface_of(first)
+    active = {"surface": surface, "what hangs on it": _mark(bpy, surface),
+              "another part": next(thing for thing in first.objects if thing != surface)}[chosen]
+    bpy.context.view_layer.objects.active = active
+    assert branches.find_surface(scene) == surface
+    assert Path(scene.limber.branch_folder) == folders[0], "as the panel shows it"
+    assert bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
+    assert [_targets(folder) for folder in folders] == [["flower"], []]
+    assert part("panels.steps").state_of(scene, "target")[0] is part("steps").StepState.DONE
+
+
+def test_the_branch_used_last_stays(bpy, two):
+    """A lamp is chosen after a: still a. The one opened last is the current one before."""
+    folders, (first, second) = two
+    scene, branches = bpy.context.scene, part("branches")
+    assert branches.current_folder(scene) == folders[1]
+    assert bpy.context.view_layer.objects.active == branches.surface_of(second)
+    layer = bpy.context.view_layer
+    layer.objects.active = branches.surface_of(first)
+    branches.surface_of(first).select_set(True)
+    layer.update()
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "SUN"))
+    scene.collection.objects.link(lamp)
+    layer.objects.active = lamp
+    layer.update()
+    assert branches.current_folder(scene) == folders[0]
+    assert branches.find_surface(scene) == branches.surface_of(first)
+
+
+def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
+    """Entered in the panel or given by a script: its branch becomes active; one that is not shown
+    leaves none active."""
+    folders, (first, _) = two
+    scene, branches, layer = bpy.context.scene, part("branches"), bpy.context.view_layer
+    scene.limber.branch_folder = f"{folders[0]}/"
+    assert layer.objects.active == branches.surface_of(first)
+    assert bpy.ops.limber.target(branch_folder=str(folders[1]), name="fruit",
+                                 at=(0.0, 0.0, 0.3)) == {"FINISHED"}
+    assert [_targets(folder) for folder in folders] == [[], ["fruit"]]
+    assert branches.current_folder(scene) == folders[1]
+    third = tmp_path / "third.branch"
+    shutil.copytree(folders[0], third)
+    scene.limber.branch_folder = str(third)
+    assert branches.find_surface(scene) is None and layer.objects.active is None
+    assert bpy.ops.limber.target(name="bud", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
+    assert [_targets(folder) for folder in (*folders, third)] == [[], ["fruit"], ["bud"]]
+
+
+def test_a_refused_folder_leaves_the_current_one(bpy, two, tmp_path):
+    """What cannot be opened is not where the next step writes."""
+    folders, _ = two
+    with pytest.raises(RuntimeError, match=r"branch\.json"):
+        bpy.ops.limber.open_result(directory=str(tmp_path))
+    assert part("branches").current_folder(bpy.context.scene) == folders[1]
+
+
+def test_a_scan_stands_for_its_own_folder(bpy, two, tmp_path):
+    """Imported beside a branch, then chosen again: a branch is made in the scan's folder."""
+    folders, (first, _) = two
+    scene, branches = bpy.context.scene, part("branches")
+    (tmp_path / "twig.xyz").write_text("0 0 0\n0 0 0.1\n0 0 0.2\n")
+    bpy.ops.limber.import_cloud(filepath=str(tmp_path / "twig.xyz"))
+    assert branches.current_folder(scene) == tmp_path / "twig.branch"
+    bpy.context.view_layer.objects.active = branches.surface_of(first)
+    assert branches.current_folder(scene) == folders[0]
+    bpy.context.view_layer.objects.active = scene.objects["twig scan"]
+    assert branches.current_folder(scene) == tmp_path / "twig.branch"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "twig.blend"))
+    assert scene.limber.branch_folder == "//twig.branch"
+
+
+@pytest.mark.parametrize("name", ["bending_branch", "young", "mature", "artificial"])
+def test_a_shipped_scene_has_its_folder(bpy, registered, name):
+    """The one beside it, with nothing chosen: steps work there."""
+    bpy.ops.wm.open_mainfile(filepath=str(BLEND_FILES / f"{name}.blend"))
+    scene = bpy.context.scene
+    assert scene.limber.branch_folder == f"//{name}"
+    assert part("branches").current_folder(scene).resolve() == BLEND_FILES / name
+    assert part("panels.steps").state_of(scene, "estimate")[1] is not None
+
+
+def test_a_scene_of_the_worker_has_its_folder(bpy, registered, bare_beam, capsys):
+    """`limber scene`: relative to the file; moved without its folder, the steps say what to do."""
+    there = bare_beam.folder.parent / "scenes" / "beam.blend"
+    assert call(["scene", str(bare_beam.folder), "-o", str(there)]) == 0, capsys.readouterr()
+    bpy.ops.wm.open_mainfile(filepath=str(there))
+    scene = bpy.context.scene
+    assert scene.limber.branch_folder == f"//../{bare_beam.folder.name}"
+    assert bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
+    assert _targets(bare_beam.folder) == ["flower"]
+    bare_beam.folder.rename(bare_beam.folder.with_name("away.branch"))
+    for step in ("target", "estimate", "report"):
+        with pytest.raises(RuntimeError, match=r"Find the Folder Again"):
+            getattr(bpy.ops.limber, step)()
+
+
+def test_a_scene_without_a_folder_says_so(bpy, registered):
+    """Nothing was opened: the step says that, and how a folder is chosen."""
+    with pytest.raises(RuntimeError, match=r"This scene has no branch folder.*Open Result"):
+        bpy.ops.limber.target(name="flower", at=(0.0, 0.0, 0.3))
