@@ -11,13 +11,14 @@ import sys
 from pathlib import Path
 
 import bpy
+import numpy as np
 from mathutils import Vector
 
 
 def main(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="colour_and_render.py")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("picture", type=Path)
+    parser.add_argument("picture", type=Path, help="a PNG")
     parser.add_argument("--colour", default="young")
     parser.add_argument("--frame", type=int, help="of the motion; the worst of all without it")
     parser.add_argument("--width", type=int, default=800)
@@ -28,7 +29,14 @@ def main(arguments: list[str]) -> None:
     if given.frame is not None:
         scene.frame_set(given.frame)
     bpy.ops.limber.color_by(scalar=given.colour, each_frame=given.frame is not None)
-    # A camera that sees the branch whole, and a sun.
+    # What was opened is active. Nothing else is in the picture: no startup cube, no lamp, nor the
+    # grey rest shape, in which an unbent branch lies.
+    branch = bpy.context.view_layer.objects.active.users_collection[0]
+    for thing in scene.objects:
+        thing.hide_render |= thing.name not in branch.all_objects or (
+            thing.get("limber_shows") == "rest")
+    # A camera that sees the branch whole in a picture of this shape, and a sun.
+    scene.render.resolution_x = scene.render.resolution_y = given.width
     bpy.ops.limber.turntable(frames=2)
     sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
     sun.rotation_euler = Vector((math.radians(50), 0.0, math.radians(-30)))
@@ -38,10 +46,34 @@ def main(arguments: list[str]) -> None:
     scene.cycles.samples, scene.cycles.use_denoising = 16, False
     scene.view_settings.view_transform = "Standard"
     scene.render.film_transparent = True
-    scene.render.resolution_x = scene.render.resolution_y = given.width
-    scene.render.filepath = str(given.picture.resolve())
+    picture = given.picture.resolve()
+    rendered = picture.with_name(f".{picture.stem}.part.png")
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.filepath = str(rendered)
     bpy.ops.render.render(write_still=True)
+    try:
+        check(rendered)
+        rendered.replace(picture)
+    finally:
+        rendered.unlink(missing_ok=True)
+
+
+def check(picture: Path) -> None:
+    """Raise RuntimeError unless the picture has a branch: opaque, with nothing around it."""
+    if not picture.is_file():
+        raise RuntimeError(f"Blender rendered no {picture}.")
+    image = bpy.data.images.load(str(picture))
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    share = (pixels[3::4] > 0.5).mean()
+    if not 0.0 < share < 1.0:
+        raise RuntimeError("The branch is not in the picture." if share == 0.0 else
+                           "Something in the scene fills the picture and covers the branch.")
 
 
 if __name__ == "__main__":
-    main(sys.argv[sys.argv.index("--") + 1:])
+    try:
+        main(sys.argv[sys.argv.index("--") + 1:])
+    except Exception as error:
+        # Blender itself would end with 0, whatever went wrong here.
+        sys.exit(f"{Path(__file__).name}: {error}")

@@ -47,4 +47,8 @@ def numbers(folder: Path) -> list:
 
 
 if __name__ == "__main__":
-    main(sys.argv[sys.argv.index("--") + 1:])
+    try:
+        main(sys.argv[sys.argv.index("--") + 1:])
+    except Exception as error:
+        # Blender itself would end with 0, whatever went wrong here.
+        sys.exit(f"{Path(__file__).name}: {error}")

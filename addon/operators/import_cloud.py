@@ -9,7 +9,7 @@ from .. import branch_folder, branches, scans
 from ..branches import FOLDER_KEY, OFFSET_KEY, SCAN_KEY, add_object
 from ..bridge import meshes
 from ..overlays.cloud import COLOUR
-from .viewing import look_at
+from .viewing import clear_view, look_at
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 _INTERVAL_SECONDS = 0.05
@@ -92,13 +92,15 @@ class LIMBER_OT_import_cloud(bpy.types.Operator):
             chosen is not None and branch_folder.is_of(chosen, scan.sha256)) else str(scan.folder)
         branches.use_folder(context.scene, cloud[FOLDER_KEY])
         settings.show_scan = True
+        hidden = clear_view(context.scene)
         look_at(context, cloud)
         unit = settings.reconstruct.unit
         size = f"{scan.extent:.4g} {unit} across"
         if guessed:
             self.report({"WARNING"}, f"{size}: taken for millimetres. Set Unit, and import again, "
                                      "if it is not.")
-        self.report({"INFO"}, f"{len(scan.points)} points, {size}")
+        told = [f"{len(scan.points)} points, {size}", *([hidden] if hidden else [])]
+        self.report({"INFO"}, "; ".join(told))
         return {"FINISHED"}
 
 

@@ -9,7 +9,7 @@ import bpy
 from .. import branch_folder, branches, frame_colours, properties, scene, scene_data
 from ..stages import stages
 from .needs_result import needed_folder
-from .viewing import look_at
+from .viewing import clear_view, look_at
 from .worker_operator import WorkerOperator
 
 
@@ -73,8 +73,10 @@ class LIMBER_OT_open_result(WorkerOperator, bpy.types.Operator):
             # The plan in sight is the one that a robot would follow.
             context.scene.limber.execute.name = data.info["plan"]
         self._take_over_settings(context, data.folder)
+        hidden = clear_view(context.scene)
         look_at(context, shown.surface)
-        self.report({"INFO"}, f"{data.info['name']}: {'; '.join(data.info['notes'])}")
+        told = [*data.info["notes"], *([hidden] if hidden else [])]
+        self.report({"INFO"}, f"{data.info['name']}: {'; '.join(told)}")
 
     def _take_over_settings(self, context, folder: Path) -> None:
         """Set the panels to what the branch was made with: running again then changes nothing."""

@@ -2,7 +2,16 @@
 
 import bpy
 
-from .. import branches
+from .. import branches, startup_cube
+
+
+def clear_view(scene: bpy.types.Scene) -> str:
+    """Hide Blender's startup cube, which encloses a branch; returns what the user reads of it."""
+    cube = startup_cube.find(scene)
+    if cube is None:
+        return ""
+    startup_cube.hide(scene, cube)
+    return f"Blender's startup cube ({cube.name}) is hidden, Undo brings it back"
 
 
 def look_at(context: bpy.types.Context, thing: bpy.types.Object) -> None:

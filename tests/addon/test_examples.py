@@ -42,12 +42,38 @@ def test_colour_and_render(bpy, run, beam, tmp_path):
     """The bent beam in the colours of its energy: transparent around it, and not of one colour."""
     from PIL import Image
 
+    # Blender has just started: its cube is there, 2 m wide about the branch.
+    bpy.ops.wm.read_factory_settings()
     run("colour_and_render", beam.folder, tmp_path / "beam.png", "--colour", "strain_energy",
         "--frame", 6, "--width", 256)
     pixels = np.asarray(Image.open(tmp_path / "beam.png"))
     branch = pixels[pixels[..., 3] > 200]
     assert 100 < len(branch) < 0.5 * pixels[..., 3].size
     assert np.ptp(branch[:, 0].astype(int)) > 60, "bent: much energy at its foot, none at its tip"
+
+
+@pytest.mark.parametrize("name", ["colour_and_render", "scan_to_branch", "compare_branches"])
+def test_an_example_that_fails_says_so(bpy, run, name, tmp_path):
+    """Blender would end with 0: the script ends with another code, and leaves no result."""
+    out = tmp_path / "out.png"
+    arguments = [tmp_path / "nowhere", *(["-o"] if name == "compare_branches" else []), out]
+    with pytest.raises(SystemExit, match="nowhere") as ended:
+        run(name, *arguments)
+    assert ended.value.code not in (0, None) and not out.exists()
+
+
+@pytest.mark.parametrize("shown", ["a wall", "nothing"])
+def test_a_picture_without_a_branch_is_refused(bpy, tmp_path, shown):
+    """Filled by something else, or empty: no picture for a success."""
+    script = runpy.run_path(str(ADDON / "examples" / "colour_and_render.py"))
+    image = bpy.data.images.new("shown", 8, 8, alpha=True)
+    image.pixels = [0.5, 0.5, 0.5, float(shown == "a wall")] * 64
+    image.filepath_raw, image.file_format = str(tmp_path / "a.png"), "PNG"
+    image.save()
+    with pytest.raises(RuntimeError, match="covers" if shown == "a wall" else "not in the"):
+        script["check"](tmp_path / "a.png")
+    with pytest.raises(RuntimeError, match="rendered no"):
+        script["check"](tmp_path / "b.png")
 
 
 def test_compare_branches(bpy, run, beam, tmp_path):

@@ -179,6 +179,42 @@ def test_interface(run, blender, environment, beam, tmp_path):
         assert _colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
 
 
+def test_the_first_view(run, blender, environment, tmp_path):
+    """Beside Blender's startup cube: example and scan are in sight, whole; undo shows the cube."""
+    require_screen()
+    generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
+        tmp_path / "scan.ply")
+    seen = driven("drive_factory_start.py", blender, environment, tmp_path)
+    assert seen["at_start"] == ["Camera", "Cube", "Light"], "a Blender that has just started"
+    for name in ("bending_branch", "scan scan"):
+        found = seen[name]
+        assert found["inside"] == 1.0 and found["height"] > 0.4, "framed"
+        assert not found["cube"] and not found["cube_in_picture"]
+    assert seen["undone"] == [True, False, False]
+    assert _coloured_count(tmp_path / "branch.png") > 1000
+
+
+def test_a_picture_by_an_example(run, beam, tmp_path):
+    """At factory start, beside the cube: the branch is in the picture; a failure has a code."""
+    example = FOLDER.parents[1] / "addon" / "examples" / "colour_and_render.py"
+    picture = tmp_path / "beam.png"
+    done = run("-b", "--python", example, "--", beam.folder, picture, "--colour", "strain_energy",
+               "--width", "300")
+    assert done.returncode == 0, done.stderr
+    assert _coloured_count(picture, None) > 300
+    done = run("-b", "--python", example, "--", tmp_path / "nowhere", tmp_path / "none.png")
+    assert done.returncode == 1 and "nowhere" in done.stderr
+    assert not (tmp_path / "none.png").exists()
+
+
+def _coloured_count(path: Path, part: tuple[int, ...] | None = (200, 200, 800, 690)) -> int:
+    """Return how many pixels are in a strong colour: of the 3D view, left of the sidebar."""
+    from PIL import Image
+
+    pixels = np.asarray(Image.open(path).convert("RGB").crop(part)).astype(int)
+    return int((np.ptp(pixels, axis=2) > 90).sum())
+
+
 def test_grab(run, blender, environment, beam, tmp_path):
     """By mouse events: pressed and dragged the beam follows; kept, left, undone; Esc restores.
 

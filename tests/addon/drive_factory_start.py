@@ -1,0 +1,71 @@
+"""Opens the example and a scan beside Blender's startup cube; test_real_blender.py starts it.
+
+FOLDER has scan.ply. Blender has just started: cube, camera and light are there.
+"""
+
+import sys
+from pathlib import Path
+
+import bpy
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+
+sys.path.insert(0, str(Path(__file__).parent))
+from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, view, waited
+
+
+def begin():
+    view()[1].spaces.active.show_region_ui = True
+    seen["at_start"] = sorted(thing.name for thing in bpy.context.scene.objects)
+    return True
+
+
+def start(operator, **keywords):
+    def step():
+        with override():
+            getattr(bpy.ops.limber, operator)("INVOKE_DEFAULT", **keywords)
+        return True
+    step.__name__ = operator
+    return step
+
+
+def look(name):
+    """Return the step that writes down where an object is in the view, and what of the cube."""
+    def step():
+        thing = bpy.data.objects.get(name)
+        if thing is None or sys.modules[f"{KEY}.jobs"].is_running() or not waited(2.0):
+            return False
+        _, area, region = view()
+        places = [location_3d_to_region_2d(region, area.spaces.active.region_3d,
+                                           thing.matrix_world @ vertex.co)
+                  for vertex in thing.data.vertices]
+        seen[name] = {
+            "inside": sum(at is not None and 0 <= at[0] < region.width
+                          and 0 <= at[1] < region.height for at in places) / len(places),
+            "height": max(at[1] for at in places if at is not None) / region.height
+                      - min(at[1] for at in places if at is not None) / region.height,
+            "cube": bpy.data.objects["Cube"].visible_get(),
+            "cube_in_picture": not bpy.data.objects["Cube"].hide_render}
+        return True
+    step.__name__ = f"look at {name}"
+    return step
+
+
+def undo():
+    with override():
+        bpy.ops.ed.undo()
+    return True
+
+
+def is_undone():
+    if not waited(0.5):
+        return False
+    cube = bpy.data.objects["Cube"]
+    seen["undone"] = [cube.visible_get(), cube.hide_render, "bending_branch" in bpy.data.objects]
+    return True
+
+
+drive([begin, is_tab_open, picture("start"),
+       start("open_example", directory=str(FOLDER / "copy")), look("bending_branch"),
+       picture("branch"), undo, is_undone,
+       start("import_cloud", filepath=str(FOLDER / "scan.ply")), look("scan scan"),
+       picture("scan")], longest=60)
