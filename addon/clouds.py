@@ -1,6 +1,7 @@
 """Reads the points of a scan, to show them; the worker reads the file itself."""
 
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,12 @@ _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "
 
 _LINES = 20_000
 """Lines of text that are read at a stretch: numpy holds the interpreter meanwhile."""
+# The worker's, of limber.geometry.cloud.text: the add-on reads files also where it has no worker.
+_AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("pos_x", "pos_y", "pos_z"),
+         ("easting", "northing", "height"), ("easting", "northing", "elevation"),
+         ("easting", "northing", "altitude"), ("easting", "northing", "z"))
+_UNIT = re.compile(r"[\s_]*[\[(](m|cm|mm|in)[\])]$|_(m|cm|mm)$")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
 
 def read_points(path: Path) -> np.ndarray:
@@ -48,13 +55,54 @@ def read_colours(path: Path) -> np.ndarray | None:
 
 
 def _read_text(path: Path) -> np.ndarray:
-    with open(path, encoding="utf-8", errors="replace") as stream:
-        first = stream.readline()
+    with open(path, encoding="utf-8-sig", errors="replace") as stream:
+        lines = (line.replace('"', "") for line in stream if line.strip() and not _is_comment(line))
+        first, second = next(lines, ""), next(lines, "")
         if not first:
             raise ValueError("it is empty")
-        delimiter = next((mark for mark in ",;" if mark in first), None)
-        lines = itertools.chain([first], stream) if _is_numbers(first, delimiter) else stream
-        return _rows(lines, delimiter=delimiter, usecols=(0, 1, 2))
+        delimiter = _delimiter(second or first)
+        columns, is_header = _columns(first, delimiter)
+        # Some programs write the number of points first.
+        is_count = bool(second) and first.strip().isdigit()
+        rows = itertools.chain([] if is_header or is_count else [first],
+                               [second] if second else [], lines)
+        if delimiter != ",":
+            rows = (line.replace(",", ".") for line in rows)
+        return _rows(rows, delimiter=delimiter, usecols=columns)
+
+
+def _columns(first: str, delimiter: str | None) -> tuple[tuple[int, ...], bool]:
+    """Return which columns are x, y and z, and whether the first line is a header, as the worker
+    takes them; ValueError where a header names other columns."""
+    mark = delimiter if delimiter is None or delimiter in first else _delimiter(first)
+    names = [_UNIT.sub("", name.lower().lstrip("/").strip()) for name in _parts(first, mark)]
+    if not any(name[:1].isalpha() and name not in ("nan", "inf") for name in names):
+        return (0, 1, 2), False
+    for axes in _AXES:
+        if set(axes) <= set(names):
+            return tuple(names.index(axis) for axis in axes), True
+    raise ValueError(f"its columns are {', '.join(names)[:200]}: x, y and z are missing")
+
+
+def _is_comment(line: str) -> bool:
+    start = line.lstrip()
+    return start.startswith("#") or (start.startswith("//") and not start[2:3].isalpha())
+
+
+def _delimiter(line: str) -> str | None:
+    for mark in ";\t":
+        if mark in line:
+            return mark
+    blanks = line.split()
+    if len(blanks) > 2 and all(_DECIMAL_COMMA.fullmatch(part) for part in blanks):
+        return None
+    return "," if "," in line else None
+
+
+def _parts(line: str, delimiter: str | None) -> list[str]:
+    parts = [part.strip() for part in line.split(delimiter)]
+    # Some programs end each line with a delimiter.
+    return parts[:-1] if len(parts) > 3 and not parts[-1] else parts
 
 
 def _rows(lines, **how) -> np.ndarray:
@@ -65,13 +113,6 @@ def _rows(lines, **how) -> np.ndarray:
         if any(line.strip() for line in part):
             parts.append(np.loadtxt(part, ndmin=2, **how))
     return np.vstack(parts) if parts else np.empty((0, 3))
-
-
-def _is_numbers(line: str, delimiter: str | None) -> bool:
-    try:
-        return [float(part) for part in line.split(delimiter)[:3]] != []
-    except ValueError:
-        return False
 
 
 def _read_ply(path: Path) -> np.ndarray:

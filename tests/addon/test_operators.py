@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from limber.files import file_digest
+from limber.geometry.cloud.files import read_cloud
 from limber.store import Branch
 
 POINTS = np.random.default_rng(7).random((40, 3)) * 300
@@ -52,6 +53,36 @@ def test_import_cloud(bpy, registered, tmp_path, name, write):
     np.testing.assert_allclose(meshes.positions(cloud.data), POINTS, rtol=1e-5)
     assert list(cloud.scale) == pytest.approx([0.001] * 3)
     assert settings.branch_folder == str(tmp_path / f"{name[0]}.branch")
+
+
+@pytest.mark.parametrize("text", [
+    "id,x,y,z\n0,0.1,0.2,0.3\n7000,0.4,0.5,0.6\n",
+    "z,x,y,r,g,b\n0.3,0.1,0.2,110,118,156\n0.6,0.4,0.5,60,107,92\n",
+    '"","x","y","z"\n"1",0.1,0.2,0.3\n"2",0.4,0.5,0.6\n',
+    "\ufeffX [m];Y [m];Z [m];Note\n0,1;0,2;0,3;7\n0,4;0,5;0,6;8\n",
+    "//Height Easting Northing\n0.3 0.1 0.2\n0.6 0.4 0.5\n",
+    "# id x y z\n0.1 0.2 0.3 9\n0.4 0.5 0.6 9\n",
+    "2\n0.1\t0.2\t0.3\n0.4\t0.5\t0.6\n",
+    "0,1 0,2 0,3\n0,4 0,5 0,6\n",
+    "0.1,0.2,0.3,\n0.4,0.5,0.6,\n"])
+def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, text):
+    """Coordinates by the header's names, in whatever order; no other column, no unit guessed."""
+    path = tmp_path / "scan.csv"
+    path.write_text(text, encoding="utf-8")
+    points = importlib.import_module("limber_addon.clouds").read_points(path)
+    np.testing.assert_allclose(points, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    np.testing.assert_allclose(points, read_cloud(path).points)
+    bpy.ops.limber.import_cloud(filepath=str(path))
+    assert bpy.context.scene.limber.reconstruct.unit == "m"
+
+
+def test_a_header_without_coordinates_is_refused(bpy, registered, tmp_path):
+    """No other column is taken for one."""
+    path = tmp_path / "scan.csv"
+    path.write_text("id,row,column\n0,1,2\n1,2,3\n")
+    with pytest.raises(RuntimeError, match=r"its columns are id, row, column: x, y and z"):
+        bpy.ops.limber.import_cloud(filepath=str(path))
+    assert not bpy.data.objects
 
 
 @pytest.mark.parametrize("content", [
