@@ -1,5 +1,6 @@
 """From a file's points to a cloud that can be worked on: unit, origin, crop, outliers, thinning."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ _LARGEST_EXTENT = 40.0  # [m]: taller than that is no plant that anybody scans a
 _SMALLEST_EXTENT = 0.02
 _SHEET_LEAST = 0.08  # share of points that makes a wall or the ground
 _SHEETS_MOST = 6  # a box has no more
+_AT_ONCE = 200_000  # points whose neighbours are held in memory together
 _COARSEST_STEP = 5e-3  # of the cloud's size: as thick as its twigs
 
 
@@ -68,14 +70,14 @@ def prepare(cloud: Cloud, scale: float, settings: PreparationSettings | None = N
         raise InputError(f"All {len(points)} points are at one place.",
                          "A branch has an extent.", "Check the export's columns and digits.")
     _enough_digits(cloud.points)
-    spread = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[1]
-    if spread[1] < 1e-6 * spread[0]:
+    _, middle, longest = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
+    if middle < 1e-6 * longest:
         raise InputError(f"All {len(points)} points lie on one straight line.",
                          "A branch has a thickness.", "Check the export's columns and digits.")
     cloud = cloud.with_points(points)
-    _, first = np.unique(points, axis=0, return_index=True)
-    counts["duplicates"] = len(cloud) - len(first)
-    cloud = cloud.subset(np.sort(first))
+    single = _first_of_each(points)
+    counts["duplicates"] = int((~single).sum())
+    cloud = cloud.subset(single)
     keep = _without_outliers(cloud.points, settings)
     counts["outliers"] = int((~keep).sum())
     cloud = cloud.subset(keep)
@@ -193,22 +195,51 @@ def _enough(cloud: Cloud, what: str) -> None:
                          "Scan more densely, or crop less.")
 
 
+def _first_of_each(points: np.ndarray) -> np.ndarray:
+    """Mask of the points that are not where one before them is already."""
+    order = np.lexsort(points.T)
+    again = np.ones(len(points), bool)
+    again[0] = False
+    for column in points.T:
+        again[1:] &= column[order[1:]] == column[order[:-1]]
+    single = np.empty(len(points), bool)
+    single[order] = ~again
+    return single
+
+
 def _without_outliers(points: np.ndarray, settings: PreparationSettings) -> np.ndarray:
     """Mask of the points that stay; what is usual is taken nearby, since scans are uneven."""
     keep = np.ones(len(points), bool)
     if settings.outlier_ratio > 0:
         count = min(settings.outlier_neighbours + 1, len(points))
-        distance, near = cKDTree(points).query(points, k=count)
-        own = distance[:, 1:].mean(axis=1)
+        own, near = _neighbourhoods(points, count)
         # The median over the neighbours is itself wide for a lone point among lone points, so
         # the whole cloud's counts too.
-        usual = np.maximum(np.median(own[near], axis=1), np.median(own))
-        keep &= own <= settings.outlier_ratio * np.minimum(usual, 3 * np.median(own))
+        overall = np.median(own)
+        for part in _parts(len(points)):
+            usual = np.maximum(np.median(own[near[part]], axis=1), overall)
+            keep[part] = own[part] <= settings.outlier_ratio * np.minimum(usual, 3 * overall)
     if settings.outlier_radius > 0:
         number = cKDTree(points).query_ball_point(
             points, settings.outlier_radius, return_length=True)
         keep &= number > settings.outlier_neighbours
     return keep
+
+
+def _neighbourhoods(points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean distance [m] of each point's ``count`` - 1 nearest, shape [n], and all of these with
+    the point itself, shape [n, count]."""
+    tree = cKDTree(points)
+    own, near = np.empty(len(points)), np.empty((len(points), count), np.int32)
+    for part in _parts(len(points)):
+        distance, near[part] = tree.query(points[part], k=count)
+        own[part] = distance[:, 1:].mean(axis=1)
+    return own, near
+
+
+def _parts(count: int) -> Iterator[slice]:
+    """Slices of so many points as are worked on at once."""
+    return (slice(begin, begin + _AT_ONCE) for begin in range(0, count, _AT_ONCE))
 
 
 def _rounding(points: np.ndarray) -> float:

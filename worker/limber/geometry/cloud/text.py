@@ -2,7 +2,6 @@
 """
 
 import codecs
-import io
 import re
 from pathlib import Path
 
@@ -110,10 +109,11 @@ def _header(path: Path, lines: list[str], separator: str | None) -> tuple[list[s
 def _numbers(path: Path, lines: list[str], separator: str | None, text: str) -> np.ndarray:
     commas = separator != ","
     try:
-        clean = [line.replace(",", ".") for line in lines] if commas else lines
+        # One line at a time: copies of all would take several times the file's size.
+        clean = (line.replace(",", ".") for line in lines) if commas else iter(lines)
         if separator is not None and lines[0].rstrip().endswith(separator):
-            clean = [line.rstrip().removesuffix(separator) for line in clean]
-        return np.loadtxt(io.StringIO("\n".join(clean)), delimiter=separator, ndmin=2)
+            clean = (line.rstrip().removesuffix(separator) for line in clean)
+        return np.loadtxt(clean, delimiter=separator, ndmin=2)
     except ValueError:
         pass
     width = len(_parts(lines[0], separator))
