@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.subjects.meshes import box_mesh
-from tests.subjects.paper_branches import Bench, PaperBranch, exact_pull
 
+from benchmarks.paper_branches import Bench, PaperBranch, exact_pull
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.recordings.recording import (
     GraspEntry,

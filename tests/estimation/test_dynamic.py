@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import Bench
 
+from benchmarks.paper_branches import Bench
 from limber.estimation.doubt.identifiability import identifiability, require_scale
 from limber.estimation.forward.dynamic import DynamicForward
 from limber.estimation.objective import Objective

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import measured
 
+from benchmarks.paper_branches import measured
 from limber.errors import Cancelled, InputError
 from limber.estimation.doubt.identifiability import identifiability, link_unresolved, require_scale
 from limber.estimation.doubt.uncertainty import uncertainty

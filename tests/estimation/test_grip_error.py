@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import FRACTIONS
 
+from benchmarks.paper_branches import FRACTIONS
 from limber.estimation.doubt.grip_error import grip_error
 from limber.estimation.objective import Objective
 from limber.estimation.parameters import Values

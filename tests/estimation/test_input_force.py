@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import measured
 
+from benchmarks.paper_branches import measured
 from limber.errors import InputError
 from limber.estimation.forward.dynamic import DynamicForward
 from limber.estimation.forward.force_motion import motion_response

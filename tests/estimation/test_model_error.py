@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import Bench
 
+from benchmarks.paper_branches import Bench
 from benchmarks.silicone_beam import (
     DENSITY,
     LOAD_POINT_M,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.subjects.paper_branches import measured
 
+from benchmarks.paper_branches import measured
 from limber.errors import WorkError
 from limber.estimation.doubt.causes import ADVICE, largest, variance_parts
 from limber.estimation.doubt.path_error import led_by_path, path_error

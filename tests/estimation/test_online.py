@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import Bench, measured
 
+from benchmarks.paper_branches import Bench, measured
 from limber.estimation.online.exact import FullBranch, Here
 from limber.estimation.online.filter import FRAME_ITERATIONS, OnlineEstimator, OnlineFrame
 from limber.estimation.settings import EstimateSettings

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
-from tests.subjects.paper_branches import measured
 
+from benchmarks.paper_branches import measured
 from limber.estimation.doubt.profile import bend_of, limit_of, profiled
 from limber.estimation.doubt.uncertainty import Uncertainty
 from limber.estimation.objective import Evaluation

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import Bench, measured
 
+from benchmarks.paper_branches import Bench, measured
 from limber.errors import InputError
 from limber.estimation import reduced_fit
 from limber.estimation.fit import fit_pulls

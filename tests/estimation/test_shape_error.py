@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import FRACTIONS, measured
 
+from benchmarks.paper_branches import FRACTIONS, measured
 from limber.estimation.doubt import shape_error as module
 from limber.estimation.doubt.shape_error import hung_error, shape_error
 from limber.estimation.field_form import open_field

@@ -1,8 +1,8 @@
 """How close estimates of the truth bench can come."""
 
 import numpy as np
-from tests.subjects.paper_branches import measured
 
+from benchmarks.paper_branches import measured
 from benchmarks.truth import _efficient
 from benchmarks.truth_branch import drawn_truth, exact_pull
 from benchmarks.truth_trials import FIRST_PULL, FIRST_TURN, SETTINGS, bounds, fitting_subject

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.subjects.paper_branches import Bench
 
+from benchmarks.paper_branches import Bench
 from limber.errors import InputError
 from limber.estimation.doubt.identifiability import identifiability
 from limber.estimation.forward.dynamic import DynamicForward

@@ -9,7 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tests.subjects.paper_branches import (
+
+from benchmarks import silicone_beam
+from benchmarks.estimation_force import force_rows
+from benchmarks.estimation_noise import noise_rows
+from benchmarks.estimation_scans import scan_rows
+from benchmarks.paper_branches import (
     BRANCHES,
     FRACTIONS,
     Bench,
@@ -17,11 +22,6 @@ from tests.subjects.paper_branches import (
     exact_pull,
     measured,
 )
-
-from benchmarks import silicone_beam
-from benchmarks.estimation_force import force_rows
-from benchmarks.estimation_noise import noise_rows
-from benchmarks.estimation_scans import scan_rows
 from benchmarks.table import Row
 from limber.estimation.fit import Estimate
 from limber.estimation.online.exact import Beside

@@ -7,8 +7,8 @@ once: the outer modulus is known to within a factor, and the interval has to say
 from dataclasses import replace
 
 import numpy as np
-from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
 
+from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
 from benchmarks.table import Row
 from limber.estimation.settings import EstimateSettings
 from limber.jobs import run_tasks

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tests.subjects import paper_branches
-from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
 
+from benchmarks import paper_branches
 from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
 from benchmarks.table import Row
 from limber.estimation.settings import EstimateSettings
 from limber.jobs import Pool

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from tests.subjects.paper_branches import BRANCHES, FRACTIONS, PaperBranch
 
+from benchmarks.paper_branches import BRANCHES, FRACTIONS, PaperBranch
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import GRASP_FRACTION
 from limber.geometry.skeleton.control_points import control_points

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation
-from tests.subjects.paper_branches import PaperBranch
 
+from benchmarks.paper_branches import PaperBranch
 from limber.estimation.gripper_path import MotionWanted, moved
 from limber.estimation.next_pull import PullChoice
 from limber.geometry.skeleton.control_points import control_points

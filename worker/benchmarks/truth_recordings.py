@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tests.subjects.paper_branches import PaperBranch
 
+from benchmarks.paper_branches import PaperBranch
 from benchmarks.table import Row
 from limber.cli import call
 from limber.geometry.tets.marks import mark

@@ -6,11 +6,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from tests.subjects.paper_branches import BRANCHES, Bench, exact_pull, measured
 
 from benchmarks.estimation import SETTINGS, followed
 from benchmarks.mechanics import DENSITY, short_beam
 from benchmarks.mechanics_reduced import CHANGED, LENGTH, GraspBench, bench_branch
+from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
 from benchmarks.table import Row
 from limber.mechanics import (
     BranchModel,
