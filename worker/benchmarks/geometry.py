@@ -6,14 +6,18 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.geometry_crowns import CROWNS, against_graph, crown_rows, explained
+from benchmarks import scan_scores
+from benchmarks.geometry_crowns import CROWN_ROWS, against_graph, crown_rows, explained
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.scan_scores import Dense, score
-from benchmarks.table import Row
+from benchmarks.table import Asked, Part, Row, Setting
 from limber.geometry.cloud.files import read_points
 from limber.geometry.generated import GeneratedBranch, generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
@@ -25,7 +29,7 @@ from limber.geometry.surface.forks import smooth_forks
 from limber.geometry.surface.surface import Surface
 from limber.geometry.surface.tubes import branch_surface
 from limber.geometry.tets.tetrahedra import mesh_branch
-from limber.progress import Progress
+from limber.plain import plain
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 SCANS = (("coffeetree_branch/branch.xyz", ["--unit", "m"]),
@@ -36,14 +40,42 @@ SCANS = (("coffeetree_branch/branch.xyz", ["--unit", "m"]),
          ("tomato_maize/maize_03-13.ply", ["--unit", "mm", "--unexplained", "1"]))
 
 
-def rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
-    """Measure; pictures and raw numbers go to ``out``."""
-    table = _generated(4 if quick else 20, progress.part(0.0, 0.4), out)
-    table += crown_rows(1 if quick else len(CROWNS), progress.part(0.4, 0.45))
-    table += _contraction(quick, progress.part(0.45, 0.55))
-    table += _speed(quick, progress.part(0.55, 0.75))
-    table += _scans(quick, progress.part(0.75, 1.0), out)
-    return table
+VIEWS = ("round", "one-sided")
+_RADIUS_LIMITS = {"round": 0.08, "one-sided": 0.12}
+_GENERATED = {(view, what): Asked(f"generated, {view}: {measure}", asked.format(
+    100 * _RADIUS_LIMITS[view])) for view in VIEWS for what, measure, asked in (
+        ("centre", "centreline error", "25 % of radius or 0.7 mm"),
+        ("radius", "radius error, median over nodes", "{:.0f} %"),
+        ("forks", "forks found / false", "95 % / under 5 %"))}
+_WATERTIGHT = Asked("generated: surface watertight, no self-intersection", "all")
+_VOLUME = Asked("generated: mesh volume against the true branch", "within 5 %")
+_PAPER_RADII = Asked("the paper's k-nearest median radii, against ours (for comparison)", "-")
+_CONTRACTION_SECONDS = {14_667: (2.5, 10.3), 58_219: (12.0, 56.5)}
+"""Asked [s] and what pc-skeletor took [s], by number of points."""
+_SPEED_SECONDS = {15_000: (4.0, ""), 100_000: (20.0, ""), 1_000_000: (60.0, ", under 3 GB")}
+"""Asked [s], and of memory, by number of points."""
+_SURFACES = Asked("real scans: surface watertight, no self-intersection", "all")
+_EXPLAINED = Asked("real scans: points no farther outside a branch than twice their spacing",
+                   "report")
+_WHOLE = Asked("whole `reconstruct` of coffeetree_branch", "30 s")
+_QSM = {"length": Asked("aRchi_tree_1: total length, ours / TreeQSM", "report"),
+        "radius": Asked("aRchi_tree_1: radius over 5 mm, ours against TreeQSM", "report"),
+        "order": Asked("aRchi_tree_1: length by order [m]", "report")}
+
+
+def _contraction_asked(count: int) -> Asked:
+    limit, theirs = _CONTRACTION_SECONDS[count]
+    return Asked(f"{count} points unthinned, contraction alone",
+                 f"{limit} s, no larger error (pc-skeletor {theirs} s)")
+
+
+def _speed_asked(count: int) -> Asked:
+    limit, memory = _SPEED_SECONDS[count]
+    return Asked(f"{count:,} points to skeleton, default settings", f"{limit:.0f} s{memory}")
+
+
+def _authors_asked(stem: str) -> Asked:
+    return Asked(f"{stem}: axes against the authors'", "report")
 
 
 def generated(seed: int, **changes: object) -> GeneratedBranch:
@@ -55,88 +87,89 @@ def generated(seed: int, **changes: object) -> GeneratedBranch:
     return generate_branch(seed, **(spec | changes))
 
 
-def _generated(count: int, progress: Progress, out: Path | None) -> list[Row]:
-    scores: dict[str, list[dict]] = {"round": [], "one-sided": []}
-    valid, volumes, paper = 0, [], []
-    for seed in range(count):
-        for view, list_of_scores in scores.items():
-            branch = generated(seed, view=view)
-            result = skeletonise(branch.cloud.points, root=branch.skeleton.nodes[0])
-            list_of_scores.append(score(branch.skeleton, result.skeleton) | {"seed": seed})
-            surface, check, _ = smooth_forks(branch_surface(result.skeleton), result.skeleton)
-            valid += check.valid  # the surface that the user gets, with its fillets
-            if view == "round":
-                meshed = mesh_branch(result.skeleton).mesh
-                volumes.append(meshed.volumes.sum() / branch.surface.volume - 1)
-                radii = median_radii(result.skeleton, branch.cloud.points)
-                paper.append(float(np.median(np.abs(radii / result.skeleton.radius - 1))))
-            if out is not None and seed < 3:
-                _draw(out / f"generated_{seed}_{view}.png", branch, result.skeleton, surface)
-        progress((seed + 1) / count, "generated branches", seed=seed)
-    if out is not None:
-        (out / "generated.json").write_text(json.dumps(scores, indent=1))
-    return _generated_rows(count, scores, valid, np.array(volumes), float(np.median(paper)))
+def _generated(setting: Setting) -> list[Row]:
+    """Accuracy on generated branches, each scanned all round and from one side."""
+    source = source_digest(("geometry",), __file__, scan_scores.__file__)
+    drawn = setting.seeds(60, 4)
+    trials = numbers_of("generated", drawn, partial(_generated_trial, source=source,
+                                                    first=drawn.start, out=setting.out),
+                        source, setting.kept / "geometry.jsonl", setting.budget, None,
+                        setting.progress)
+    return _generated_rows([trial.values for trial in trials])
 
 
-def _generated_rows(count: int, scores: dict[str, list[dict]], valid: int, volumes: np.ndarray,
-                    paper: float) -> list[Row]:
+def _generated_trial(seed: int, source: str, first: int, out: Path | None) -> Numbers:
+    """Scores of both views of one branch; the first three are drawn."""
+    found: dict[str, Any] = {"valid": 0}
+    for view in VIEWS:
+        branch = generated(seed, view=view)
+        result = skeletonise(branch.cloud.points, root=branch.skeleton.nodes[0])
+        found[view] = score(branch.skeleton, result.skeleton)
+        surface, check, _ = smooth_forks(branch_surface(result.skeleton), result.skeleton)
+        found["valid"] += bool(check.valid)  # the surface that the user gets, with its fillets
+        if view == "round":
+            meshed = mesh_branch(result.skeleton).mesh
+            found["volume"] = float(meshed.volumes.sum() / branch.surface.volume - 1)
+            radii = median_radii(result.skeleton, branch.cloud.points)
+            found["paper"] = float(np.median(np.abs(radii / result.skeleton.radius - 1)))
+        if out is not None and seed < first + 3:
+            _draw(out / f"generated_{seed}_{view}.png", branch, result.skeleton, surface)
+    return Numbers("generated", seed, source, plain(found))
+
+
+def _generated_rows(trials: list[dict[str, Any]]) -> list[Row]:
+    count = len(trials)
+
     def column(view: str, key: str) -> np.ndarray:
-        return np.array([one[key] for one in scores[view]])
+        return np.array([one[view][key] for one in trials], float)
 
     table = []
-    for view in scores:
+    for view in VIEWS:
+        asked_centre, asked_radius, asked_forks = (_GENERATED[view, what] for what in (
+            "centre", "radius", "forks"))
         centre, share = column(view, "centre_m"), column(view, "centre_radii")
         met = (share < 0.25) | (centre < 0.0007)
         table.append(Row(
-            f"{count} generated, {view}: centreline error", "25 % of radius or 0.7 mm",
-            f"mean {100 * share.mean():.0f} % ({1000 * centre.mean():.2f} mm), worst "
-            f"{100 * share.max():.0f} % ({1000 * centre.max():.2f} mm); {met.sum()}/{count} met",
-            bool(met.all())))
+            *asked_centre, f"mean {100 * share.mean():.0f} % ({1000 * centre.mean():.2f} mm), "
+            f"worst {100 * share.max():.0f} % ({1000 * centre.max():.2f} mm); "
+            f"{met.sum()}/{count} met", bool(met.all()), count))
         error, bias = column(view, "radius_error"), column(view, "radius_bias")
-        limit = 0.08 if view == "round" else 0.12
         table.append(Row(
-            f"{count} generated, {view}: radius error, median over nodes", f"{100 * limit:.0f} %",
-            f"mean {100 * error.mean():.1f} %, worst {100 * error.max():.1f} %, bias "
-            f"{100 * bias.mean():+.1f} %", bool((error < limit).all())))
-        wanted, found = column(view, "forks").sum(), column(view, "forks_found").sum()
-        false = column(view, "forks_false").sum()
+            *asked_radius, f"mean {100 * error.mean():.1f} %, worst {100 * error.max():.1f} %, "
+            f"bias {100 * bias.mean():+.1f} %", bool((error < _RADIUS_LIMITS[view]).all()), count))
+        wanted, found, false = (int(column(view, key).sum()) for key in (
+            "forks", "forks_found", "forks_false"))
+        each = max(wanted, 1)
         table.append(Row(
-            f"{count} generated, {view}: forks found / false", "95 % / under 5 %",
-            f"{100 * found / wanted:.0f} % ({found}/{wanted}) / {100 * false / wanted:.0f} %",
-            bool(found >= 0.95 * wanted and false < 0.05 * wanted)))
-    table.append(Row("the paper's k-nearest median radii, against ours (for comparison)", "-",
-                     f"differ by {100 * paper:.0f} % (median)", None))
-    table.append(Row("generated: surface watertight, no self-intersection", "all",
-                     f"{valid}/{2 * count}", valid == 2 * count))
-    table.append(Row("generated: mesh volume against the true branch", "within 5 %",
-                     f"mean {100 * volumes.mean():+.1f} %, worst "
-                     f"{100 * np.abs(volumes).max():.1f} %", bool((np.abs(volumes) < 0.05).all())))
-    return table
+            *asked_forks, f"{100 * found / each:.0f} % ({found}/{wanted}) / "
+            f"{100 * false / each:.0f} %",
+            bool(found >= 0.95 * wanted and false < 0.05 * wanted) if wanted else None, count))
+    valid = sum(one["valid"] for one in trials)
+    volumes = np.array([one["volume"] for one in trials], float)
+    paper = float(np.median([one["paper"] for one in trials]))
+    return [*table,
+            Row(*_WATERTIGHT, f"{valid}/{2 * count}", valid == 2 * count, count),
+            Row(*_VOLUME, f"mean {100 * volumes.mean():+.1f} %, worst "
+                f"{100 * np.abs(volumes).max():.1f} %", bool((np.abs(volumes) < 0.05).all()),
+                count),
+            Row(*_PAPER_RADII, f"differ by {100 * paper:.0f} % (median)", None, count)]
 
 
-def _contraction(quick: bool, progress: Progress) -> list[Row]:
+def _contraction(setting: Setting, count: int) -> list[Row]:
     """Our contraction alone against the loop of pc-skeletor, on the same points."""
-    table = []
-    for count, asked, theirs in ((14_667, 2.5, 10.3), (58_219, 12.0, 56.5)):
-        if quick and count > 20_000:
-            continue
-        branch = generate_branch(7, point_spacing=0.0017 * np.sqrt(14_667 / count))
-        rng = np.random.default_rng(0)
-        points = branch.cloud.points
-        points = points[rng.permutation(len(points))[:count]]
-        seconds, contracted = min((_timed(contract, points) for _ in range(1 if quick else 2)),
-                                  key=lambda run: run[0])
-        error = _contracted_error(branch.skeleton, contracted.points)
-        other_seconds, other = _timed(renewed_contraction, points)
-        other_error = _contracted_error(branch.skeleton, other)
-        progress(count / 58_219, "contraction", points=len(points))
-        table.append(Row(
-            f"{len(points)} points unthinned, contraction alone", f"{asked} s, no larger error "
-            f"(pc-skeletor {theirs} s)",
-            f"{seconds:.1f} s, {100 * error:.0f} % of the radius; pc-skeletor's loop here "
-            f"{other_seconds:.1f} s, {100 * other_error:.0f} %",
-            seconds <= asked and error <= other_error))
-    return table
+    limit, _ = _CONTRACTION_SECONDS[count]
+    branch = generate_branch(setting.seed, point_spacing=0.0017 * np.sqrt(14_667 / count))
+    points = branch.cloud.points
+    points = points[setting.generator(21).permutation(len(points))[:count]]
+    seconds, contracted = min((_timed(contract, points) for _ in range(1 if setting.quick else 2)),
+                              key=lambda run: run[0])
+    error = _contracted_error(branch.skeleton, contracted.points)
+    other_seconds, other = _timed(renewed_contraction, points)
+    other_error = _contracted_error(branch.skeleton, other)
+    return [Row(*_contraction_asked(count),
+                f"{seconds:.1f} s, {100 * error:.0f} % of the radius; pc-skeletor's loop here "
+                f"{other_seconds:.1f} s, {100 * other_error:.0f} % ({len(points)} points)",
+                seconds <= limit and error <= other_error)]
 
 
 def renewed_contraction(points: np.ndarray) -> np.ndarray:
@@ -196,76 +229,75 @@ print(time.perf_counter() - started, peak_memory_mb(), result.skeleton.branch_co
 """
 
 
-def _speed(quick: bool, progress: Progress) -> list[Row]:
-    table = []
-    for count, asked in ((15_000, 4.0), (100_000, 20.0), (1_000_000, 60.0)):
-        if quick and count > 200_000:
-            continue
-        branch = generate_branch(11, point_spacing=0.0017 * np.sqrt(15_000 / count),
-                                 noise=0.001, length=1.0)
-        points = branch.cloud.points[:count]
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, "points.npy")
-            np.save(path, points)
-            # A process of its own, since peak memory is a process's.
-            done = [subprocess.run([sys.executable, "-c", _SKELETON_SCRIPT, str(path)],
-                                   capture_output=True, text=True, check=True).stdout.split()
-                    for _ in range(2 if count < 200_000 else 1)]
-        seconds = min(float(run[0]) for run in done)
-        memory = float(done[0][1])
-        progress(min(count / 1e6, 1.0), "speed", points=len(points))
-        limit = ", under 3 GB" if count == 1_000_000 else ""
-        table.append(Row(f"{len(points):,} points to skeleton, default settings",
-                         f"{asked:.0f} s{limit}", f"{seconds:.1f} s, {memory:.0f} MB, "
-                         f"{done[0][2]} runs", seconds <= asked and memory < 3000))
-    return table
+def _speed(setting: Setting, count: int) -> list[Row]:
+    limit, _ = _SPEED_SECONDS[count]
+    branch = generate_branch(setting.seed, point_spacing=0.0017 * np.sqrt(15_000 / count),
+                             noise=0.001, length=1.0)
+    points = branch.cloud.points[:count]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "points.npy")
+        np.save(path, points)
+        # A process of its own, since peak memory is a process's.
+        done = [subprocess.run([sys.executable, "-c", _SKELETON_SCRIPT, str(path)],
+                               capture_output=True, text=True, check=True).stdout.split()
+                for _ in range(2 if count < 200_000 else 1)]
+    seconds = min(float(run[0]) for run in done)
+    memory = float(done[0][1])
+    return [Row(*_speed_asked(count), f"{seconds:.1f} s, {memory:.0f} MB, {done[0][2]} branches "
+                f"({len(points):,} points)", seconds <= limit and memory < 3000, len(done))]
 
 
-def _scans(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
+def _scans(setting: Setting) -> list[Row]:
+    """Real scans through the command, as many as there is time for."""
     if not DATA.is_dir():
-        return [Row("real scans", "all", "not measured: no ../shared/data", None)]
-    table, valid, count, notes, shares = [], 0, 0, [], []
+        return [Row(*_SURFACES, "not measured: no ../shared/data", None, 0)]
+    scans = SCANS[:2] if setting.quick else SCANS
+    table, valid, notes, shares = [], 0, [], []
     with tempfile.TemporaryDirectory() as temporary:
-        for number, (name, options) in enumerate(SCANS):
-            if quick and number > 1:
-                continue
+        for name, options in setting.budget.items(scans):
             path = DATA / name
-            folder = Path(out or temporary, f"{path.stem}.branch")
-            started = time.perf_counter()
-            run = subprocess.run(
-                [sys.executable, "-m", "limber", "reconstruct", str(path), "-o", str(folder),
-                 "--force", "--json", "--progress", "none", *options], capture_output=True,
-                text=True, check=False)
-            seconds = time.perf_counter() - started
-            result = json.loads(run.stdout.splitlines()[-1])
-            count += 1
-            if result["status"] == "done":
+            folder = Path(setting.out or temporary, f"{path.stem}.branch")
+            seconds, result = _reconstructed(path, folder, options)
+            is_done = result["status"] == "done"
+            if is_done:
                 check = result["surface_check"]
-                good = check["watertight"] and check["self_intersection_count"] == 0
-                valid += good
-                if out is not None:
-                    draw_folder(folder, out / f"{path.stem}.png")
-                ours = read_swc(folder / "skeleton.swc")
-                share = explained(read_points(folder / "cloud.ply").points, ours)
+                valid += check["watertight"] and check["self_intersection_count"] == 0
+                if setting.out is not None:
+                    draw_folder(folder, setting.out / f"{path.stem}.png")
+                share, compared = _compared(path, folder)
                 shares.append(f"{path.stem} {share:.0%}")
-                if path.stem == "Tree_1":
-                    table += _against_qsm(folder)
-                if path.with_suffix(".graph.txt").is_file():
-                    text = against_graph(path.with_suffix(".graph.txt"),
-                                         _in_file_frame(folder, ours).nodes, ours.parent)
-                    table.append(Row(f"{path.stem}: axes against the authors'", "report", text,
-                                     None))
-            notes.append(f"{path.stem} {seconds:.0f} s " + (
-                f"{result['tet_count']} tets" if result["status"] == "done" else "FAILED"))
+                table += compared
+            notes.append(f"{path.stem} {seconds:.0f} s "
+                         + (f"{result['tet_count']} tets" if is_done else "FAILED"))
             if path.stem == "branch":
-                table.append(Row("whole `reconstruct` of coffeetree_branch", "30 s",
-                                 f"{seconds:.1f} s", seconds <= 30 and run.returncode == 0))
-            progress((number + 1) / len(SCANS), path.stem)
-    table.append(Row("real scans: points no farther outside a branch than twice their spacing",
-                     "report", "; ".join(shares), None))
-    table.append(Row("real scans: surface watertight, no self-intersection", "all",
-                     f"{valid}/{count} ({'; '.join(notes)})", valid == count))
-    return table
+                table.append(Row(*_WHOLE, f"{seconds:.1f} s", seconds <= 30 and is_done))
+            setting.progress(len(notes) / len(scans), path.stem)
+    count = len(notes)
+    return [Row(*_SURFACES, f"{valid}/{count} ({'; '.join(notes)})", valid == count, count),
+            Row(*_EXPLAINED, "; ".join(shares), None, count), *table]
+
+
+def _reconstructed(path: Path, folder: Path, options: list[str]) -> tuple[float, dict[str, Any]]:
+    """Seconds of `limber reconstruct`, and what it tells."""
+    started = time.perf_counter()
+    run = subprocess.run(
+        [sys.executable, "-m", "limber", "reconstruct", str(path), "-o", str(folder),
+         "--force", "--json", "--progress", "none", *options], capture_output=True,
+        text=True, check=False)
+    return time.perf_counter() - started, json.loads(run.stdout.splitlines()[-1])
+
+
+def _compared(path: Path, folder: Path) -> tuple[float, list[Row]]:
+    """Share of the points that the axes explain, and rows against what others found."""
+    ours, table = read_swc(folder / "skeleton.swc"), []
+    share = explained(read_points(folder / "cloud.ply").points, ours)
+    if path.stem == "Tree_1":
+        table += _against_qsm(folder)
+    graph = path.with_suffix(".graph.txt")
+    if graph.is_file():
+        text = against_graph(graph, _in_file_frame(folder, ours).nodes, ours.parent)
+        table.append(Row(*_authors_asked(path.stem), text, None))
+    return share, table
 
 
 def _against_qsm(folder: Path) -> list[Row]:
@@ -285,9 +317,9 @@ def _against_qsm(folder: Path) -> list[Row]:
     distance, near = cKDTree(axes.points).query((start + end)[thick] / 2)
     close = distance < 2 * radius[thick]
     ratio = axes.radius[near[close]] / radius[thick][close] - 1
-    rows = [Row("aRchi_tree_1: total length, ours / TreeQSM", "report",
+    rows = [Row(*_QSM["length"],
                 f"{ours.length:.0f} m / {length.sum():.0f} m", None),
-            Row("aRchi_tree_1: radius over 5 mm, ours against TreeQSM", "report",
+            Row(*_QSM["radius"],
                 f"median {100 * np.median(ratio):+.0f} %, median |difference| "
                 f"{100 * np.median(np.abs(ratio)):.0f} % on {close.mean():.0%} of its cylinders",
                 None)]
@@ -298,7 +330,7 @@ def _against_qsm(folder: Path) -> list[Row]:
         step = np.linalg.norm(theirs.nodes[1:] - theirs.nodes[theirs.parent[1:]], axis=1)
         text += "; TreeQSM " + ", ".join(
             f"{k}: {step[theirs.order[1:] == k].sum():.0f}" for k in range(4))
-    rows.append(Row("aRchi_tree_1: length by order [m]", "report", text, None))
+    rows.append(Row(*_QSM["order"], text, None))
     return rows
 
 
@@ -334,3 +366,19 @@ def _draw(path: Path, branch: GeneratedBranch, skeleton: Skeleton, surface: Surf
 
     draw_reconstruction(path, branch.cloud.points, skeleton, surface,
                         f"generated, seed {branch.seed}, {branch.spec.view}")
+
+
+PARTS = {
+    "generated": Part(_generated, 20, (*_GENERATED.values(), _WATERTIGHT, _VOLUME, _PAPER_RADII),
+                      grows=True),
+    "speed-15k": Part(partial(_speed, count=15_000), 15, (_speed_asked(15_000),)),
+    "speed-100k": Part(partial(_speed, count=100_000), 40, (_speed_asked(100_000),)),
+    "scans": Part(_scans, 40, (_SURFACES, _EXPLAINED, _WHOLE, *_QSM.values(), *(
+        _authors_asked(stem) for stem in ("tomato_03-05", "maize_03-13"))), grows=True),
+    "speed-1m": Part(partial(_speed, count=1_000_000), 90, (_speed_asked(1_000_000),)),
+    "contraction-15k": Part(partial(_contraction, count=14_667), 20, (
+        _contraction_asked(14_667),)),
+    "contraction-58k": Part(partial(_contraction, count=58_219), 100, (
+        _contraction_asked(58_219),)),
+    "crowns": Part(crown_rows, 60, CROWN_ROWS, grows=True)}
+"""The table, in order of importance."""

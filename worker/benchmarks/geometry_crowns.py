@@ -1,23 +1,26 @@
 """Dense crowns with known truth, and how much of a scan its skeleton explains."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.scan_scores import Dense
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.geometry.generated import BranchSpec, scan
 from limber.geometry.skeleton.radii.cylinders import nearest_cylinders
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.geometry.skeleton.sweep import frames, tangents
-from limber.progress import Progress
 
-CROWNS = ((0, 8.0, 0.12, 0.035, 0.004), (1, 12.0, 0.2, 0.05, 0.008), (2, 6.0, 0.08, 0.025, 0.004),
-          (3, 8.0, 0.12, 0.05, 0.004))
-"""Seed, height [m], root radius [m], point spacing [m], noise [m]."""
+CROWNS = ((8.0, 0.12, 0.035, 0.004), (12.0, 0.2, 0.05, 0.008), (6.0, 0.08, 0.025, 0.004),
+          (8.0, 0.12, 0.05, 0.004))
+"""Height [m], root radius [m], point spacing [m], noise [m]; seeds take turns."""
+CROWN_ROWS = (Asked("generated crowns: axis length recalled / right", "report"),
+              Asked("generated crowns: radius where the axis is right", "report"))
 
 _TWIGS = (9, 6, 4)  # on each axis of order 0, 1, 2
 _THINNEST = 0.006  # [m]
@@ -65,23 +68,29 @@ def axis_scores(truth: Skeleton, found: Skeleton, spacing: float, step: float = 
             "radius_error": float(np.median(np.abs(ratio)))}
 
 
-def crown_rows(count: int, progress: Progress) -> list[Row]:
+def crown_rows(setting: Setting) -> list[Row]:
     """Skeletonise generated crowns and score their axes."""
-    scores = []
-    for number, crown in enumerate(CROWNS[:count]):
-        truth, points = generated_crown(*crown)
-        found = skeletonise(points, root=truth.nodes[0]).skeleton
-        scores.append(axis_scores(truth, found, crown[3]))
-        progress((number + 1) / count, "generated crowns", seed=crown[0])
+    source = source_digest(("geometry",), __file__)
+    trials = numbers_of("crowns", setting.seeds(len(CROWNS), 1), partial(
+        _crown_trial, source=source), source, setting.kept / "geometry.jsonl", setting.budget,
+        progress=setting.progress)
+    scores = [trial.values for trial in trials]
     mean = {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
     worst = min(score["recall"] for score in scores), min(s["precision"] for s in scores)
-    return [Row(f"{len(scores)} generated crowns: axis length recalled / right", "report",
+    return [Row(*CROWN_ROWS[0],
                 f"{mean['recall']:.0%} (worst {worst[0]:.0%}; under 20 mm radius "
                 f"{mean['thin']:.0%}) / {mean['precision']:.0%} (worst {worst[1]:.0%}), length "
-                f"{mean['length']:.2f} of the truth", None),
-            Row(f"{len(scores)} generated crowns: radius where the axis is right", "report",
+                f"{mean['length']:.2f} of the truth", None, len(scores)),
+            Row(*CROWN_ROWS[1],
                 f"median {mean['radius_bias']:+.0%}, median |difference| "
-                f"{mean['radius_error']:.0%}", None)]
+                f"{mean['radius_error']:.0%}", None, len(scores))]
+
+
+def _crown_trial(seed: int, source: str) -> Numbers:
+    kind = CROWNS[seed % len(CROWNS)]
+    truth, points = generated_crown(seed, *kind)
+    found = skeletonise(points, root=truth.nodes[0]).skeleton
+    return Numbers("crowns", seed, source, axis_scores(truth, found, spacing=kind[2]))
 
 
 def explained(points: np.ndarray, skeleton: Skeleton) -> float:

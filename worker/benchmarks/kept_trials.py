@@ -2,14 +2,77 @@
 
 import hashlib
 import json
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
+
+from benchmarks.budget import Budget, side_by_side
 from limber.plain import plain
+from limber.progress import SILENT, Progress
 
 Trial = TypeVar("Trial")
+Task = TypeVar("Task")
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What one trial gave: numbers by name.
+
+    Attributes:
+        part: Of the benchmark's table.
+        seed: Of all that was drawn.
+        source: Digest of the sources; trials of other sources do not count.
+        values: JSON has no number that is not finite: such a number is read back as infinite.
+    """
+
+    part: str
+    seed: int
+    source: str
+    values: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        for name, value in self.values.items():
+            if value is None:
+                self.values[name] = np.inf
+
+
+def numbers_of(part: str, seeds: Iterable[int], work: Callable[[int], Numbers], source: str,
+               kept: Path | None, budget: Budget, workers: int | None = 1,
+               progress: Progress = SILENT) -> list[Numbers]:
+    """Return the trials of a part by seed; :func:`go_on` says what is made and what is kept."""
+    own = [each for each in read_trials(Numbers, kept) if each.part == part]
+    return go_on(own, list(seeds), lambda trial: trial.seed, work, source, kept, budget, workers,
+                 progress)
+
+
+def go_on(kept_trials: list[Trial], tasks: list[Task], key: Callable[[Trial], Task],
+          work: Callable[[Task], Trial], source: str, kept: Path | None, budget: Budget,
+          workers: int | None = 1, progress: Progress = SILENT) -> list[Trial]:
+    """Return the trials of ``tasks``, in their order: those kept, and as many new ones as fit.
+
+    Args:
+        kept_trials: From an earlier run; those of another ``source`` do not count.
+        tasks: What to do, the most important first.
+        key: Returns the task of a trial.
+        work: Makes the trial of a task.
+        source: Digest of the sources.
+        kept: File to which new trials are appended, or None.
+        budget: For the new ones; one at least is made where there is none yet.
+        workers: How many at once; None: as many as there are cores.
+        progress: Called after each.
+    """
+    wanted = set(tasks)
+    known = {key(trial): trial for trial in kept_trials
+             if trial.source == source and key(trial) in wanted}
+    missing = [task for task in tasks if task not in known]
+    for task, trial in side_by_side(work, missing, budget, workers, at_least=0 if known else 1):
+        known[task] = trial
+        keep(trial, kept)
+        progress(len(known) / len(tasks), f"trial {len(known)} of at most {len(tasks)}")
+    return [known[task] for task in tasks if task in known]
 
 
 def source_digest(packages: Iterable[str], *own: str | Path) -> str:

@@ -1,81 +1,245 @@
-"""The table that every benchmark prints: measure, asked, measured, met."""
+"""The table that every benchmark prints: measure, asked, measured, met, count."""
 
 import argparse
 import importlib
-import inspect
 import json
 import secrets
 import sys
+import tempfile
 import time
-from dataclasses import asdict, dataclass
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+
+from benchmarks.budget import Budget, parsed_seconds
+from limber.errors import Cancelled
 from limber.plain import plain
-from limber.progress import BarSink, Progress
+from limber.progress import SILENT, BarSink, Progress
 
 NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "scans", "viewport",
          "worker")
+NOT_SHOWN = "not shown"
+"""What a row says for which there was no time, or nothing to measure it with."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line. ``met`` is None where nothing was asked, or where it could not be measured."""
+    """One line of the table.
+
+    Attributes:
+        measure: What is measured.
+        asked: The limit that the issue set.
+        measured: What came out.
+        met: None where nothing was asked, or where it could not be measured.
+        count: How many trials the row stands on: seeds, files, runs; 0 where it is not shown.
+    """
 
     measure: str
     asked: str
     measured: str
     met: bool | None
+    count: int = 1
+
+
+class Asked(NamedTuple):
+    """What a row measures, and its limit: known before anything is measured."""
+
+    measure: str
+    asked: str
+
+    def not_shown(self) -> Row:
+        """Return the row without a measurement."""
+        return Row(*self, NOT_SHOWN, None, 0)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a part is measured.
+
+    Attributes:
+        seed: From which all is drawn.
+        quick: Fewer trials, smaller cases.
+        budget: Time of the part.
+        progress: Called as it goes.
+        kept: Folder where trials are kept; parts of one run and runs of one ``--out`` share it.
+        out: Folder for pictures and raw numbers, or None where the user named none.
+    """
+
+    seed: int
+    quick: bool
+    budget: Budget
+    progress: Progress
+    kept: Path
+    out: Path | None = None
+
+    def at_most(self, count: int, quick: int) -> int:
+        """Return how many trials to take if the time allows."""
+        return quick if self.quick else count
+
+    def seeds(self, count: int, quick: int, first: int = 0) -> range:
+        """Return seeds of trials: fresh ones for each base seed, ``count`` or ``quick`` many."""
+        start = 1000 * self.seed + first
+        return range(start, start + self.at_most(count, quick))
+
+    def generator(self, *which: int) -> np.random.Generator:
+        """Return a generator of the base seed; ``which`` keeps those of parts apart."""
+        return np.random.default_rng([self.seed, *which])
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a benchmark's table.
+
+    Attributes:
+        run: Measures it.
+        seconds: About what the least of it takes on two cores [s]: all of it, or one trial where
+            it grows. It is not begun with less.
+        gives: Its rows: one that ``run`` does not return is not shown.
+        grows: It takes trials as long as its budget lasts.
+        alone: Measured only where ``--only`` names it.
+    """
+
+    run: Callable[[Setting], list[Row]]
+    seconds: float
+    gives: tuple[Asked, ...]
+    grows: bool = False
+    alone: bool = False
 
 
 def main(arguments: list[str] | None = None) -> int:
     """``scripts/bench NAME``: measure, print the table; 0 whenever it could measure."""
     parser = argparse.ArgumentParser(prog="scripts/bench", description=main.__doc__)
     parser.add_argument("name", choices=NAMES)
+    parser.add_argument("--budget", type=_seconds, default="15m", metavar="TIME", help=(
+        "how long to measure, as 90s, 15m (default) or 1h; rows come in order of importance"))
     parser.add_argument("--quick", action="store_true", help="fewer seeds")
     parser.add_argument("--json", action="store_true", help="last line: the table as JSON")
     parser.add_argument("--seed", type=int, help="repeat what a printed base seed drew")
     parser.add_argument("--only", nargs="+", metavar="PART", default=(), help=(
-        "only these parts of the table, where a bench has parts; a wrong one lists them"))
-    parser.add_argument("--out", type=Path, help="folder for pictures and raw numbers")
+        "only these parts of the table; a wrong name lists them"))
+    parser.add_argument("--out", type=Path, help=(
+        "folder for pictures, raw numbers and trials; with the same --seed, a run goes on there"))
     options = parser.parse_args(arguments)
-    module = importlib.import_module(f"benchmarks.{options.name}")
-    parts = getattr(module, "PARTS", {})
-    for part in options.only:
-        if part not in parts:
-            parser.error(f"{options.name} has no part {part!r}; it has: {', '.join(parts)}")
-    if options.out:
-        options.out.mkdir(parents=True, exist_ok=True)
+    budget = Budget(options.budget)
+    parts = importlib.import_module(f"benchmarks.{options.name}").PARTS
+    for name in options.only:
+        if name not in parts:
+            parser.error(f"{options.name} has no part {name!r}; it has: {', '.join(parts)}")
     started = time.perf_counter()
-    rows = _measure(module, options)
+    rows, failed = _measured(parts, options, budget)
     show(rows)
     print(f"{options.name}: {time.perf_counter() - started:.0f} s")
     if options.json:
         print(json.dumps({"bench": options.name, "rows": [plain(asdict(row)) for row in rows]}))
-    return 0
+    return 1 if rows and failed == len(rows) else 0
 
 
-def show(rows: list[Row]) -> None:
+def show(rows: Sequence[Row]) -> None:
     """Print rows as a table."""
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("measure", "asked", "measured", "met")
+    table = Table("measure", "asked", "measured", "met", "count")
     for row in rows:
         met = {True: "yes", False: "NO", None: "-"}[row.met]
-        table.add_row(row.measure, row.asked, row.measured, met)
-    console = Console(width=None if sys.stdout.isatty() else 160)
+        table.add_row(row.measure, row.asked, row.measured, met, str(row.count))
+    console = Console(width=None if sys.stdout.isatty() else 160, markup=False)
     console.print(table)
 
 
-def _measure(module: object, options: argparse.Namespace) -> list[Row]:
-    drawn = {"only": tuple(options.only)} if options.only else {}
-    if "seed" in inspect.signature(module.rows).parameters:
-        drawn["seed"] = secrets.randbits(31) if options.seed is None else options.seed
-        print(f"base seed {drawn['seed']} (--seed repeats it)", flush=True)
-    if not sys.stderr.isatty():
-        return module.rows(options.quick, Progress(), options.out, **drawn)
-    with BarSink(options.name) as bar:
-        return module.rows(options.quick, Progress(bar), options.out, **drawn)
+def rows_of(parts: dict[str, Part], setting: Setting, only: Sequence[str] = (),
+            ) -> tuple[list[Row], int]:
+    """Measure parts in their order, within the setting's budget.
+
+    Returns:
+        The rows of all chosen parts, and how many of them come from parts that failed.
+    """
+    chosen = only or [name for name, part in parts.items() if not part.alone]
+    table: list[Row] = []
+    failed = 0
+    for number, name in enumerate(chosen):
+        part, later = parts[name], [parts[each] for each in chosen[number + 1:]]
+        seconds = allowance(part, later, setting.budget.remaining)
+        if seconds is None:
+            print(f"{name}: not shown, it takes {part.seconds:.0f} s or more and "
+                  f"{max(setting.budget.remaining, 0):.0f} s are left", flush=True)
+            table += [asked.not_shown() for asked in part.gives]
+            continue
+        progress = setting.progress.part(number / len(chosen), (number + 1) / len(chosen))
+        progress(0.0, name)
+        found = _tried(name, part, replace(setting, budget=setting.budget.part(seconds),
+                                           progress=progress))
+        failed += 0 if found else len(part.gives)
+        table += found or [Row(*asked, "failed, see above", False, 0) for asked in part.gives]
+    return table, failed
+
+
+def allowance(part: Part, later: Sequence[Part], remaining: float) -> float | None:
+    """Return the time [s] of a part, or None where the least of it does not fit.
+
+    The least of each later part that still fits, the most important first, is set aside. Parts
+    that grow share evenly what is left over.
+    """
+    spare, growing = remaining - part.seconds, 1
+    if spare < 0:
+        return None
+    for other in later:
+        if other.seconds <= spare:
+            spare -= other.seconds
+            growing += other.grows
+    return part.seconds + (spare / growing if part.grows else 0.0)
+
+
+def share_met(share: float, count: int, low: float, high: float) -> bool | None:
+    """Whether a share of ``count`` intervals lies in an asked range, or None: they are too few.
+
+    Of fewer than 20, one that misses is more than the 5 % that 95 % intervals may miss; a share
+    above ``high`` says nothing where a single miss would bring it below.
+    """
+    if count < _FEW or (share > high and count * (1 - high) < 1):
+        return None
+    return bool(low <= share <= high)
+
+
+_FEW = 20
+
+
+def _tried(name: str, part: Part, setting: Setting) -> list[Row]:
+    """The rows of a part, in what it gives; none where it failed, which is printed."""
+    try:
+        found = part.run(setting)
+    except Cancelled:
+        raise
+    except Exception:
+        print(f"{name}: {traceback.format_exc()}", flush=True)
+        return []
+    shown = {(row.measure, row.asked) for row in found}
+    return found + [asked.not_shown() for asked in part.gives if tuple(asked) not in shown]
+
+
+def _measured(parts: dict[str, Part], options: argparse.Namespace, budget: Budget,
+              ) -> tuple[list[Row], int]:
+    seed = secrets.randbits(31) if options.seed is None else options.seed
+    print(f"base seed {seed} (--seed repeats it)", flush=True)
+    with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
+        kept = options.out or Path(place)
+        kept.mkdir(parents=True, exist_ok=True)
+        setting = Setting(seed, options.quick, budget, SILENT, kept, options.out)
+        if not sys.stderr.isatty():
+            return rows_of(parts, setting, options.only)
+        with BarSink(options.name) as bar:
+            return rows_of(parts, replace(setting, progress=Progress(bar)), options.only)
+
+
+def _seconds(text: str) -> float:
+    try:
+        return parsed_seconds(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 if __name__ == "__main__":
