@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.mechanics import _exact_potential, _manufactured_potential
+from benchmarks.mechanics_exact import _exact_potential, _manufactured_potential
 
 
 def test_energy_converges_at_fourth_order():

@@ -6,14 +6,16 @@ The truth is always simulated on another, finer mesh than the fit, with noise of
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks import silicone_beam
-from benchmarks.estimation_force import force_rows
-from benchmarks.estimation_noise import noise_rows
-from benchmarks.estimation_scans import scan_rows
+from benchmarks.estimation_force import FORCE_ROWS, force_rows
+from benchmarks.estimation_noise import NOISE_ROWS, noise_rows
+from benchmarks.estimation_scans import SCAN_ROWS, scan_rows
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.paper_branches import (
     BRANCHES,
     FRACTIONS,
@@ -22,7 +24,7 @@ from benchmarks.paper_branches import (
     exact_pull,
     measured,
 )
-from benchmarks.table import Row
+from benchmarks.table import Asked, Part, Row, Setting
 from limber.estimation.fit import Estimate
 from limber.estimation.online.exact import Beside
 from limber.estimation.online.filter import OnlineFrame
@@ -38,35 +40,30 @@ from limber.estimation.virtual_pull import (
     write_depth_frames,
 )
 from limber.jobs import run_tasks
-from limber.progress import SILENT, Progress
+from limber.progress import SILENT
 from limber.recordings.alignment import frames_of
 from limber.recordings.recording import Pull
 
 SETTINGS = EstimateSettings(hold_out=False)
+_BEAM_YOUNG_PA = (1.6e5, 4.0e5)
+"""Of simulated beams, least and most."""
 
 
-def rows(quick: bool, progress: Progress, out: Path | None) -> list[Row]:
-    """Measure everything; about 30 minutes on two quiet cores, 7 with ``quick``.
-
-    With ``out`` each fit is kept in ``estimation-noise.jsonl`` and ``estimation-scans.jsonl``: a
-    run that was stopped goes on there.
-    """
-    progress(0.01, "the paper's branches")
-    table = _paper_table()
-    kept = out / "estimation-noise.jsonl" if out else None
-    table += noise_rows(3 if quick else 20, progress.part(0.05, 0.45), kept)
-    kept = out / "estimation-scans.jsonl" if out else None
-    table += scan_rows(2 if quick else 10, progress.part(0.45, 0.6), kept)
-    progress(0.58, "driven by force")
-    table += force_rows(2 if quick else 10)
-    progress(0.6, "depth frames")
-    table += _depth_rows(quick)
-    progress(0.7, "Nelder-Mead against Gauss-Newton")
-    table += _optimiser_rows()
-    progress(0.85, "full and reduced model, online")
-    table += _speed_rows()
-    progress(0.95, "silicone beam")
-    return table + _beam_rows()
+_TABLE = tuple(Asked(f"paper's table, {branch.name}: E1..E4 [1e7 Pa], nu", " ".join(
+    f"{young / 1e7:.3g}" for young in branch.young) + f", {branch.poisson}") for branch in BRANCHES)
+_EXACT = Asked("three branches, one pull, exact data: worst E error", "1 %")
+_DEPTH = Asked("depth frames of a simulated D455 at 1 m, one side: worst E error", "10 %")
+_OPTIMISER = Asked("forward simulations, Nelder-Mead over Gauss-Newton, to the same loss",
+                   "10 times fewer")
+_SPEED = (
+    Asked("one pull of 100 frames, 2,500 quadratic tetrahedra, full model", "240 s"),
+    Asked("the same on the reduced model, its basis built", "20 s"),
+    Asked("online update", "33 ms a frame"))
+_BEAM = (Asked("silicone_beam: E from the recording (CSV; C3D in brackets)",
+               "simulated static tip drop within 2 % of the measured"),
+         Asked("silicone_beam: drop foretold for other loads", "-"))
+_OTHER_LOADS = Asked("the same with simulated recordings, fitted at 0.51 N: worst error of the "
+                     "drop at 0, 0.2 and 1 N", "5 %")
 
 
 def _exact(branch: PaperBranch) -> tuple[np.ndarray, float, int]:
@@ -77,34 +74,29 @@ def _exact(branch: PaperBranch) -> tuple[np.ndarray, float, int]:
     return bench.errors(found), found.values.poisson, found.objective.forward_count
 
 
-def _paper_table() -> list[Row]:
+def _paper_table(_setting: Setting) -> list[Row]:
     found = run_tasks(_exact, [(branch,) for branch in BRANCHES])
     table = []
-    for branch, (errors, poisson, count) in zip(BRANCHES, found, strict=True):
-        truth = " ".join(f"{young / 1e7:.3g}" for young in branch.young)
+    for asked, branch, (errors, poisson, count) in zip(_TABLE, BRANCHES, found, strict=True):
         ours = " ".join(f"{young / 1e7 * (1 + error):.3g}"
                         for young, error in zip(branch.young, errors, strict=True))
-        table.append(Row(f"paper's table, {branch.name}: E1..E4 [1e7 Pa], nu",
-                         f"{truth}, {branch.poisson}",
-                         f"{ours}, {poisson:.3f} ({count} simulations)", None))
+        table.append(Row(*asked, f"{ours}, {poisson:.3f} ({count} simulations)", None))
     worst = [float(np.abs(errors).max()) for errors, _, _ in found]
     each = ", ".join(f"{branch.name} {100 * error:.2f} %"
                      for branch, error in zip(BRANCHES, worst, strict=True))
-    table.append(Row("three branches, one pull, exact data: worst E error", "1 %", each,
-                     bool(max(worst) <= 0.01)))
-    return table
+    return [Row(*_EXACT, each, bool(max(worst) <= 0.01), len(worst)), *table]
 
 
-def _depth_rows(quick: bool) -> list[Row]:
+def _depth_rows(setting: Setting) -> list[Row]:
     from limber.perception.observe import observe
 
-    worst, sizes, squares, covered = [], [], [], []
-    branches = BRANCHES[1:2] if quick else BRANCHES
-    for branch in branches:
+    worst, sizes, squares, covered = {}, [], [], []
+    branches = BRANCHES[1:2] if setting.quick else BRANCHES
+    for branch in setting.budget.items(branches):
         truth = branch.truth()
         settings = VirtualPullSettings(
             young=branch.young, poisson=branch.poisson, frames=40, reach=0.4, phase=0.3,
-            camera=True, seed=11)
+            camera=True, seed=setting.seed)
         pull, states = simulate_pull(truth, "pull-1", settings)
         with tempfile.TemporaryDirectory() as folder:
             write_depth_frames(Path(folder), truth, pull, states, settings)
@@ -116,15 +108,15 @@ def _depth_rows(quick: bool) -> list[Row]:
         squares.append(np.nanmean(np.einsum("fmi,fmij,fmj->fm", off,
                                             np.linalg.inv(seen.covariance), off)) / 3)
         found = bench.fit([replace(pull, observations=seen)], SETTINGS)
-        worst.append(float(np.abs(bench.errors(found)).max()))
+        worst[branch.name] = float(np.abs(bench.errors(found)).max())
         low, high = found.uncertainty.young_interval.T
         covered += ((low <= branch.young) & (high >= branch.young)).tolist()
-    each = ", ".join(f"{branch.name} {100 * error:.1f} %"
-                     for branch, error in zip(branches, worst, strict=True))
-    return [Row("depth frames of a simulated D455 at 1 m, one side: worst E error", "10 %",
+    each = ", ".join(f"{name} {100 * error:.1f} %" for name, error in worst.items())
+    return [Row(*_DEPTH,
                 f"{each} (points found to {1e3 * np.median(sizes):.2f} mm, "
                 f"{np.sqrt(np.mean(squares)):.1f} of their stated deviation; "
-                f"{sum(covered)} of {len(covered)} intervals hold)", max(worst) <= 0.10)]
+                f"{sum(covered)} of {len(covered)} intervals hold)",
+                max(worst.values()) <= 0.10, len(worst))]
 
 
 def _moved(truth: object, displacements: list) -> list[np.ndarray]:
@@ -134,11 +126,11 @@ def _moved(truth: object, displacements: list) -> list[np.ndarray]:
     return [(operator @ displacement.ravel()).reshape(-1, 3) for displacement in displacements]
 
 
-def _optimiser_rows() -> list[Row]:
+def _optimiser_rows(setting: Setting) -> list[Row]:
     """Both from the same start; how many simulations each needs to Nelder-Mead's final loss."""
     branch = BRANCHES[1]
     bench = Bench(branch)
-    pull = measured(exact_pull(branch, 0, frames=40), 7)
+    pull = measured(exact_pull(branch, 0, frames=40), setting.seed)
     settings = EstimateSettings(hold_out=False, key_frames=8)
     start = scaled_start(bench.objective([pull], settings), Values(np.full(4, 1e7), 0.35, 900.0))
     ours, theirs = (bench.objective([pull], settings) for _ in range(2))
@@ -151,31 +143,31 @@ def _optimiser_rows() -> list[Row]:
                     if entry.objective <= final * (1 + 1e-6)), ours.forward_count)
     ratio = theirs.forward_count / reached
     note = "" if fitted.evaluation.objective <= final * (1 + 1e-6) else ", which it misses"
-    return [Row("forward simulations, Nelder-Mead over Gauss-Newton, to the same loss",
-                "10 times fewer", f"{theirs.forward_count} / {reached} = {ratio:.0f}{note}",
+    return [Row(*_OPTIMISER, f"{theirs.forward_count} / {reached} = {ratio:.0f}{note}",
                 bool(ratio >= 10 and not note))]
 
 
-def _speed_rows() -> list[Row]:
+def _speed_rows(setting: Setting) -> list[Row]:
     branch = BRANCHES[1]
     # About 2,500 quadratic tetrahedra.
     bench = Bench(branch, slice_length=0.95, sides=10)
-    pull = measured(exact_pull(branch, 0), 5)
+    pull = measured(exact_pull(branch, 0), setting.seed)
     started = time.perf_counter()
     found = bench.fit([pull], SETTINGS)
     full = time.perf_counter() - started
     short, build, away = _reduced(bench, pull, found)
-    updates, _, online_error = followed(bench, measured(exact_pull(branch, 1), 6), pull, found)
+    updates, _, online_error = followed(
+        bench, measured(exact_pull(branch, 1), setting.seed), pull, found)
     return [
-        Row(f"one pull of 100 frames, {bench.mesh.tet_count} quadratic tetrahedra, full model",
-            "240 s", f"{full:.0f} s ({found.objective.forward_count} simulations)", full <= 240),
-        Row("the same on the reduced model, its basis built", "20 s",
+        Row(*_SPEED[0], f"{full:.0f} s ({found.objective.forward_count} simulations, "
+            f"{bench.mesh.tet_count} tetrahedra)", full <= 240),
+        Row(*_SPEED[1],
             f"{short:.1f} s; {100 * away:.1f} % from the full model's E; with the basis "
             f"{build:.0f} s", short <= 20),
-        Row("online update", "33 ms a frame",
+        Row(*_SPEED[2],
             f"median {1e3 * np.median(updates):.0f} ms, 95 % under "
             f"{1e3 * np.percentile(updates, 95):.0f} ms; ends {100 * online_error:.1f} % from the "
-            "full fit", bool(np.percentile(updates, 95) <= 0.033))]
+            "full fit", bool(np.percentile(updates, 95) <= 0.033), len(updates))]
 
 
 def _reduced(bench: Bench, pull: Pull, found: Estimate) -> tuple[float, float, float]:
@@ -219,13 +211,11 @@ def followed(bench: Bench, earlier: Pull, pull: Pull, found: Estimate,
     return np.array(seconds), live, settled
 
 
-def _beam_rows() -> list[Row]:
-    asked = "simulated static tip drop within 2 % of the measured"
+def _beam_rows(_setting: Setting) -> list[Row]:
     if not silicone_beam.RECORDING.is_file():
-        return [Row("silicone_beam: E", asked, "the recording is not here", None)]
+        return [Row(*_BEAM[0], "the recording is not here", None, 0)]
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        branch = silicone_beam.made_branch(folder)
+        branch = silicone_beam.made_branch(Path(temporary))
         c3d = silicone_beam.estimate_beam(branch, silicone_beam.RECORDING_C3D,
                                           silicone_beam.LOAD_N, "c3d")
         found = silicone_beam.estimate_beam(branch, silicone_beam.RECORDING,
@@ -233,32 +223,55 @@ def _beam_rows() -> list[Row]:
         others = ", ".join(
             f"{load:g} N {1e3 * silicone_beam.predicted_drop(branch, 'csv', load):.2f} mm"
             for load in (0.0, 0.25, 0.75, 1.0))
-        off, covered = _simulated_beam(folder, branch)
     drop_off = found.simulated_drop / found.measured_drop - 1
     low, high = (value / 1e3 for value in found.interval)
     return [
-        Row("silicone_beam: E from the recording (CSV; C3D in brackets)", asked,
+        Row(*_BEAM[0],
             f"E = {found.young / 1e3:.1f} kPa ({c3d.young / 1e3:.1f}), 95 % {low:.0f} to "
             f"{high:.0f} (sensors {100 * found.sensor:.1f} %, mesh {100 * found.mesh:.1f} %); drop "
             f"{1e3 * found.simulated_drop:.2f} of {1e3 * found.measured_drop:.2f} mm "
             f"({100 * drop_off:+.2f} %)", bool(abs(drop_off) <= 0.02)),
-        Row("silicone_beam: drop foretold for other loads", "-", others, None),
-        Row("the same with simulated recordings, fitted at 0.51 N: worst error of the drop at 0, "
-            "0.2 and 1 N", "5 %", f"{100 * off:.1f} % (E's interval holds the truth: {covered})",
-            bool(off <= 0.05))]
+        Row(*_BEAM[1], others, None)]
 
 
-def _simulated_beam(folder: Path, branch: Path) -> tuple[float, str]:
-    """Worst relative error of a drop at other loads, and how often the interval held, 3 beams."""
-    worst, held = 0.0, 0
-    for seed, young in enumerate((1.6e5, 2.4e5, 4.0e5)):
-        path = folder / f"simulated-{seed}.csv"
+def _other_loads_row(setting: Setting) -> list[Row]:
+    """Drawn beams, weighed with one load: how far the drops under others are off."""
+    source = source_digest(("estimation", "mechanics"), __file__, silicone_beam.__file__)
+    trials = numbers_of("beam", setting.seeds(6, 1), partial(_simulated_beam, source=source),
+                        source, setting.kept / "estimation-beam.jsonl", setting.budget,
+                        progress=setting.progress)
+    worst = max(trial.values["off"] for trial in trials)
+    held = sum(trial.values["held"] for trial in trials)
+    return [Row(*_OTHER_LOADS, f"{100 * worst:.1f} % (E's interval holds the truth: {held} of "
+                f"{len(trials)})", bool(worst <= 0.05), len(trials))]
+
+
+def _simulated_beam(seed: int, source: str) -> Numbers:
+    """Worst relative error of a drop at other loads, and whether the interval held."""
+    young = float(np.exp(np.random.default_rng(seed).uniform(*np.log(_BEAM_YOUNG_PA))))
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        branch, path = silicone_beam.made_branch(folder), folder / "simulated.csv"
         silicone_beam.simulated_recording(path, young, silicone_beam.LOAD_N, seed)
         found = silicone_beam.estimate_beam(branch, path, silicone_beam.LOAD_N, "simulated")
-        held += found.interval[0] <= young <= found.interval[1]
+        worst = 0.0
         for load in (0.0, 0.2, 1.0):
             # Markers where they should be: what is compared is the beam.
             true = silicone_beam.drop(young, load, cells=(16, 5, 5))
             foretold = silicone_beam.predicted_drop(branch, "simulated", load)
             worst = max(worst, abs(foretold / true - 1))
-    return worst, f"{held} of 3"
+    return Numbers("beam", seed, source, {
+        "off": float(worst), "held": bool(found.interval[0] <= young <= found.interval[1])})
+
+
+PARTS = {
+    "exact": Part(_paper_table, 60, (_EXACT, *_TABLE)),
+    "noise": Part(noise_rows, 90, NOISE_ROWS, grows=True),
+    "scans": Part(scan_rows, 60, SCAN_ROWS, grows=True),
+    "beam": Part(_beam_rows, 30, _BEAM),
+    "other-loads": Part(_other_loads_row, 20, (_OTHER_LOADS,), grows=True),
+    "speed": Part(_speed_rows, 120, _SPEED),
+    "depth": Part(_depth_rows, 30, (_DEPTH,), grows=True),
+    "force": Part(force_rows, 60, FORCE_ROWS, grows=True),
+    "optimiser": Part(_optimiser_rows, 60, (_OPTIMISER,))}
+"""The table, in order of importance."""

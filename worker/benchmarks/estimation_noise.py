@@ -5,20 +5,15 @@ it tells error, interval and whether the truth lies inside.
 """
 
 import time
-from collections.abc import Iterator
-from concurrent.futures import as_completed
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks import paper_branches
-from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting, share_met
 from limber.estimation.settings import EstimateSettings
-from limber.jobs import Pool
-from limber.progress import Progress
 
 SETTINGS = EstimateSettings(hold_out=False)
 PULL_COUNTS = (1, 3)
@@ -61,75 +56,58 @@ class Trial:
         return (np.array(self.low) <= 1) & (np.array(self.high) >= 1)
 
 
-def noise_rows(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Row]:
-    """Measure ``seeds`` noises of each branch; with ``kept``, a file of trials, go on with it."""
-    trials = run_trials(seeds, progress, kept, workers)
-    table = []
-    for label, asked, count in (("one pull", 0.06, 1), ("three pulls", 0.03, 3)):
-        medians = [float(np.median([trial.worst for trial in trials
-                                    if (trial.branch, trial.pulls) == (number, count)]))
-                   for number in range(len(BRANCHES))]
-        each = ", ".join(f"{branch.name} {100 * median:.1f} %"
-                         for branch, median in zip(BRANCHES, medians, strict=True))
-        table.append(Row(
-            f"1 mm, 2 % force noise, {label}: median over {seeds} seeds of the worst E error",
-            f"{100 * asked:.0f} %", each, max(medians) <= asked))
+NOISE_ROWS = (
+    Asked("1 mm, 2 % force noise, one pull: median over seeds of the worst E error", "6 %"),
+    Asked("1 mm, 2 % force noise, three pulls: median over seeds of the worst E error", "3 %"),
+    Asked("95 % intervals that cover the truth", "88 to 99 %"))
+_LIMITS = (0.06, 0.03)
+
+
+def noise_rows(setting: Setting) -> list[Row]:
+    """Measure as many noises of each branch as there is time for."""
+    seeds = setting.seeds(20, 3)
+    tasks = [(branch, seed, pulls) for seed in seeds for branch in range(len(BRANCHES))
+             for pulls in PULL_COUNTS]
+    kept = setting.kept / "estimation-noise.jsonl"
+    trials = go_on(read_trials(Trial, kept), tasks, lambda each: (each.branch, each.seed,
+                                                                  each.pulls),
+                   trial_of, _source_digest(), kept, setting.budget, None, setting.progress)
+    table = [_error_row(asked, limit, [each for each in trials if each.pulls == pulls])
+             for asked, limit, pulls in zip(NOISE_ROWS, _LIMITS, PULL_COUNTS, strict=False)]
     covered = np.concatenate([trial.covered for trial in trials])
     share = float(np.mean(covered))
-    each = ", ".join(
-        f"{branch.name} {100 * np.mean([t.covered for t in trials if t.branch == number]):.0f} %"
-        for number, branch in enumerate(BRANCHES))
-    table.append(Row("95 % intervals that cover the truth", "88 to 99 %",
-                     f"{100 * share:.1f} % of {len(covered)} ({each})",
-                     0.88 <= share <= 0.99))
-    return table
+    each = ", ".join(f"{branch.name} {100 * np.mean(held):.0f} %"
+                     for number, branch in enumerate(BRANCHES)
+                     if (held := [t.covered for t in trials if t.branch == number]))
+    return [*table, Row(*NOISE_ROWS[2], f"{100 * share:.1f} % of {len(covered)} ({each})",
+                        share_met(share, len(covered), 0.88, 0.99), len(trials))]
 
 
-def run_trials(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Trial]:
-    """All trials, those that ``kept`` has from the same estimator included."""
-    source = _source_digest()
-    known = {(t.branch, t.seed, t.pulls): t for t in read_trials(Trial, kept)
-             if t.source == source}
-    wanted = [(branch, seed) for seed in range(seeds) for branch in range(len(BRANCHES))]
-    missing = [task for task in wanted
-               if any((*task, count) not in known for count in PULL_COUNTS)]
-    done = len(wanted) - len(missing)
-    for trial in _computed(missing, workers):
-        known[trial.branch, trial.seed, trial.pulls] = trial
-        keep(trial, kept)
-        if trial.pulls == PULL_COUNTS[-1]:
-            done += 1
-            progress(done / len(wanted), "noise over seeds")
-    return [known[(*task, count)] for task in wanted for count in PULL_COUNTS]
+def _error_row(asked: Asked, limit: float, trials: list[Trial]) -> Row:
+    """The worst median of the three branches; not judged while one of them lacks."""
+    medians = {branch.name: float(np.median(worst)) for number, branch in enumerate(BRANCHES)
+               if (worst := [trial.worst for trial in trials if trial.branch == number])}
+    if not medians:
+        return asked.not_shown()
+    each = ", ".join(f"{name} {100 * median:.1f} %" for name, median in medians.items())
+    return Row(*asked, each, max(medians.values()) <= limit
+               if len(medians) == len(BRANCHES) else None, len(trials))
 
 
-def trials_of(task: tuple[int, int]) -> list[Trial]:
-    """Fit one branch under one noise: with one pull and with three."""
-    number, seed = task
+def trial_of(task: tuple[int, int, int]) -> Trial:
+    """Fit one branch under one noise, with one pull or with several."""
+    number, seed, count = task
     branch = BRANCHES[number]
     bench = Bench(branch)
-    noisy = [measured(pull, 1000 + seed) for pull in _exact_pulls(number)]
-    truth, trials = np.array(branch.young), []
-    for count in PULL_COUNTS:
-        started = time.perf_counter()
-        found = bench.fit(noisy[:count], SETTINGS)
-        low, high = (found.uncertainty.young_interval / truth[:, None]).T
-        trials.append(Trial(
-            number, seed, count, tuple(bench.errors(found).tolist()), tuple(low.tolist()),
-            tuple(high.tolist()), found.uncertainty.variance_factor,
-            found.objective.space.group_count, round(time.perf_counter() - started, 2),
-            _source_digest()))
-    return trials
-
-
-def _computed(tasks: list[tuple[int, int]], workers: int) -> Iterator[Trial]:
-    if workers < 2:
-        for task in tasks:
-            yield from trials_of(task)
-        return
-    with Pool(workers) as pool:
-        for future in as_completed([pool.submit(trials_of, task) for task in tasks]):
-            yield from future.result()
+    noisy = [measured(pull, seed) for pull in _exact_pulls(number)[:count]]
+    truth, started = np.array(branch.young), time.perf_counter()
+    found = bench.fit(noisy, SETTINGS)
+    low, high = (found.uncertainty.young_interval / truth[:, None]).T
+    return Trial(
+        number, seed, count, tuple(bench.errors(found).tolist()), tuple(low.tolist()),
+        tuple(high.tolist()), found.uncertainty.variance_factor,
+        found.objective.space.group_count, round(time.perf_counter() - started, 2),
+        _source_digest())
 
 
 _PULLS: dict[int, list] = {}
@@ -143,4 +121,4 @@ def _exact_pulls(number: int) -> list:
 
 
 def _source_digest() -> str:
-    return source_digest(("estimation",), paper_branches.__file__)
+    return source_digest(("estimation",), __file__, paper_branches.__file__)

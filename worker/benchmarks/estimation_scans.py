@@ -7,29 +7,25 @@ reconstructed, the true branch pulled, and the moduli estimated on the reconstru
 import json
 import tempfile
 import time
-from collections.abc import Iterator
-from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.kept_trials import keep, read_trials, source_digest
-from benchmarks.table import Row
+from benchmarks.budget import Budget
+from benchmarks.kept_trials import go_on, read_trials, source_digest
+from benchmarks.table import Asked, Row, Setting, share_met
 from limber.errors import LimberError
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch
-from limber.jobs import Pool
-from limber.progress import Progress
+from limber.progress import SILENT, Progress
 from limber.stages.estimate import estimate
 from limber.stages.generate import write_generated
 from limber.stages.reconstruct import reconstruct
 from limber.stages.virtual_pull import virtual_pull
 from limber.store import Branch
 
-FIRST_SEED = 8100
-"""Seeds from here on are no test's and no other bench's."""
 VIEWS = ("round", "one-sided")
 NOISES = (1e-3, 4e-4)
 """Of the scan's points [m]; seeds take turns."""
@@ -71,9 +67,16 @@ class Trial:
         return (np.array(self.low) <= 0) & (np.array(self.high) >= 0)
 
 
-def scan_rows(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Row]:
-    """Measure ``seeds`` branches, each scanned in both ways; ``kept``: go on with its trials."""
-    trials = run_trials(seeds, progress, kept, workers)
+SCAN_ROWS = (
+    Asked("reconstructed from a scan: 95 % intervals that cover the truth", "88 to 99 %"),
+    Asked("the same: error of E", "-"))
+
+
+def scan_rows(setting: Setting) -> list[Row]:
+    """Measure as many branches as there is time for, each scanned in both ways."""
+    tasks = [(seed, view) for seed in setting.seeds(20, 2) for view in VIEWS]
+    trials = run_trials(tasks, setting.kept / "estimation-scans.jsonl", setting.budget,
+                        None, setting.progress)
     return [coverage_row(trials), size_row(trials)]
 
 
@@ -87,10 +90,12 @@ def coverage_row(trials: list[Trial]) -> Row:
                      for view, held in by_view.items() if held)
     poor = sum(trial.is_poor for trial in trials)
     failed = sum(bool(trial.failure) for trial in trials)
-    return Row("reconstructed from a scan: 95 % intervals that cover the truth", "88 to 99 %",
-               f"{100 * share:.1f} % of {sum(map(len, covered))} ({told}; {poor} of {len(trials)} "
+    count = sum(map(len, covered))
+    is_met = share_met(share, count, 0.88, 0.99)
+    return Row(*SCAN_ROWS[0],
+               f"{100 * share:.1f} % of {count} ({told}; {poor} of {len(trials)} "
                f"fits say that they are poor, {failed} failed)",
-               bool(covered) and not failed and 0.88 <= share <= 0.99)
+               False if failed else is_met, len(trials))
 
 
 def size_row(trials: list[Trial]) -> Row:
@@ -107,22 +112,14 @@ def size_row(trials: list[Trial]) -> Row:
                          for name, part in zip(PARTS, parts, strict=True))
         told.append(f"{view}: median {100 * np.median(np.abs(errors)):.1f} %, "
                     f"{np.median(np.abs(over)) / 0.6745:.2f} of what is stated ({each})")
-    return Row("the same: error of E", "-", "; ".join(told), None)
+    return Row(*SCAN_ROWS[1], "; ".join(told), None, len(trials))
 
 
-def run_trials(seeds: int, progress: Progress, kept: Path | None, workers: int = 2) -> list[Trial]:
-    """All trials, those that ``kept`` has from the same sources included."""
-    source = _source_digest()
-    known = {(trial.seed, trial.view): trial for trial in read_trials(Trial, kept)
-             if trial.source == source}
-    wanted = [(FIRST_SEED + number, view) for number in range(seeds) for view in VIEWS]
-    done = sum(task in known for task in wanted)
-    for trial in _computed([task for task in wanted if task not in known], workers):
-        known[trial.seed, trial.view] = trial
-        keep(trial, kept)
-        done += 1
-        progress(done / len(wanted), "from scans to moduli")
-    return [known[task] for task in wanted]
+def run_trials(tasks: list[tuple[int, str]], kept: Path, budget: Budget,
+               workers: int | None = None, progress: Progress = SILENT) -> list[Trial]:
+    """Trials of seeds and views, those that ``kept`` has from the same sources included."""
+    return go_on(read_trials(Trial, kept), tasks, lambda trial: (trial.seed, trial.view), trial_of,
+                 _source_digest(), kept, budget, workers, progress)
 
 
 def trial_of(task: tuple[int, str]) -> Trial:
@@ -160,15 +157,6 @@ def from_scan(folder: Path, seed: int, view: str) -> dict:
     virtual_pull(branch, "pull-1", VirtualPullSettings(seed=seed))
     estimate(branch, EstimateSettings())
     return json.loads(Branch.open(branch).path("estimate.json").read_text(encoding="utf-8"))
-
-
-def _computed(tasks: list[tuple[int, str]], workers: int) -> Iterator[Trial]:
-    if workers < 2:
-        yield from map(trial_of, tasks)
-        return
-    with Pool(workers) as pool:
-        for future in as_completed([pool.submit(trial_of, task) for task in tasks]):
-            yield future.result()
 
 
 def _told(values: np.ndarray) -> tuple[float, ...]:

@@ -5,22 +5,29 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from benchmarks.table import Row
+from benchmarks.mechanics_exact import LENGTH, YOUNG, Cantilever
+from benchmarks.table import Asked, Row, Setting
+
+FELUPE = Asked("peer: felupe, same mesh, material and load (alpha 2)", "-")
+SKFEM = Asked("peer: scikit-fem, same mesh, linear elasticity (no large deflection as shipped)",
+              "-")
 
 
-def rows() -> list[Row]:
-    """Return one row a peer; one that is not installed is said to be absent."""
-    return [_felupe_row() if find_spec("felupe") else _absent("felupe"),
-            _skfem_row() if find_spec("skfem") else _absent("scikit-fem")]
+def felupe_row(_setting: Setting) -> list[Row]:
+    """Measure felupe, or say that it is not installed."""
+    return [_felupe_row() if find_spec("felupe") else _absent(FELUPE)]
 
 
-def _absent(name: str) -> Row:
-    return Row(f"peer: {name}", "-", "not installed (pip install felupe scikit-fem)", None)
+def skfem_row(_setting: Setting) -> list[Row]:
+    """Measure scikit-fem, or say that it is not installed."""
+    return [_skfem_row() if find_spec("skfem") else _absent(SKFEM)]
+
+
+def _absent(asked: Asked) -> Row:
+    return Row(*asked, "not installed (pip install felupe scikit-fem)", None, 0)
 
 
 def _problem() -> tuple:
-    from benchmarks.mechanics import LENGTH, YOUNG, Cantilever
-
     beam = Cantilever.make()
     force = 2 * YOUNG * beam.inertia / LENGTH**2
     start = time.process_time()
@@ -37,7 +44,6 @@ def _problem() -> tuple:
 def _felupe_row() -> Row:
     import felupe
 
-    from benchmarks.mechanics import YOUNG
     from limber.mechanics.materials import lame
 
     beam, loads, ours, our_seconds = _problem()
@@ -56,11 +62,10 @@ def _felupe_row() -> Row:
             felupe.newtonrhapson(items=[solid, load], dof0=dofs[0], dof1=dofs[1], verbose=0,
                                  maxiter=60, tol=1e-6)
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
-        return Row("peer: felupe, same cantilever, alpha 2", "-", f"did not converge ({error})",
-                   None)
+        return Row(*FELUPE, f"did not converge ({error})", None)
     seconds = time.process_time() - start
     moved = (beam.end.weights @ field[0].values[beam.end.nodes])[0]
-    return Row("peer: felupe, same mesh, material and load (alpha 2)", "-",
+    return Row(*FELUPE,
                f"{seconds:.1f} s against {our_seconds:.2f} s; tip differs by"
                f" {100 * abs(moved / ours - 1):.3f} %; no tangent predictor or mixed-point Newton:"
                f" {count} load steps", None)
@@ -88,7 +93,6 @@ def _skfem_row() -> Row:
     import skfem
     from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-    from benchmarks.mechanics import YOUNG
     from limber.mechanics import BranchModel, solve_static
 
     beam, loads, _, _ = _problem()
@@ -105,6 +109,5 @@ def _skfem_row() -> Row:
     solution = skfem.solve(*skfem.condense(
         stiffness, np.ones(basis.N), D=basis.get_dofs(lambda x: x[2] < 1e-9)))
     seconds = time.process_time() - start
-    return Row("peer: scikit-fem, same mesh, linear elasticity (no large deflection as shipped)",
-               "-", f"assembly and solve {seconds:.1f} s against {our_seconds:.2f} s"
+    return Row(*SKFEM, f"assembly and solve {seconds:.1f} s against {our_seconds:.2f} s"
                f" ({solution.size} unknowns, ours converged: {result.converged})", None)

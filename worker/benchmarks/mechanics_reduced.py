@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics import BranchModel, Grasp, young_weights
@@ -24,7 +24,7 @@ from limber.mechanics.reduced.training import (
     sample_poses,
     sample_young,
 )
-from limber.progress import SILENT, Progress
+from limber.progress import Progress
 from limber.session.client import InteractiveSession
 from limber.session.loading import load_held, reduced_settings
 from limber.session.settings import SessionSettings
@@ -63,6 +63,12 @@ class Errors:
     untrusted: int
     milliseconds: float
 
+    @property
+    def is_small(self) -> bool:
+        """Whether position and energy are as near as asked where E is known."""
+        return bool(np.median(self.position) <= 0.05 and self.position.max() <= 0.5
+                    and np.median(self.energy) <= 0.1 and self.energy.max() <= 2)
+
     def text(self) -> str:
         parts = [f"{name} {np.median(values):.3f} / {values.max():.2f} %" for name, values in
                  (("position", self.position), ("energy", self.energy), ("force", self.force))]
@@ -92,10 +98,26 @@ def bench_branch(spacing: float = 2.0) -> Branching:
     return Branching(model, weights, young, points, skeleton.point_at(2 / 3))
 
 
-def rows(quick: bool, progress: Progress = SILENT, out: Path | None = None) -> list[Row]:
-    """Measure the rows; ``out`` gets the raw numbers as JSON."""
+_ASKED_PINNED = "0.05 % of length / 0.5 %; 0.1 % / 2 %"
+PINNED_ROWS = (
+    Asked("reduced model, held-out pinned grasps, known E: position, energy (median / max)",
+          _ASKED_PINNED),
+    Asked("reduced model after E changed by up to a factor of 3 at each control point",
+          "0.3 % of length, 1 % energy"),
+    Asked("reduced implicit step (1/60 s), minimum / median", "1 ms at that accuracy"),
+    Asked("reduced motion against the full one, brisk half-second pull", "-"),
+    Asked("interactive session: rate; delay from move to frame as the client sees it"
+          " (median / 95 % / 99 % / max), with a jump half-way, trainer at work",
+          "60 Hz, under 20 ms"))
+CLAMPED_ROW = Asked("the same, clamped grasps (position and rotation given), known E",
+                    _ASKED_PINNED)
+
+
+def pinned_rows(setting: Setting) -> list[Row]:
+    """Measure pinned grasps and a session; the folder ``out`` gets the raw numbers as JSON."""
+    quick, progress = setting.quick, setting.progress
     branch = bench_branch()
-    bench = GraspBench(branch, "pinned", quick)
+    bench = GraspBench(branch, "pinned", setting.seed)
     count, varied = (50, 100) if quick else (120, 160)
     known = bench.train(count, 1.0, None, progress.part(0.0, 0.25))
     held_out = bench.test(10 if quick else 40, False, known, progress.part(0.25, 0.32))
@@ -111,44 +133,44 @@ def rows(quick: bool, progress: Progress = SILENT, out: Path | None = None) -> l
     progress(0.75, "running a session")
     session = run_session(bench, reduced, known.for_known_young(), 4.0 if quick else 15.0)
     found = [
-        Row("reduced model, held-out pinned grasps, known E: position, energy (median / max)",
-            "0.05 % of length / 0.5 %; 0.1 % / 2 %", exact.text(),
-            bool(np.median(exact.position) <= 0.05 and exact.position.max() <= 0.5
-                 and np.median(exact.energy) <= 0.1 and exact.energy.max() <= 2)),
-        Row("reduced model after E changed by up to a factor of 3 at each control point",
-            "0.3 % of length, 1 % energy", changed.text(),
-            bool(np.median(changed.position) <= 0.3 and np.median(changed.energy) <= 1)),
-        Row("reduced implicit step (1/60 s), minimum / median", "1 ms at that accuracy",
+        Row(*PINNED_ROWS[0], exact.text(), exact.is_small, len(exact.position)),
+        Row(*PINNED_ROWS[1], changed.text(),
+            bool(np.median(changed.position) <= 0.3 and np.median(changed.energy) <= 1),
+            len(changed.position)),
+        Row(*PINNED_ROWS[2],
             f"{_step_text(motion)} ({reduced.size} coordinates, known E); "
             f"{_step_text(wide_motion)} ({wide.size}, E changed)",
             bool(_typical(motion) <= 1.0 and _typical(wide_motion) <= 1.0)),
-        Row("reduced motion against the full one, brisk half-second pull", "-", motion_error, None),
-        Row("interactive session: rate; delay from move to frame as the client sees it"
-            " (median / 95 % / 99 % / max), with a jump half-way, trainer at work",
-            "60 Hz, under 20 ms", session[0], session[1])]
-    if not quick:
-        found.append(_clamped_row(branch, progress.part(0.8, 1.0)))
-    if out is not None:
+        Row(*PINNED_ROWS[3], motion_error, None),
+        Row(*PINNED_ROWS[4], *session)]
+    if setting.out is not None:
         content = {"tets": branch.model.mesh.tet_count, "rows": [vars(row) for row in found]}
-        (out / "mechanics_reduced.json").write_text(json.dumps(content, indent=1))
-    progress(1.0, "done")
+        (setting.out / "mechanics_reduced.json").write_text(json.dumps(content, indent=1))
     return found
+
+
+def clamped_rows(setting: Setting) -> list[Row]:
+    """Measure clamped grasps: the position and the rotation are given."""
+    bench = GraspBench(bench_branch(), "clamped", setting.seed)
+    known = bench.train(setting.at_most(200, 100), 1.0, None, setting.progress.part(0.0, 0.7))
+    errors = measure(bench.reduce(known.for_known_young(), CLAMPED), bench.test(
+        setting.at_most(30, 10), False, known, setting.progress.part(0.8, 0.95)))
+    return [Row(*CLAMPED_ROW, errors.text(), errors.is_small, len(errors.position))]
 
 
 class GraspBench:
     """One grasp of the branch, its training and its test grasps."""
 
-    def __init__(self, branch: Branching, mode: str, quick: bool):
-        self.branch, self.quick = branch, quick
+    def __init__(self, branch: Branching, mode: str, seed: int):
+        self.branch = branch
         self.grasp = branch.grasp(mode)
         self.trainer = Trainer(branch.model, self.grasp, branch.weights, branch.young)
-        self.seed = 1
+        self._base, self._draws = seed, 0
 
     def train(self, count: int, spread: float, known: Snapshots | None,
               progress: Progress) -> Snapshots:
         settings = TrainingSettings(grasp_count=count)
-        rng = np.random.default_rng(self.seed)
-        self.seed += 1
+        rng = self._generator()
         poses = sample_poses(self.branch.model, self.grasp, count, rng, settings)
         young = np.repeat(self.branch.young[None], count, axis=0)
         if spread > 1:
@@ -157,11 +179,16 @@ class GraspBench:
                                  vibration_count=4, progress=progress)
 
     def test(self, count: int, change: bool, known: Snapshots, progress: Progress) -> Snapshots:
-        rng = np.random.default_rng(99)
+        rng = self._generator()
         poses = sample_poses(self.branch.model, self.grasp, count, rng, TrainingSettings())
         young = sample_young(self.branch.young, 2 * count, rng, 3.0)[1::2] if change else \
             np.repeat(self.branch.young[None], count, axis=0)
         return self.trainer.take(poses, young, known, progress=progress)
+
+    def _generator(self) -> np.random.Generator:
+        """One that no earlier draw had."""
+        self._draws += 1
+        return np.random.default_rng([self._base, 53, self._draws])
 
     def reduce(self, snapshots: Snapshots, settings: ReducedSettings) -> ReducedModel:
         branch = self.branch
@@ -307,17 +334,6 @@ def _watch(session: InteractiveSession, until: float, sent: dict[int, float], se
                 delays.append(time.perf_counter() - sent[seen])
         time.sleep(0.0005)
     return seen
-
-
-def _clamped_row(branch: Branching, progress: Progress) -> Row:
-    bench = GraspBench(branch, "clamped", False)
-    known = bench.train(200, 1.0, None, progress.part(0.0, 0.7))
-    errors = measure(bench.reduce(known.for_known_young(), CLAMPED),
-                     bench.test(30, False, known, progress.part(0.8, 0.95)))
-    return Row("the same, clamped grasps (position and rotation given), known E",
-               "0.05 % of length / 0.5 %; 0.1 % / 2 %", errors.text(),
-               bool(np.median(errors.position) <= 0.05 and errors.position.max() <= 0.5
-                    and np.median(errors.energy) <= 0.1 and errors.energy.max() <= 2))
 
 
 def _typical(motion: ReducedMotion) -> float:

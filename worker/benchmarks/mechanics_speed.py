@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.mechanics import DENSITY, LENGTH, YOUNG
+from benchmarks.mechanics_exact import DENSITY, LENGTH, YOUNG
 from benchmarks.mechanics_reduced import bench_branch
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.jobs import Pool
@@ -25,19 +25,18 @@ from limber.mechanics import (
     simulate_dynamics,
     solve_static,
 )
-from limber.progress import SILENT, Progress
 
-
-def rows(quick: bool, progress: Progress = SILENT) -> list[Row]:
-    """Measure; ``quick`` takes fewer grasps and the smaller meshes."""
-    steps: list[Callable[[], list[Row]]] = [
-        lambda: speed_rows(quick), lambda: [linear_row()], lambda: [grasp_row(quick)],
-        lambda: [memory_row(quick)]]
-    found = []
-    for number, step in enumerate(steps):
-        progress(number / len(steps), "measuring")
-        found += step()
-    return found
+SPEED_ROWS = (
+    Asked("assembly of stiffness and force, 2,800 quadratic tetrahedra, one thread",
+          "under 30 % of the factorisation"),
+    Asked("converged implicit step, same mesh, dt 1/60",
+          "under 3.2 times (assembly + factorisation + solve)"),
+    Asked("converged implicit steps, 1,000 quadratic tetrahedra", "40 steps a second"))
+LINEAR = Asked("linear tetrahedra, one-Newton step, 7,500 tetrahedra",
+               "12 ms where the prototype took 11.6")
+GRASPS = Asked("300 random grasps to 40 % of the length, full model, one process",
+               "105 s; no false equilibrium")
+MEMORY = Asked("memory at 50,000 quadratic tetrahedra", "4 GB, and it solves")
 
 
 def bench_mesh(spacing: float) -> TetMesh:
@@ -132,7 +131,7 @@ def _stepping(model: BranchModel, count: int = 40) -> tuple[float, float]:
     return best, iterations
 
 
-def speed_rows(quick: bool) -> list[Row]:
+def speed_rows(setting: Setting) -> list[Row]:
     """Assembly against factorisation, converged steps."""
     found = []
     model = _branch_model(_sized_mesh(2800))
@@ -140,23 +139,22 @@ def speed_rows(quick: bool) -> list[Row]:
     ratio = 100 * parts.assembly / parts.factorisation
     count = model.mesh.tet_count
     found.append(Row(
-        f"assembly of stiffness and force, {count} quadratic tetrahedra, one thread",
-        "under 30 % of the factorisation",
-        f"{ratio:.0f} % ({1e3 * parts.assembly:.1f} of {1e3 * parts.factorisation:.1f} ms;"
+        *SPEED_ROWS[0],
+        f"{ratio:.0f} % ({count} tetrahedra; {1e3 * parts.assembly:.1f} of"
+        f" {1e3 * parts.factorisation:.1f} ms;"
         f" CHOLMOD, which the row was set for, takes {1e3 * general:.1f} ms:"
         f" {100 * parts.assembly / general:.0f} %; prototype 7.1 of 27.1)", bool(ratio < 30)))
-    step, iterations = _stepping(model, 20 if quick else 40)
+    step, iterations = _stepping(model, setting.at_most(40, 20))
     units = step / parts.total
     found.append(Row(
-        "converged implicit step, same mesh, dt 1/60",
-        "under 3.2 times (assembly + factorisation + solve)",
+        *SPEED_ROWS[1],
         f"{units:.2f} times ({1e3 * step:.0f} ms, {iterations:.1f} iterations, residual 1e-4;"
         " prototype 91 ms)", bool(units < 3.2)))
     small = _branch_model(_sized_mesh(1000))
-    step, _ = _stepping(small, 20 if quick else 40)
+    step, _ = _stepping(small, setting.at_most(40, 20))
     found.append(Row(
-        f"converged implicit steps, {small.mesh.tet_count} quadratic tetrahedra",
-        "40 steps a second", f"{1 / step:.0f} a second (prototype 35)", bool(1 / step >= 40)))
+        *SPEED_ROWS[2], f"{1 / step:.0f} a second ({small.mesh.tet_count} tetrahedra; "
+        "prototype 35)", bool(1 / step >= 40)))
     return found
 
 
@@ -164,7 +162,7 @@ def _branch_model(mesh: TetMesh) -> BranchModel:
     return BranchModel(mesh, young=YOUNG, poisson=0.35, density=DENSITY, gravity=None)
 
 
-def linear_row() -> Row:
+def linear_row(_setting: Setting) -> list[Row]:
     """One Newton step in time with linear tetrahedra."""
     mesh = _sized_mesh(7500).linear()
     model = _branch_model(mesh)
@@ -178,19 +176,18 @@ def linear_row() -> Row:
         tangent.solve(right - model.mass_matrix @ zero)
 
     seconds = least_seconds(step)
-    return Row(f"linear tetrahedra, one-Newton step, {mesh.tet_count} tetrahedra",
-               "12 ms where the prototype took 11.6", f"{1e3 * seconds:.1f} ms",
-               bool(seconds <= 0.012))
+    return [Row(*LINEAR, f"{1e3 * seconds:.1f} ms ({mesh.tet_count} tetrahedra)",
+                bool(seconds <= 0.012))]
 
 
-def grasp_row(quick: bool) -> Row:
+def grasp_row(setting: Setting) -> list[Row]:
     """Random grasps to 40 % of the length by the full model, each solved on two paths."""
-    count = 40 if quick else 300
+    count = setting.at_most(300, 40)
     model = _branch_model(_sized_mesh(2800))
     reach = 2 / 3 * LENGTH
     grasp = Grasp.at(model.mesh, model.mesh.nodes[_node_at(model.mesh, reach)], 0.0, "pinned")
     poses = np.array([np.concatenate([grasp.centre + move, np.zeros(3)])
-                      for move in _tour(grasp.centre, count)])
+                      for move in _tour(grasp.centre, count, setting.generator(52))])
     start = time.process_time()
     results = follow_poses(model, grasp, poses)
     seconds = time.process_time() - start
@@ -204,9 +201,8 @@ def grasp_row(quick: bool) -> Row:
     measured = (f"{seconds:.0f} s for {count} ({seconds * 300 / count:.0f} s for 300; prototype"
                 f" 104); {failed} failed; min det F {lowest:.2f}; energy on the way back differs"
                 f" by {max(off):.1e} at most; {false} higher than there")
-    return Row("300 random grasps to 40 % of the length, full model, one process",
-               "105 s; no false equilibrium", measured,
-               bool(seconds * 300 / count <= 105 and not false and lowest > 0 and not failed))
+    return [Row(*GRASPS, measured, bool(
+        seconds * 300 / count <= 105 and not false and lowest > 0 and not failed), count)]
 
 
 def _node_at(mesh: TetMesh, height: float) -> int:
@@ -215,9 +211,8 @@ def _node_at(mesh: TetMesh, height: float) -> int:
     return int(main[np.abs(np.linalg.norm(mesh.nodes[main], axis=1) - height).argmin()])
 
 
-def _tour(centre: np.ndarray, count: int) -> np.ndarray:
+def _tour(centre: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return reachable random moves [m] in the order of nearest neighbours, [count, 3]."""
-    rng = np.random.default_rng(0)
     moves: list[np.ndarray] = []
     while len(moves) < count:
         move = rng.standard_normal(3)
@@ -234,15 +229,15 @@ def _tour(centre: np.ndarray, count: int) -> np.ndarray:
     return np.array([moves[k] for k in order])
 
 
-def memory_row(quick: bool) -> Row:
+def memory_row(setting: Setting) -> list[Row]:
     """A static solve with 50,000 quadratic tetrahedra, in a process of its own."""
-    count = 10_000 if quick else 50_000
+    count = setting.at_most(50_000, 10_000)
     with Pool(1) as pool:
         found, megabytes, seconds, converged = pool.submit(_solve_large, count).result()
-    return Row("memory at 50,000 quadratic tetrahedra", "4 GB, and it solves",
-               f"{megabytes / 1024:.2f} GB at {found} tetrahedra,"
-               f" {'solved' if converged else 'not solved'} in {seconds:.0f} s",
-               bool(converged and megabytes < 4096 and found >= 45_000) if not quick else None)
+    is_met = None if setting.quick else bool(
+        converged and megabytes < 4096 and found >= 45_000)
+    return [Row(*MEMORY, f"{megabytes / 1024:.2f} GB at {found} tetrahedra,"
+                f" {'solved' if converged else 'not solved'} in {seconds:.0f} s", is_met)]
 
 
 def _solve_large(count: int) -> tuple[int, float, float, bool]:

@@ -171,8 +171,10 @@ def rows_of(parts: dict[str, Part], setting: Setting, only: Sequence[str] = (),
             continue
         progress = setting.progress.part(number / len(chosen), (number + 1) / len(chosen))
         progress(0.0, name)
+        began = setting.budget.clock()
         found = _tried(name, part, replace(setting, budget=setting.budget.part(seconds),
                                            progress=progress))
+        print(f"{name}: {setting.budget.clock() - began:.0f} s", flush=True)
         failed += 0 if found else len(part.gives)
         table += found or [Row(*asked, "failed, see above", False, 0) for asked in part.gives]
     return table, failed

@@ -1,91 +1,61 @@
 """Estimates against truths drawn anew: what was asked of them, what comes out."""
 
-from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
 from benchmarks import truth_beam, truth_branch, truth_scans, truth_states, truth_trials
-from benchmarks.kept_trials import keep, read_trials, source_digest
-from benchmarks.table import Row
-from benchmarks.truth_recordings import bad_recordings_row
+from benchmarks.kept_trials import go_on, read_trials, source_digest
+from benchmarks.table import Asked, Part, Row, Setting, share_met
+from benchmarks.truth_recordings import BAD_RECORDINGS, bad_recordings_row
 from benchmarks.truth_trials import Trial, trial
-from limber.progress import Progress
 from limber.recordings.calibration import CalibrationEntry
 
 CELL = CalibrationEntry()
 CALIBRATED = CalibrationEntry(pose_sigma_m=2e-4, pose_sigma_rad=3.5e-3)
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
-         only: tuple[str, ...] = ()) -> list[Row]:
-    """Measure the parts named in ``only``, or all; ``seed`` is the base of all that is drawn.
-
-    With ``out`` each trial is kept in ``truth-trials.jsonl`` and ``truth-scans.jsonl``: a run of
-    the same seed that was stopped goes on there.
-    """
-    table, chosen = [], only or tuple(PARTS)
-    for number, name in enumerate(chosen):
-        part = progress.part(number / len(chosen), (number + 1) / len(chosen))
-        table += PARTS[name](quick, part, out, seed)
-    return table
+def _asked(label: str, error: str) -> tuple[Asked, ...]:
+    return (Asked(f"{label}: median of the worst E error", error),
+            Asked(f"{label}: 95 % intervals that hold the truth", "90 to 99 %"),
+            Asked(f"{label}: median half width of the intervals, over the Cramer-Rao bound of the "
+                  "problem", "1.5"))
 
 
-def _one_pull(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    return _cell_rows("one pull; sensor noise, force gain 2 %, zero and drift 1 N, gripper 1 mm "
-                      "and 1 degree, camera 1 mm, density 10 %, nu 0.05, another form of the "
-                      "field", _trials(4 if quick else 60, progress, out, (seed, 1), CELL, 1),
-                      0.12, quick)
+_ONE_PULL = _asked("one pull; sensor noise, force gain 2 %, zero and drift 1 N, gripper 1 mm "
+                   "and 1 degree, camera 1 mm, density 10 %, nu 0.05, another form of the field",
+                   "12 %")
+_THREE_PULLS = _asked("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees", "6 %")
 
 
-def _three_pulls(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    return _cell_rows("three pulls, gripper calibrated to 0.2 mm and 0.2 degrees", _trials(
-        2 if quick else 20, progress, out, (seed, 2), CALIBRATED, 3), 0.06, quick)
+def _one_pull(setting: Setting) -> list[Row]:
+    trials = _trials(setting, 1, setting.at_most(60, 4), CELL, 1)
+    return _cell_rows(_ONE_PULL, trials, 0.12)
 
 
-def _scans(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    kept = out / "truth-scans.jsonl" if out else None
-    return [truth_scans.scan_row(2 if quick else 30, progress, kept, seed)]
+def _three_pulls(setting: Setting) -> list[Row]:
+    trials = _trials(setting, 2, setting.at_most(20, 2), CALIBRATED, 3)
+    return _cell_rows(_THREE_PULLS, trials, 0.06)
 
 
-PARTS: dict[str, Callable[[bool, Progress, Path | None, int], list[Row]]] = {
-    "one-pull": _one_pull, "three-pulls": _three_pulls, "scans": _scans,
-    "bad-recordings": lambda quick, progress, out, seed: [bad_recordings_row(progress, seed)],
-    "beam": lambda quick, progress, out, seed: truth_beam.rows(progress, seed),
-    "sag": lambda quick, progress, out, seed: [
-        truth_beam.sag_row(4 if quick else 20, progress, seed)],
-    "swing": lambda quick, progress, out, seed: [
-        truth_states.swing_row(quick, progress, np.random.default_rng([seed, 11]))],
-    "reduced": lambda quick, progress, out, seed: truth_states.doubt_rows(
-        quick, progress, np.random.default_rng([seed, 12])),
-    "second-pull": lambda quick, progress, out, seed: truth_states.quick_rows(
-        np.random.default_rng([seed, 13]))}
-"""What ``--only`` knows."""
-
-
-def _trials(count: int, progress: Progress, out: Path | None, seed: tuple[int, ...],
-            cell: CalibrationEntry, pull_count: int) -> list[Trial]:
-    kept = out / "truth-trials.jsonl" if out else None
+def _trials(setting: Setting, kind: int, count: int, cell: CalibrationEntry, pull_count: int,
+            ) -> list[Trial]:
+    kept = setting.kept / "truth-trials.jsonl"
     source = source_digest(("estimation", "mechanics"), __file__, truth_trials.__file__,
                            truth_branch.__file__)
-    known = {each.seed: each for each in read_trials(Trial, kept) if each.source == source}
-    found = []
-    for number in range(count):
-        progress(number / count, f"trial {number + 1} of {count}")
-        each = known.get((*seed, number))
-        if each is None:
-            each = trial((*seed, number), cell, pull_count, source=source)
-            keep(each, kept)
-        found.append(each)
-    return found
+    tasks = [(setting.seed, kind, number) for number in range(count)]
+    work = partial(trial, calibration=cell, pull_count=pull_count, source=source)
+    return go_on(read_trials(Trial, kept), tasks, lambda each: each.seed, work, source, kept,
+                 setting.budget, None, setting.progress)
 
 
-def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> list[Row]:
+def _cell_rows(asked: tuple[Asked, ...], trials: list[Trial], limit: float) -> list[Row]:
     """Error, coverage and width of a kind of trial."""
+    count = len(trials)
     fitted = [each for each in trials if not each.message]
     if not fitted:
-        return [Row(f"{label}: estimates", "some", f"{len(trials)} of {len(trials)} refused: "
-                    f"{trials[0].message}", False)]
+        return [Row(*each, f"{count} of {count} refused: {trials[0].message}", False, count)
+                for each in asked]
     # A refusal is no small error.
     worst = [float(np.abs(each.errors).max()) if each.errors else np.inf for each in trials]
     covered = np.concatenate([each.covered for each in fitted])
@@ -93,22 +63,19 @@ def _cell_rows(label: str, trials: list[Trial], asked: float, quick: bool) -> li
     width = np.median([each.widths for each in fitted])
     share, median = float(covered.mean()), float(np.median(worst))
     ninth = float(np.quantile(worst, 0.9, method="lower"))
-    refused = len(trials) - len(fitted)
-    told = f", {refused} refused" if refused else ""
+    refused = count - len(fitted)
+    told = f"; {refused} refused" if refused else ""
     told += f"; as good as the data allow: {_efficient([each.bound for each in fitted])}"
     told += (", were the form of the field known: "
              f"{_efficient([each.bound_of_known_form for each in fitted])}")
-    enough = not quick
     return [
-        Row(f"{label}: median of the worst E error", f"{100 * asked:.0f} %",
-            f"{100 * median:.1f} % (90 % of trials under {100 * ninth:.0f} %; "
-            f"{len(trials)} trials{told})", median <= asked),
-        Row("95 % intervals that hold the truth", "90 to 99 %",
-            f"{100 * share:.1f} % of {covered.size}",
-            bool(0.9 <= share <= 0.99) if enough else None),
-        Row("median half width of the intervals, over the Cramer-Rao bound of the problem",
-            "1.5", f"{100 * width:.0f} %, {np.nanmedian(ratio):.2f} (worst {np.nanmax(ratio):.2f})",
-            bool(np.nanmedian(ratio) <= 1.5))]
+        Row(*asked[0], f"{100 * median:.1f} % (90 % of trials under {100 * ninth:.0f} %{told})",
+            median <= limit, count),
+        Row(*asked[1], f"{100 * share:.1f} % of {covered.size}",
+            share_met(share, covered.size, 0.90, 0.99), len(fitted)),
+        Row(*asked[2],
+            f"{100 * width:.0f} %, {np.nanmedian(ratio):.2f} (worst {np.nanmax(ratio):.2f})",
+            bool(np.nanmedian(ratio) <= 1.5), len(fitted))]
 
 
 def _half_widths(trial: Trial) -> np.ndarray:
@@ -133,3 +100,17 @@ def _efficient(bounds: list[tuple]) -> str:
     drawn = np.random.default_rng(0).standard_normal((1000, len(covariance), 4, 1))
     errors = np.expm1(np.linalg.cholesky(covariance) @ drawn)
     return f"{100 * np.median(np.abs(errors).max(axis=(-2, -1))):.1f} %"
+
+
+PARTS = {
+    "one-pull": Part(_one_pull, 40, _ONE_PULL, grows=True),
+    "scans": Part(truth_scans.scan_row, 60, (truth_scans.SCAN_ROW,), grows=True),
+    "three-pulls": Part(_three_pulls, 120, _THREE_PULLS, grows=True),
+    "bad-recordings": Part(bad_recordings_row, 30, (BAD_RECORDINGS,)),
+    "beam": Part(truth_beam.beam_rows, 60, truth_beam.BEAM_ROWS),
+    "real-beam": Part(truth_beam.real_row, 60, (truth_beam.REAL_ROW,)),
+    "sag": Part(truth_beam.sag_row, 20, (truth_beam.SAG_ROW,), grows=True),
+    "swing": Part(truth_states.swing_row, 30, (truth_states.SWING_ROW,)),
+    "second-pull": Part(truth_states.quick_rows, 120, truth_states.QUICK_ROWS),
+    "reduced": Part(truth_states.doubt_rows, 240, truth_states.DOUBT_ROWS)}
+"""The table, in order of importance."""

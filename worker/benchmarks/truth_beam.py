@@ -1,15 +1,17 @@
 """Estimates of a hung beam: over meshes, from the real recording, and drops under other loads."""
 
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from benchmarks import silicone_beam
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.silicone_beam import BeamResult
-from benchmarks.table import Row
-from limber.errors import LimberError
+from benchmarks.table import Asked, Row, Setting
+from limber.errors import Cancelled, LimberError
 from limber.estimation.settings import EstimateSettings, PredictSettings, SwingSettings
 from limber.geometry.sections import Sections, mesh_sections, read_sections
 from limber.geometry.settings import MeshSurfaceSettings
@@ -19,7 +21,6 @@ from limber.mechanics.added import PointMass
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.progress import Progress
 from limber.recordings.settings import ImportSettings
 from limber.recordings.streams import Stream, write_stream
 from limber.stages.estimate import estimate
@@ -39,9 +40,22 @@ LEAST_SAG = 0.01
 """Of the length: what sags less shows no modulus to 5 % in markers of 0.2 mm."""
 
 
-def rows(progress: Progress, seed: int) -> list[Row]:
-    """Measure everything; ``seed`` draws the simulated recordings."""
-    rng = np.random.default_rng([seed, 41])
+BEAM_ROWS = (
+    Asked("mesh refinement of clamp and grasp: E of one recording over three meshes", "0.7 %"),
+    Asked("drops under other loads, simulated recordings", "3 % and inside their interval"))
+SAG_ROW = Asked("tapered beam with elliptic sections under its own weight (by 1 % of its length "
+                "and more)", "5 %, covered")
+REAL_ROW = Asked(
+    "silicone beam: static and dynamic E of the given recording",
+    "intervals overlap and hold what other programs found: 264, 264 to 295, 283 kPa, or it is "
+    "said why not")
+SWING_ROW = Asked("silicone beam: E of the swing's dynamic fit against the static fit's",
+                  "intervals overlap; damping with interval")
+
+
+def beam_rows(setting: Setting) -> list[Row]:
+    """One simulated recording over three meshes, and drops under other loads."""
+    rng = setting.generator(41)
     young = float(np.exp(rng.uniform(np.log(1.8e5), np.log(4e5))))
     drawn = int(rng.integers(2**31))
     with tempfile.TemporaryDirectory() as temporary:
@@ -50,11 +64,9 @@ def rows(progress: Progress, seed: int) -> list[Row]:
                                           silicone_beam.LOAD_N, drawn)
         found = []
         for number, cells in enumerate(MESHES):
-            progress(number / 4, "one recording over three meshes")
+            setting.progress(number / len(MESHES), "one recording over three meshes")
             found.append(_estimated(folder, cells))
-        table = [_refinement_row(found), _drop_row(folder, young, drawn)]
-        progress(0.8, "the real beam")
-        return [*table, real_row(folder)]
+        return [_refinement_row(found), _drop_row(folder, young, drawn)]
 
 
 def _estimated(folder: Path, cells: tuple[int, int, int]) -> dict:
@@ -103,10 +115,9 @@ def _refinement_row(found: list[dict]) -> Row:
     young = np.array([each["young_pa"][0] for each in found])
     spread = float(np.ptp(young) / young.mean())
     each = ", ".join(f"{value / 1e3:.1f}" for value in young)
-    return Row("mesh refinement of clamp and grasp: E of one recording over three meshes",
-               "0.7 %", f"{100 * spread:.2f} % ({each} kPa on "
+    return Row(*BEAM_ROWS[0], f"{100 * spread:.2f} % ({each} kPa on "
                f"{', '.join(str(6 * int(np.prod(cells))) for cells in MESHES)} tetrahedra)",
-               bool(spread <= 0.007))
+               bool(spread <= 0.007), len(found))
 
 
 def _drop_row(folder: Path, young: float, drawn: int) -> Row:
@@ -123,30 +134,39 @@ def _drop_row(folder: Path, young: float, drawn: int) -> Row:
         worst = max(worst, abs(drop / truth - 1))
         told.append(f"{load:g} N {1e3 * drop:.2f} of {1e3 * truth:.2f} mm "
                     f"({1e3 * low:.2f} to {1e3 * high:.2f})")
-    return Row("drops under other loads, simulated recordings", "3 % and inside their interval",
+    return Row(*BEAM_ROWS[1],
                f"{100 * worst:.1f} %, {held} of {len(OTHER_LOADS_N)} inside: {'; '.join(told)}",
-               bool(worst <= 0.03 and held == len(OTHER_LOADS_N)))
+               bool(worst <= 0.03 and held == len(OTHER_LOADS_N)),
+               len(OTHER_LOADS_N))
 
 
-def sag_row(count: int, progress: Progress, seed: int) -> Row:
+def sag_row(setting: Setting) -> list[Row]:
     """Drawn beams of elliptic sections, thinner outwards, that sag under their own weight."""
-    errors, held, refused = [], 0, []
-    for number in range(count):
-        progress(number / count, f"a drawn beam sags, {number + 1} of {count}")
-        with tempfile.TemporaryDirectory() as folder:
-            try:
-                error, is_held = _sagging(Path(folder), np.random.default_rng([seed, 42, number]))
-            except LimberError as refusal:
-                refused.append(str(refusal)[:80])
-                continue
-        errors.append(error)
-        held += is_held
+    source = source_digest(("estimation", "mechanics", "geometry"), __file__)
+    trials = numbers_of("sag", setting.seeds(40, 4), partial(_sag_trial, source=source), source,
+                        setting.kept / "truth-sag.jsonl", setting.budget, None, setting.progress)
+    count = len(trials)
+    refused = [each.values["refused"] for each in trials if "refused" in each.values]
+    fitted = [each.values for each in trials if "refused" not in each.values]
+    errors, held = [each["error"] for each in fitted], sum(each["held"] for each in fitted)
     worst = 100 * max(errors, default=np.inf)
-    return Row("tapered beam with elliptic sections under its own weight (by 1 % of its length "
-               "and more)", "5 %, covered",
-               f"worst {worst:.1f} %, median {100 * np.median(errors or [np.inf]):.1f} %, "
-               f"{held} of {count} covered{'; '.join(['', *refused[:2]])}",
-               bool(worst <= 5 and held >= np.ceil(0.88 * count) and not refused))
+    return [Row(*SAG_ROW, f"worst {worst:.1f} %, median "
+                f"{100 * np.median(errors or [np.inf]):.1f} %, "
+                f"{held} of {count} covered{'; '.join(['', *refused[:2]])}",
+                bool(worst <= 5 and held >= np.ceil(0.88 * count) and not refused), count)]
+
+
+def _sag_trial(seed: int, source: str) -> Numbers:
+    """Error of E and whether its interval holds the truth, or why there is no estimate."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            error, is_held = _sagging(Path(folder), np.random.default_rng([seed, 42]))
+        except Cancelled:
+            # Stopped from outside: no trial.
+            raise
+        except LimberError as refusal:
+            return Numbers("sag", seed, source, {"refused": str(refusal)[:80]})
+    return Numbers("sag", seed, source, {"error": float(error), "held": is_held})
 
 
 def _sagging(folder: Path, rng: np.random.Generator) -> tuple[float, bool]:
@@ -206,24 +226,21 @@ def _drawn_table(path: Path, rng: np.random.Generator) -> Sections:
     return read_sections(path, "mm")
 
 
-def real_row(folder: Path) -> Row:
+def real_row(_setting: Setting) -> list[Row]:
     """Both moduli of the given recording against those that other programs found."""
-    measure = "silicone beam: static and dynamic E of the given recording"
-    asked = ("intervals overlap and hold what other programs found: 264, 264 to 295, 283 kPa, or "
-             "it is said why not")
     if not silicone_beam.RECORDING.is_file():
-        return Row(measure, asked, "the recording is not here", None)
-    found, swung = _of_the_recording(folder)
+        return [Row(*REAL_ROW, "the recording is not here", None, 0)]
+    found, swung = _of_the_recording()
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     values = list(dict.fromkeys(value for each in OTHERS_PA for value in each))
     beyond = [value for value in values if not low <= value <= high]
     unheld = [value for value in values if not soft <= value <= stiff]
     told = "".join(_why_not_at_rest(value, found.measured_drop) for value in beyond)
-    return Row(measure, asked, f"{_told(found, swung)}; outside the dynamic one: "
-               f"{', '.join(f'{value / 1e3:.0f}' for value in unheld) or 'none'}{told}"
-               f"; drop {1e3 * found.simulated_drop:.2f} of {1e3 * found.measured_drop:.2f} mm",
-               not unheld and max(low, soft) <= min(high, stiff)
-               and (not beyond or silicone_beam.creep() > 0))
+    return [Row(*REAL_ROW, f"{_told(found, swung)}; outside the dynamic one: "
+                f"{', '.join(f'{value / 1e3:.0f}' for value in unheld) or 'none'}{told}"
+                f"; drop {1e3 * found.simulated_drop:.2f} of {1e3 * found.measured_drop:.2f} mm",
+                not unheld and max(low, soft) <= min(high, stiff)
+                and (not beyond or silicone_beam.creep() > 0))]
 
 
 def _why_not_at_rest(young: float, measured: float) -> str:
@@ -238,28 +255,30 @@ def _why_not_at_rest(young: float, measured: float) -> str:
             f"{100 * silicone_beam.creep():.1f} % over the last three seconds (it creeps)")
 
 
-def swing_row(folder: Path) -> Row:
+def swing_row(_setting: Setting) -> list[Row]:
     """Whether the swing of the given recording tells the modulus that its rest tells."""
-    measure = "silicone beam: E of the swing's dynamic fit against the static fit's"
-    asked = "intervals overlap; damping with interval"
     if not silicone_beam.RECORDING.is_file():
-        return Row(measure, asked, "the recording is not here", None)
-    found, swung = _of_the_recording(folder)
+        return [Row(*SWING_ROW, "the recording is not here", None, 0)]
+    found, swung = _of_the_recording()
     (low, high), (soft, stiff) = found.interval, swung["young_interval_pa"]
     least, most = swung["damping_ratio_interval"]
-    return Row(measure, asked, _told(found, swung), max(low, soft) <= min(high, stiff)
-               and 0 < least < swung["damping_ratio"] < most)
+    return [Row(*SWING_ROW, _told(found, swung), max(low, soft) <= min(high, stiff)
+                and 0 < least < swung["damping_ratio"] < most)]
 
 
-def _of_the_recording(folder: Path) -> tuple[BeamResult, dict[str, Any]]:
+def _of_the_recording() -> tuple[BeamResult, dict[str, Any]]:
     """Its place of rest, on the mesh of its surface, and its swing, on coarse bricks: quick, and
     corrected by what they are too stiff by."""
-    (folder / "swing").mkdir()
-    bricks = _bricks(folder / "swing", SWING_MESH)
-    _imported(bricks, silicone_beam.RECORDING, "swing", "swing")
-    swung = swing(bricks.folder, SwingSettings(poisson=silicone_beam.POISSON, density_sigma=0.02))
-    return silicone_beam.estimate_beam(silicone_beam.made_branch(folder), silicone_beam.RECORDING,
-                                       silicone_beam.LOAD_N, "csv"), swung
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        (folder / "swing").mkdir()
+        bricks = _bricks(folder / "swing", SWING_MESH)
+        _imported(bricks, silicone_beam.RECORDING, "swing", "swing")
+        swung = swing(bricks.folder, SwingSettings(poisson=silicone_beam.POISSON,
+                                                   density_sigma=0.02))
+        return silicone_beam.estimate_beam(
+            silicone_beam.made_branch(folder), silicone_beam.RECORDING, silicone_beam.LOAD_N,
+            "csv"), swung
 
 
 def _told(found: BeamResult, swung: dict[str, Any]) -> str:

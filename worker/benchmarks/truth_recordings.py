@@ -16,13 +16,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.paper_branches import PaperBranch
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.cli import call
 from limber.geometry.tets.marks import mark
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.statics.solve import solve_static
-from limber.progress import Progress
 from limber.recordings.grasping import grasp_on
 from limber.recordings.recording import GraspEntry
 from limber.recordings.streams import Stream, write_stream
@@ -59,22 +58,20 @@ class Rig:
         return self.folder / "hung.branch"
 
 
-def bad_recordings_row(progress: Progress, seed: int) -> Row:
+def bad_recordings_row(setting: Setting) -> list[Row]:
     """Every bad recording that the issue names, and a good one that must pass."""
     with tempfile.TemporaryDirectory() as folder:
-        rig = made_rig(Path(folder), np.random.default_rng([seed, 31]))
+        rig = made_rig(Path(folder), setting.generator(31))
         good = _imported(rig)
         wrong = [] if good[0] == 0 else [f"a good one: exit {good[0]}"]
         for number, (name, words, run) in enumerate(CASES):
-            progress(number / len(CASES), name)
+            setting.progress(number / len(CASES), name)
             code, told = run(rig)
             if code not in (2, 3) or not all(word in told for word in words):
                 wrong.append(f"{name}: exit {code}, {told[:60]!r}")
     count = len(CASES) + 1
-    return Row("bad recordings: " + ", ".join(name for name, _, _ in CASES),
-               "exit 2 or 3 with the reason",
-               f"{count - len(wrong)} of {count} as asked" + "".join(f"; {each}" for each in wrong),
-               not wrong)
+    return [Row(*BAD_RECORDINGS, f"{count - len(wrong)} of {count} as asked"
+                + "".join(f"; {each}" for each in wrong), not wrong, count)]
 
 
 def made_rig(folder: Path, rng: np.random.Generator) -> Rig:
@@ -203,3 +200,5 @@ CASES: tuple[tuple[str, tuple[str, ...], Callable[[Rig], tuple[int, str]]], ...]
     ("a load in another unit", ("another unit",), _in_another_unit),
 )
 """What is wrong, words that the message has, and how it is made."""
+BAD_RECORDINGS = Asked("bad recordings: " + ", ".join(name for name, _, _ in CASES),
+                       "exit 2 or 3 with the reason")

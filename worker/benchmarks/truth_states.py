@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.estimation import SETTINGS, followed
-from benchmarks.mechanics import DENSITY, short_beam
+from benchmarks.mechanics_exact import DENSITY, short_beam
 from benchmarks.mechanics_reduced import CHANGED, LENGTH, GraspBench, bench_branch
 from benchmarks.paper_branches import BRANCHES, Bench, exact_pull, measured
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.mechanics import (
     BranchModel,
     EnergyMomentumSettings,
@@ -22,21 +22,32 @@ from limber.mechanics import (
 )
 from limber.mechanics.reduced.refresh import checked, estimate_error
 from limber.mechanics.reduced.training import TrainingSettings, sample_poses
-from limber.progress import Progress
 
 _AMPLITUDES = (0.01, 0.25, 0.6)
 _STEPS = 1000
 _YOUNG = 1e7
 
+SWING_ROW = Asked("free swing at 1, 25, 60 % amplitude, 1,000 steps of 1/60 s: energy drift",
+                  "1 %")
+DOUBT_ROWS = (
+    Asked("reduced model after E changed by up to 3: worst error among the unflagged",
+          "0.5 % of the length, 1 % energy"),
+    Asked("bad states flagged / good ones flagged", "95 % / under 10 %"))
+QUICK_ROWS = (
+    Asked("a second, different pull with --forward reduced", "10 s"),
+    Asked("online: last live update against the batch fit; every frame's time, worst",
+          "3 %; 33 ms"))
 
-def swing_row(quick: bool, progress: Progress, rng: np.random.Generator) -> Row:
+
+def swing_row(setting: Setting) -> list[Row]:
     """An undamped beam let go from aside, in the default step of 1/60 s."""
     mesh, tip = short_beam()
     model = BranchModel(mesh, young=_YOUNG, poisson=0.3, density=DENSITY, gravity=None,
                         damping=RayleighDamping(0.0, 0.0))
-    told, worst, count = [], 0.0, 200 if quick else _STEPS
+    rng = setting.generator(11)
+    told, worst, count = [], 0.0, setting.at_most(_STEPS, 200)
     for number, amplitude in enumerate(_AMPLITUDES):
-        progress(number / len(_AMPLITUDES), f"swinging at {100 * amplitude:.0f} %")
+        setting.progress(number / len(_AMPLITUDES), f"swinging at {100 * amplitude:.0f} %")
         angle = rng.uniform(0, 2 * np.pi)
         bent = _pulled_aside(model, tip, np.array([np.cos(angle), np.sin(angle), 0.0]), amplitude)
         settings = EnergyMomentumSettings()
@@ -46,8 +57,8 @@ def swing_row(quick: bool, progress: Progress, rng: np.random.Generator) -> Row:
         drift = 100 * np.abs(energy / energy[0] - 1).max() if result.converged else np.inf
         worst = max(worst, drift)
         told.append(f"{drift:.4f} %")
-    return Row(f"free swing at 1, 25, 60 % amplitude, {count} steps of 1/60 s: energy drift",
-               "1 %", ", ".join(told), bool(worst <= 1))
+    return [Row(*SWING_ROW, f"{', '.join(told)} ({count} steps)", bool(worst <= 1),
+                len(_AMPLITUDES))]
 
 
 def _pulled_aside(model: BranchModel, tip: Grasp, direction: np.ndarray,
@@ -69,14 +80,16 @@ def _pulled_aside(model: BranchModel, tip: Grasp, direction: np.ndarray,
     return pulled(brentq(missing, 0.0, most, rtol=1e-3))
 
 
-def doubt_rows(quick: bool, progress: Progress, rng: np.random.Generator) -> list[Row]:
+def doubt_rows(setting: Setting) -> list[Row]:
     """Grasps of a reduced model after E changed by up to 3 at each control point, checked."""
-    bench = GraspBench(bench_branch(), "pinned", quick)
+    progress, rng = setting.progress, setting.generator(12)
+    bench = GraspBench(bench_branch(), "pinned", setting.seed)
     branch = bench.branch
-    known = bench.train(50 if quick else 120, 1.0, None, progress.part(0.0, 0.2))
-    both = known.joined(bench.train(100 if quick else 160, 4.0, known, progress.part(0.2, 0.4)))
+    known = bench.train(setting.at_most(120, 50), 1.0, None, progress.part(0.0, 0.2))
+    both = known.joined(bench.train(
+        setting.at_most(160, 100), 4.0, known, progress.part(0.2, 0.4)))
     wide = bench.reduce(both, CHANGED)
-    count = 30 if quick else 300
+    count = setting.at_most(300, 30)
     poses = sample_poses(branch.model, bench.grasp, count, rng, TrainingSettings())
     young = branch.young * 3.0 ** rng.uniform(-1, 1, (count, len(branch.young)))
     truth = bench.trainer.take(poses, young, known, progress=progress.part(0.5, 0.9))
@@ -103,18 +116,18 @@ def _doubted(off: np.ndarray, energy: np.ndarray, flagged: np.ndarray, milliseco
     caught = 100 * flagged[bad].mean() if bad.any() else np.nan
     false = 100 * flagged[~bad].mean() if (~bad).any() else np.nan
     return [
-        Row(f"reduced model after E changed by up to 3, {len(off)} grasps: worst error among the "
-            "unflagged", "0.5 % of the length, 1 % energy",
+        Row(*DOUBT_ROWS[0],
             f"{worst:.2f} %, {worst_energy:.2f} % (among all {off.max():.1f}, {energy.max():.1f} "
-            f"%; {milliseconds:.0f} ms a checked grasp)", bool(worst <= 0.5 and worst_energy <= 1)),
-        Row("bad states flagged / good ones flagged", "95 % / under 10 %",
+            f"%; {milliseconds:.0f} ms a checked grasp)", bool(worst <= 0.5 and worst_energy <= 1),
+            len(off)),
+        Row(*DOUBT_ROWS[1],
             f"{caught:.0f} % of {bad.sum()} / {false:.1f} % of {(~bad).sum()}",
-            bool(caught >= 95 and false < 10) if bad.any() else None)]
+            bool(caught >= 95 and false < 10) if bad.any() else None, len(off))]
 
 
-def quick_rows(rng: np.random.Generator) -> list[Row]:
+def quick_rows(setting: Setting) -> list[Row]:
     """A new pull on a basis that is there; a pull followed while it goes on."""
-    branch = BRANCHES[1]
+    branch, rng = BRANCHES[1], setting.generator(13)
     # About 2,500 quadratic tetrahedra.
     bench = Bench(branch, slice_length=0.95, sides=10)
     first, second = (measured(exact_pull(branch, number), int(rng.integers(1 << 31)))
@@ -130,11 +143,10 @@ def quick_rows(rng: np.random.Generator) -> list[Row]:
     away = float(np.abs(short.values.young / found.values.young - 1).max())
     updates, live, settled = followed(bench, first, second, found)
     return [
-        Row("a second, different pull with --forward reduced", "10 s",
+        Row(*QUICK_ROWS[0],
             f"{seconds[1]:.1f} s, {100 * away:.2f} % from the full model's E (the first, with the "
             f"basis built, {seconds[0]:.0f} s)", bool(seconds[1] <= 10)),
-        Row("online: last live update against the batch fit; every frame's time, worst",
-            "3 %; 33 ms", f"{100 * live:.1f} % (settled {100 * settled:.1f} %); "
+        Row(*QUICK_ROWS[1], f"{100 * live:.1f} % (settled {100 * settled:.1f} %); "
             f"{1e3 * updates.max():.0f} ms (median {1e3 * np.median(updates):.0f}, 99 % under "
             f"{1e3 * np.percentile(updates, 99):.0f}, {len(updates)} frames)",
-            bool(live <= 0.03 and updates.max() <= 0.033))]
+            bool(live <= 0.03 and updates.max() <= 0.033), len(updates))]
