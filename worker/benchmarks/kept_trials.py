@@ -49,27 +49,29 @@ def numbers_of(part: str, seeds: Iterable[int], work: Callable[[int], Numbers], 
 
 
 def go_on(kept_trials: list[Trial], tasks: list[Task], key: Callable[[Trial], Task],
-          work: Callable[[Task], Trial], source: str, kept: Path | None, budget: Budget,
-          workers: int | None = 1, progress: Progress = SILENT) -> list[Trial]:
+          work: Callable[[Any], Trial], source: str, kept: Path | None, budget: Budget,
+          workers: int | None = 1, progress: Progress = SILENT,
+          given: Callable[[list[Task]], list] = list) -> list[Trial]:
     """Return the trials of ``tasks``, in their order: those kept, and as many new ones as fit.
 
     Args:
         kept_trials: From an earlier run; those of another ``source`` do not count.
         tasks: What to do, the most important first.
         key: Returns the task of a trial.
-        work: Makes the trial of a task.
+        work: Makes the trial of a task, from what ``given`` made of it.
         source: Digest of the sources.
         kept: File to which new trials are appended, or None.
         budget: For the new ones; one at least is made where there is none yet.
         workers: How many at once; None: as many as there are cores.
         progress: Called after each.
+        given: Turns the tasks that are left into what ``work`` takes.
     """
     wanted = set(tasks)
     known = {key(trial): trial for trial in kept_trials
              if trial.source == source and key(trial) in wanted}
-    missing = [task for task in tasks if task not in known]
-    for task, trial in side_by_side(work, missing, budget, workers, at_least=0 if known else 1):
-        known[task] = trial
+    missing = given([task for task in tasks if task not in known])
+    for _, trial in side_by_side(work, missing, budget, workers, at_least=0 if known else 1):
+        known[key(trial)] = trial
         keep(trial, kept)
         progress(len(known) / len(tasks), f"trial {len(known)} of at most {len(tasks)}")
     return [known[task] for task in tasks if task in known]

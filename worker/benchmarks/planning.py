@@ -9,22 +9,22 @@ Starts are taken in turn over all branches, so that also a part of them speaks f
 
 import json
 import time
-from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cache, cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TypeVar
 
 import numpy as np
 
-from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.planning_branches import ARC_NAMES, Subject, arcs, forked
-from benchmarks.planning_confidence import Sure, run_sure, sure_rows
-from benchmarks.planning_detours import Detour, detour_rows, run_detour
+from benchmarks.planning_confidence import SURE_ROW, Sure, run_sure, sure_rows
+from benchmarks.planning_detours import DETOUR_ROWS, Detour, detour_rows, run_detour
 from benchmarks.planning_trials import Trial, no_path_seconds, run_trial
-from benchmarks.table import Row
+from benchmarks.table import Asked, Part, Row, Setting
 from limber.errors import LimberError
-from limber.jobs import Pool
 from limber.mechanics.reduced.cache import ReducedCache
 from limber.plain import plain
 from limber.planning.field.energy_field import EnergyField, fit_field
@@ -39,6 +39,9 @@ _ERRORS = (("energy", "energy", 100, (1, 5), "%"), ("force", "force", 100, (2, 8
            ("tip", "target position", 1e3, (1, 4), "mm"))
 """Of a field at fresh poses: their name, in words, scale, median and 95 % asked, unit."""
 _TIMED_STARTS = 3  # of each branch, where only times are asked
+_Start = tuple[str, int, int]
+"""Branch, number, seed."""
+_Kept = TypeVar("_Kept", Trial, Detour)
 
 
 @dataclass(frozen=True)
@@ -56,75 +59,92 @@ class _Fresh:
 
 @dataclass(frozen=True)
 class _Fielded:
-    """A branch with its field; ``lost`` is the share of its samples' hull that is not trusted."""
+    """A branch with its field.
+
+    Attributes:
+        seconds: Of sampling and fit [s].
+        all_seconds: The same with the fresh poses [s].
+        lost: Share of the samples' hull that is not trusted.
+    """
 
     subject: Subject
     known: EnergyField
     goal: GraspGoal
     seconds: float
+    all_seconds: float
     fresh: _Fresh
     lost: float
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
-         only: tuple[str, ...] = ()) -> list[Row]:
-    """Measure the parts named in ``only``, or all but what repeats times of others by themselves;
-    ``quick`` takes one arc, one forked branch and three starts."""
-    run = _Run(quick, progress, out, seed)
-    table = [row for name in only or WHOLE for row in PARTS[name](run)]
-    if out is not None and "trials" in (only or WHOLE):
-        raw = {one.subject.name: {
-            "field_seconds": one.seconds, "errors": one.known.errors, "goal": one.goal.describe(),
-            "fresh": asdict(one.fresh), "trials": [asdict(t) for t in run.trials[one.subject.name]],
-        } for one in run.fielded}
-        (out / "planning.json").write_text(json.dumps(plain(raw), indent=1))
-    return table
-
-
-@dataclass
 class _Run:
-    """What the parts of the table share, made when it is asked for."""
+    """What the parts of the table share: branches, and fields of as many as there was time for.
 
-    quick: bool
-    progress: Progress
-    out: Path | None
-    seed: int
-    failed: list[str] = field(default_factory=list)
+    Args:
+        setting: Of the part that asks.
+        share: Of the part's time that may go into fields that are not there yet.
+    """
+
+    def __init__(self, setting: Setting, share: float = 0.5):
+        self.setting = setting
+        self.failed: list[str] = []
+        self._share = share
 
     @property
     def starts(self) -> int:
-        return 3 if self.quick else 10
+        return self.setting.at_most(10, 3)
 
     @property
     def draws(self) -> int:
-        return 30 if self.quick else 100
+        return self.setting.at_most(100, 30)
 
-    @cached_property
-    def forked(self) -> list[Subject]:
-        return forked(self.seed, 1 if self.quick else 3, self.progress)
+    @property
+    def largest(self) -> Subject:
+        """The forked branch of most tetrahedra."""
+        return max(_forked(self.setting.seed, self.setting.at_most(3, 1)),
+                   key=lambda one: one.model.mesh.tet_count)
 
     @cached_property
     def fielded(self) -> list[_Fielded]:
-        subjects = [*(arcs()[1:2] if self.quick else arcs()), *self.forked]
-        found = []
-        for number, subject in enumerate(subjects):
-            part = self.progress.part(0.3 * number / len(subjects),
-                                      0.3 * (number + 1) / len(subjects))
+        """Branches with fields, arcs and forked ones in turn, so that a few speak for all.
+
+        Raises:
+            RuntimeError: no branch has a field.
+        """
+        setting, found, longest = self.setting, [], 0.0
+        subjects = [*(arcs()[1:2] if setting.quick else arcs()),
+                    *_forked(setting.seed, setting.at_most(3, 1))]
+        half = (len(subjects) + 1) // 2
+        budget = setting.budget.part(self._share * setting.budget.remaining)
+        for number in sorted(range(len(subjects)), key=lambda k: (k % half, k)):
+            name, kept = subjects[number].name, self._field_file(subjects[number].name)
+            if found and not kept.is_file() and budget.remaining <= longest:
+                continue
+            part = setting.progress.part(0.5 * len(found) / len(subjects),
+                                         0.5 * (len(found) + 1) / len(subjects))
             try:
-                found.append(_fielded(subject, EnergySettings(seed=self.seed),
-                                      15 if self.quick else 40,
-                                      _own_seed(self.seed + 1, number, 0), self.out, part))
+                found.append(_fielded(subjects[number], EnergySettings(seed=setting.seed),
+                                      setting.at_most(40, 15),
+                                      _own_seed(setting.seed + 1, number, 0), kept, part))
+                longest = max(longest, found[-1].all_seconds)
             except LimberError as error:
-                self.failed.append(f"{subject.name}: {error}")
+                self.failed.append(f"{name}: {error}")
+        if not found:
+            raise RuntimeError(f"no branch of the bench has a field: {'; '.join(self.failed)}")
         return found
 
-    @cached_property
-    def trials(self) -> dict[str, list[Trial]]:
-        return _trials(self.fielded, self.starts, self.seed, self.kept("trials"),
-                       self.progress.part(0.3, 0.85))
+    def _field_file(self, name: str) -> Path:
+        setting = self.setting
+        return setting.kept / (f"field-{setting.seed}-{setting.at_most(40, 15)}-"
+                               f"{name.replace(' ', '-')}-{_field_source()}.npz")
 
-    def kept(self, what: str) -> Path | None:
-        return None if self.out is None else self.out / f"planning-{what}.jsonl"
+    def kept(self, what: str) -> Path:
+        return self.setting.kept / f"planning-{what}.jsonl"
+
+    def starts_of(self, wanted: Callable[[str], bool], starts: int) -> dict[_Start, _Fielded]:
+        """The starts of branches with a field, in turn over the branches."""
+        return {(one.subject.name, number, _own_seed(self.setting.seed, k, number)): one
+                for number in range(starts) for k, one in enumerate(self.fielded)
+                if wanted(one.subject.name)}
 
 
 def _source() -> str:
@@ -136,30 +156,31 @@ def _field_source() -> str:
                          Path(__file__).parent / "planning_branches.py")
 
 
+@cache
+def _forked(seed: int, count: int) -> list[Subject]:
+    return forked(seed, count)
+
+
 def _fielded(subject: Subject, settings: EnergySettings, fresh_count: int, fresh_seed: int,
-             out: Path | None, progress: Progress) -> _Fielded:
-    """Sample and fit, or read what an earlier run kept of the same branch."""
-    kept = None if out is None else (
-        out / f"field-{settings.seed}-{subject.name.replace(' ', '-')}-{_field_source()}.npz")
-    if kept is not None and kept.is_file():
+             kept: Path, progress: Progress) -> _Fielded:
+    """Sample and fit, or read what an earlier part or run kept of the same branch."""
+    if kept.is_file():
         known = EnergyField.read(kept)
         with np.load(kept) as file:
             fresh = _Fresh(*file["fresh"])
-            seconds, lost = float(file["seconds"]), float(file["lost"])
-        return _Fielded(subject, known, default_goal(known, 0.01), seconds, fresh, lost)
-    found = _sampled(subject, settings, fresh_count, fresh_seed, progress)
-    if kept is not None:
-        found.known.write(kept, {"seconds": np.array(found.seconds), "lost": np.array(found.lost),
-                                 "fresh": np.array(list(asdict(found.fresh).values()))})
-    return found
-
-
-def _sampled(subject: Subject, settings: EnergySettings, fresh_count: int, fresh_seed: int,
-             progress: Progress) -> _Fielded:
+            times = float(file["seconds"]), float(file["all_seconds"])
+            lost = float(file["lost"])
+        return _Fielded(subject, known, default_goal(known, 0.01), *times, fresh, lost)
+    began = time.perf_counter()
     sampled, known, seconds = _timed_field(subject.model, settings, progress.part(0.0, 0.7))
     fresh, lost = _fresh(subject.model, known, sampled, settings, fresh_count, fresh_seed,
                          progress.part(0.7, 1.0))
-    return _Fielded(subject, known, default_goal(known, 0.01), seconds, fresh, lost)
+    times = seconds, time.perf_counter() - began
+    written = kept.with_name(f"writing-{kept.name}")
+    known.write(written, {"seconds": np.array(times[0]), "all_seconds": np.array(times[1]),
+                         "lost": np.array(lost), "fresh": np.array(list(asdict(fresh).values()))})
+    written.replace(kept)
+    return _Fielded(subject, known, default_goal(known, 0.01), *times, fresh, lost)
 
 
 def _timed_field(model: GraspModel, settings: EnergySettings, progress: Progress,
@@ -194,62 +215,63 @@ def _fresh(model: GraspModel, known: EnergyField, sampled: Sampled, settings: En
     return _Fresh(*errors), lost
 
 
-def _trials(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
-            progress: Progress, limited: bool = True) -> dict[str, list[Trial]]:
-    found: dict[str, list[Trial]] = {one.subject.name: [] for one in fielded}
-    source, wanted = _source(), {}
-    for number in range(count):
-        for k, one in enumerate(fielded):
-            wanted[one.subject.name, _own_seed(seed, k, number)] = one, number
-    for trial in read_trials(Trial, kept):
-        if trial.source == source and wanted.pop((trial.branch, trial.seed), None):
-            found[trial.branch].append(trial)
-    with Pool() as pool:
-        futures = [pool.submit(partial(run_trial, branch=name, source=source, limited=limited),
-                               one.subject.model, one.known, one.goal, number, own)
-                   for (name, own), (one, number) in wanted.items()]
-        for done, future in enumerate(as_completed(futures)):
-            trial = future.result()
-            keep(trial, kept)
-            found[trial.branch].append(trial)
-            progress((done + 1) / len(futures), "trials")
-    return {name: sorted(trials, key=lambda trial: trial.number)
-            for name, trials in found.items()}
+def _trials(run: _Run, starts: int, kept: Path | None, limited: bool = True,
+            ) -> dict[str, list[Trial]]:
+    """Trials of as many starts as there is time for, by branch."""
+    found: dict[str, list[Trial]] = {one.subject.name: [] for one in run.fielded}
+    for trial in _planned(run, Trial, partial(_trial_of, limited=limited), kept,
+                          run.starts_of(lambda _: True, starts)):
+        found[trial.branch].append(trial)
+    return {name: trials for name, trials in found.items() if trials}
 
 
-def _detours(fielded: list[_Fielded], count: int, seed: int, kept: Path | None,
-             progress: Progress) -> list[Detour]:
+def _trial_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str,
+              limited: bool) -> Trial:
+    (name, number, own), model, known, goal = task
+    return run_trial(model, known, goal, number, own, branch=name, source=source, limited=limited)
+
+
+def _detours(run: _Run) -> list[Detour]:
     """Plan on the paper's arcs within the paper's detour, from the starts of the trials."""
-    source, wanted, found = _source(), {}, []
-    for k, one in enumerate(fielded):
-        for number in range(count if one.subject.name in ARC_NAMES else 0):
-            wanted[one.subject.name, _own_seed(seed, k, number)] = one, number
-    for detour in read_trials(Detour, kept):
-        if detour.source == source and wanted.pop((detour.branch, detour.seed), None):
-            found.append(detour)
-    with Pool() as pool:
-        futures = [pool.submit(partial(run_detour, branch=name, source=source), one.known,
-                               one.goal, number, own)
-                   for (name, own), (one, number) in wanted.items()]
-        for done, future in enumerate(as_completed(futures)):
-            found.append(future.result())
-            keep(found[-1], kept)
-            progress((done + 1) / len(futures), "paths within a detour")
-    return found
+    return _planned(run, Detour, _detour_of, run.kept("detours"),
+                    run.starts_of(ARC_NAMES.__contains__, run.starts))
 
 
-def _sure(fielded: list[_Fielded], draws: int, seed: int, out: Path | None) -> list[Sure]:
+def _detour_of(task: tuple[_Start, GraspModel, EnergyField, GraspGoal], source: str) -> Detour:
+    (name, number, own), _, known, goal = task
+    return run_detour(known, goal, number, own, branch=name, source=source)
+
+
+def _planned(run: _Run, kind: type[_Kept], work: Callable, kept: Path | None,
+             starts: dict[_Start, _Fielded]) -> list[_Kept]:
+    """Trials of starts, kept ones included, as many as there is time for."""
+    setting, source = run.setting, _source()
+
+    def with_models(missing: list[_Start]) -> list[tuple]:
+        return [(start, one.subject.model, one.known, one.goal) for start in missing
+                for one in [starts[start]]]
+    return go_on(read_trials(kind, kept), list(starts),
+                 lambda each: (each.branch, each.number, each.seed), partial(work, source=source),
+                 source, kept, setting.budget, None, setting.progress.part(0.5, 1.0), with_models)
+
+
+def _sure(run: _Run) -> list[Sure]:
     """Plan with confidence on each branch from rest, and try it on draws of the moduli."""
-    source, kept = _source(), None if out is None else out / "planning-sure.jsonl"
-    found = [one for one in read_trials(Sure, kept) if (one.source, one.seed) == (source, seed)]
-    missing = [one for one in fielded if one.subject.name not in {done.branch for done in found}]
-    with Pool() as pool:
-        futures = [pool.submit(run_sure, one.subject, one.known, one.goal, draws, seed, source)
-                   for one in missing]
-        for future in as_completed(futures):
-            found.append(future.result())
-            keep(found[-1], kept)
-    return found
+    setting, source, kept = run.setting, _source(), run.kept("sure")
+    by_name = {one.subject.name: one for one in run.fielded}
+    tasks = [(name, setting.seed) for name in by_name]
+
+    def with_models(missing: list[tuple[str, int]]) -> list[tuple]:
+        return [(by_name[name].subject, by_name[name].known, by_name[name].goal)
+                for name, _ in missing]
+    return go_on(read_trials(Sure, kept), tasks, lambda each: (each.branch, each.seed), partial(
+        _sure_of, draws=run.draws, seed=setting.seed, source=source), source, kept,
+        setting.budget, None, setting.progress.part(0.5, 1.0), with_models)
+
+
+def _sure_of(task: tuple[Subject, EnergyField, GraspGoal], draws: int, seed: int,
+             source: str) -> Sure:
+    return run_sure(*task, draws, seed, source)
 
 
 def _own_seed(seed: int, branch: int, number: int) -> int:
@@ -260,16 +282,15 @@ def _own_seed(seed: int, branch: int, number: int) -> int:
 def _saved_rows(trials: dict[str, list[Trial]]) -> list[Row]:
     good = [t for some in trials.values() for t in some if t.saved]
     table = []
-    for name in ("RRT*, not smoothed", "RRT*", "straight line"):
+    for name in _AGAINST:
         saved = [t.saved[name] for t in good if t.number > 0 and name in t.saved]
         added = [t.added[name] for t in good if t.number > 0 and name in t.saved]
         table.append(Row(
-            f"random starts, default weights: saved against {name}", "-",
-            f"{np.mean(saved):.1f} %, {np.mean(added):.1f} % longer, {len(saved)} trials"
-            if saved else "none", None))
+            *_saved_asked(name), f"{np.mean(saved):.1f} %, {np.mean(added):.1f} % longer"
+            if saved else "none", None, len(saved)))
     rest = [t.saved["straight line"] for t in good if t.number == 0]
-    table.append(Row("from rest, all branches: saved against the straight line", "-",
-                     ", ".join(f"{value:.1f}" for value in rest) + " %", None))
+    table.append(Row(*_FROM_REST, ", ".join(f"{value:.1f}" for value in rest) + " %", None,
+                     len(rest)))
     return table
 
 
@@ -277,88 +298,83 @@ def _bound_rows(trials: dict[str, list[Trial]]) -> list[Row]:
     every = [t for some in trials.values() for t in some]
     good = [t for t in every if np.isfinite(t.gap)]
     if not good:
-        return [Row("certified gap", "2 / 5 %, in 10 s", _troubles(trials), False)]
+        return [Row(*asked, _troubles(trials), False, len(every)) for asked in _BOUND_ROWS]
     gaps = 100.0 * np.array([t.gap for t in good])
     tree = np.array([t.tree_to_optimum for t in good if np.isfinite(t.tree_to_optimum)])
     ratio = np.array([t.to_optimum for t in good if np.isfinite(t.to_optimum)])
     below = np.array([t.bound_to_optimum for t in good if np.isfinite(t.bound_to_optimum)])
     return [
-        Row(f"success where a path exists, {len(every)} trials", "100 %", _troubles(trials) or
-            "100 %", all(not t.trouble for t in every)),
-        Row(f"certified gap, median / worst of {len(gaps)}", "2 / 5 %",
-            f"{np.median(gaps):.2f} / {gaps.max():.2f} %",
-            bool(np.median(gaps) <= 2.0 and gaps.max() <= 5.0)),
-        *_time_rows(trials),
-        Row("the same: D-RRT* of 3,000 iterations, over the best, median / worst", "2 %",
-            f"{100 * np.median(tree - 1):.1f} / {100 * (tree.max() - 1):.1f} %, "
+        Row(*_BOUND_ROWS[0], _troubles(trials) or "100 %", all(not t.trouble for t in every),
+            len(every)),
+        Row(*_BOUND_ROWS[1], f"{np.median(gaps):.2f} / {gaps.max():.2f} %",
+            bool(np.median(gaps) <= 2.0 and gaps.max() <= 5.0), len(gaps)),
+        Row(*_BOUND_ROWS[2], f"{100 * np.median(tree - 1):.1f} / {100 * (tree.max() - 1):.1f} %, "
             f"{(tree <= 1.02).sum()} of {len(tree)} within" if len(tree) else "none",
-            bool(len(tree) and np.median(tree) <= 1.02)),
-        Row("cost over an independent optimum's, worst", "1 %",
+            bool(len(tree) and np.median(tree) <= 1.02), len(tree)),
+        Row(*_BOUND_ROWS[3],
             f"{100 * (ratio.max() - 1):.3f} % (best {100 * (ratio.min() - 1):.3f} %)",
-            bool(ratio.max() <= 1.01)),
-        Row("no path below the bound", "never", f"bound at most {below.max():.4f} of the best",
-            bool(below.max() <= 1.0 + 1e-9))]
+            bool(ratio.max() <= 1.01), len(ratio)),
+        Row(*_BOUND_ROWS[4], f"bound at most {below.max():.4f} of the best",
+            bool(below.max() <= 1.0 + 1e-9), len(below))]
 
 
 def _time_rows(trials: dict[str, list[Trial]]) -> list[Row]:
     good = [t for some in trials.values() for t in some if np.isfinite(t.check_seconds)]
     if not good:
-        return [Row("in: plan, and check", "10 s", _troubles(trials), False)]
+        return [Row(*asked, _troubles(trials), False, sum(map(len, trials.values())))
+                for asked in _TIME_ROWS]
     seconds = np.array([t.seconds for t in good])
     soon = np.array([t.seconds_to_close for t in good])
     checks = np.array([t.check_seconds for t in good])
     return [
-        Row(f"in: RRT*, D-RRT*, plan and bound, median / worst of {len(good)}, two at once", "10 s",
-            f"{np.median(seconds):.1f} / {seconds.max():.1f} s", bool(seconds.max() <= 10.0)),
-        Row("planning after the field to within 2 % of the best: eikonal, median / worst", "1 s",
+        Row(*_TIME_ROWS[0], f"{np.median(seconds):.1f} / {seconds.max():.1f} s",
+            bool(seconds.max() <= 10.0), len(good)),
+        Row(*_TIME_ROWS[1],
             f"{np.nanmedian(soon):.1f} / {np.nanmax(soon):.1f} s, {np.isnan(soon).sum()} never",
-            bool(np.median(soon) <= 1.0)),
-        Row("full-model check of both paths, median / worst, one process, two at once", "10 s",
-            f"{np.median(checks):.1f} / {checks.max():.1f} s", bool(checks.max() <= 10.0))]
+            bool(np.median(soon) <= 1.0), len(good)),
+        Row(*_TIME_ROWS[2], f"{np.median(checks):.1f} / {checks.max():.1f} s",
+            bool(checks.max() <= 10.0), len(good))]
 
 
-def _field_rows(fielded: list[_Fielded], failed: list[str]) -> list[Row]:
-    table = []
+def _field_rows(setting: Setting) -> list[Row]:
+    run = _Run(setting, share=1.0)
+    fielded, table = run.fielded, []
     for name, what, scale, asked, unit in _ERRORS:
         worst = max(fielded, key=lambda one: np.nanquantile(getattr(one.fresh, name), 0.95))
         there = scale * np.nanquantile(getattr(worst.fresh, name), 0.95)
         table.append(_error_row(
-            what, np.concatenate([getattr(one.fresh, name) for one in fielded]), scale, asked,
+            _error_asked(what, asked, unit), np.concatenate(
+                [getattr(one.fresh, name) for one in fielded]), scale, asked,
             unit, f" (worst {worst.subject.name}: {there:.2g})"))
-    missed = sum(int(np.isnan(one.fresh.tip).sum()) for one in fielded)
-    table.append(Row(
-        "of the samples' hull not trusted, mean / most; fresh trusted poses where the motion does "
-        "not come", "-", f"{100 * np.mean([one.lost for one in fielded]):.0f} / "
-        f"{100 * max(one.lost for one in fielded):.0f} %; {missed} of "
-        f"{sum(len(one.fresh.tip) for one in fielded)}", None))
     slowest = max(fielded, key=lambda one: one.seconds)
-    table.append(_cost_row("field, slowest branch", slowest.subject, slowest.known,
-                           slowest.seconds, 35.0))
+    table.append(_cost_row(_FIELD_COST, slowest.subject, slowest.known, slowest.seconds, 35.0))
     heights = [float(one.known.region.height(one.known.rest[None])[0]) for one in fielded]
-    table.append(Row("rest pose inside the sampled region: least depth", "inside",
-                     f"{-1e3 * max(heights):.2f} mm", bool(max(heights) < 0.0)))
-    if failed:
-        table.append(Row("branches without a field", "none", "; ".join(failed), False))
-    return table
+    table.append(Row(*_REST_INSIDE, f"{-1e3 * max(heights):.2f} mm", bool(max(heights) < 0.0),
+                     len(fielded)))
+    table.append(Row(*_WITHOUT_FIELD, "; ".join(run.failed) or "none", not run.failed,
+                     len(fielded) + len(run.failed)))
+    missed = sum(int(np.isnan(one.fresh.tip).sum()) for one in fielded)
+    return [*table, Row(
+        *_NOT_TRUSTED, f"{100 * np.mean([one.lost for one in fielded]):.0f} / "
+        f"{100 * max(one.lost for one in fielded):.0f} %; {missed} of "
+        f"{sum(len(one.fresh.tip) for one in fielded)}", None, len(fielded))]
 
 
-def _error_row(what: str, values: np.ndarray, scale: float, asked: tuple[float, float], unit: str,
+def _error_row(row: Asked, values: np.ndarray, scale: float, asked: tuple[float, float], unit: str,
                more: str = "") -> Row:
     # A pose where the motion does not come is as wrong as can be.
     median, most = np.quantile(np.nan_to_num(scale * values, nan=np.inf), (0.5, 0.95),
                                method="higher")
-    return Row(f"field error on fresh poses: {what}, median / 95 %",
-               f"{asked[0]} / {asked[1]} {unit}", f"{median:.2g} / {most:.2g} {unit}{more}",
-               bool(median <= asked[0] and most <= asked[1]))
+    return Row(*row, f"{median:.2g} / {most:.2g} {unit}{more}",
+               bool(median <= asked[0] and most <= asked[1]), len(values))
 
 
-def _cost_row(what: str, subject: Subject, known: EnergyField, seconds: float, asked: float,
-              ) -> Row:
+def _cost_row(row: Asked, subject: Subject, known: EnergyField, seconds: float, asked: float,
+              more: str = "") -> Row:
     samples, tets = len(known.samples.poses), subject.model.mesh.tet_count
     scaled = seconds * 300 / samples * 2500 / tets
-    return Row(f"{what}, fit included", f"300 grasps, 2,500 tets: {asked:.0f} s",
-               f"{seconds:.0f} s ({samples} grasps, {tets} tets: {scaled:.0f} s scaled)",
-               scaled <= asked)
+    return Row(*row, f"{seconds:.0f} s ({subject.name}, {samples} grasps, {tets} tets: "
+               f"{scaled:.0f} s scaled{more})", scaled <= asked)
 
 
 def _full_rows(trials: dict[str, list[Trial]]) -> list[Row]:
@@ -372,32 +388,30 @@ def _full_rows(trials: dict[str, list[Trial]]) -> list[Row]:
     first = [t.first_field_error for t in good] or [np.nan]
     moving = [t.moving_seconds for t in accepted if np.isfinite(t.moving_seconds)] or [np.nan]
     return [
-        Row("the same in time, there and back, with a force that binds: median / worst", "10 s",
+        Row(*_FULL_ROWS[0],
             f"{np.median(moving):.1f} / {np.max(moving):.1f} s; "
             f"{sum(t.slowings > 0 for t in accepted)} of {len(accepted)} slowed down, force at "
             f"most {np.max([t.moving_ratio for t in accepted] or [np.nan]):.3f} of the limit",
-            bool(np.max(moving) <= 10.0)),
-        Row("field's energy along planned paths (rms), median / worst", "-",
+            bool(np.max(moving) <= 10.0), len(accepted)),
+        Row(*_FULL_ROWS[2],
             f"{100 * np.median(errors):.2f} / {100 * np.max(errors):.2f} %, before samples were "
             f"added {100 * np.median(first):.2f} / {100 * np.max(first):.2f} %; "
-            f"{np.mean([t.rounds for t in good] or [0]):.1f} rounds", None),
-        Row(f"limits broken on the full model by an accepted plan, of {len(every)} with a force "
-            "that binds", "none",
+            f"{np.mean([t.rounds for t in good] or [0]):.1f} rounds", None, len(good)),
+        Row(*_FULL_ROWS[1],
             f"{len(broken)} of {len(accepted)} accepted ({again} planned anew), "
             f"{len(refused)} refused" + (f"; worst {100 * max(broken):+.2f} %" if broken else "")
-            + (f"; {refused[0]}" if refused else ""), bool(accepted) and not broken)]
+            + (f"; {refused[0]}" if refused else ""), bool(accepted) and not broken, len(every))]
 
 
-def _no_path_rows(fielded: list[_Fielded]) -> list[Row]:
-    found = {one.subject.name: no_path_seconds(one.known, one.goal) for one in fielded}
+def _no_path_rows(setting: Setting) -> list[Row]:
+    found = {one.subject.name: no_path_seconds(one.known, one.goal)
+             for one in _Run(setting).fielded}
     slowest = max(seconds for cases in found.values() for seconds, _ in cases.values())
     wrong = [f"{name}, {word}: {said}" for name, cases in found.items()
              for word, (_, said) in cases.items() if said]
     count = sum(len(cases) for cases in found.values())
-    return [Row("no path: force too low for the goal, goal outside the workspace",
-                "said with its reason, in 10 s",
-                f"{count - len(wrong)} of {count}, slowest {slowest:.1f} s" + "".join(
-                    f"; {one}" for one in wrong), not wrong and slowest <= 10.0)]
+    return [Row(*_NO_PATH, f"{count - len(wrong)} of {count}, slowest {slowest:.1f} s" + "".join(
+        f"; {one}" for one in wrong), not wrong and slowest <= 10.0, count)]
 
 
 def _troubles(trials: dict[str, list[Trial]]) -> str:
@@ -405,58 +419,112 @@ def _troubles(trials: dict[str, list[Trial]]) -> str:
                      for t in some if t.trouble)
 
 
-def _trial_rows(run: _Run) -> list[Row]:
-    return [*_saved_rows(run.trials), *_bound_rows(run.trials), *_full_rows(run.trials)]
+def _trial_rows(setting: Setting) -> list[Row]:
+    run = _Run(setting)
+    trials = _trials(run, run.starts, run.kept("trials"))
+    if setting.out is not None:
+        raw = {one.subject.name: {
+            "field_seconds": one.seconds, "errors": one.known.errors, "goal": one.goal.describe(),
+            "fresh": asdict(one.fresh),
+            "trials": [asdict(t) for t in trials.get(one.subject.name, ())],
+        } for one in run.fielded}
+        (setting.out / "planning.json").write_text(json.dumps(plain(raw), indent=1))
+    return [*_bound_rows(trials), *_time_rows(trials), *_full_rows(trials), *_saved_rows(trials)]
 
 
-def _detour_table(run: _Run) -> list[Row]:
-    return detour_rows(_detours(run.fielded, run.starts, run.seed, run.kept("detours"),
-                                run.progress.part(0.85, 1.0)))
+def _detour_table(setting: Setting) -> list[Row]:
+    return detour_rows(_detours(_Run(setting)))
 
 
-def _field_time(run: _Run) -> list[Row]:
+def _sure_table(setting: Setting) -> list[Row]:
+    run = _Run(setting)
+    return sure_rows(_sure(run), run.draws)
+
+
+def _field_time(setting: Setting) -> list[Row]:
     """The cost of a field by itself: of the largest forked branch, on an idle machine."""
-    largest = max(run.forked, key=lambda one: one.model.mesh.tet_count)
-    _, known, seconds = _timed_field(largest.model, EnergySettings(seed=run.seed, samples=300),
-                                     run.progress)
-    return [_cost_row(f"field of {largest.name} alone", largest, known, seconds, 35.0)]
+    largest = _Run(setting).largest
+    _, known, seconds = _timed_field(largest.model, EnergySettings(seed=setting.seed, samples=300),
+                                     setting.progress)
+    return [_cost_row(_FIELD_ALONE, largest, known, seconds, 35.0)]
 
 
-def _reduced_time(run: _Run) -> list[Row]:
+def _reduced_time(setting: Setting) -> list[Row]:
     """The cost of a field on a reduced model that was learnt before, and how good it is."""
-    largest = max(run.forked, key=lambda one: one.model.mesh.tet_count)
-    settings = EnergySettings(seed=run.seed, samples=300)
+    largest, progress = _Run(setting).largest, setting.progress
+    settings = EnergySettings(seed=setting.seed, samples=300)
     with TemporaryDirectory() as folder:
         cache, began = ReducedCache(Path(folder)), time.perf_counter()
-        LearntGraspModel.learnt(largest.model, cache, progress=run.progress.part(0.0, 0.5))
+        LearntGraspModel.learnt(largest.model, cache, progress=progress.part(0.0, 0.5))
         learning, began = time.perf_counter() - began, time.perf_counter()
         learnt = LearntGraspModel.learnt(largest.model, cache)
         reading = time.perf_counter() - began
-    sampled, known, seconds = _timed_field(learnt, settings, run.progress.part(0.5, 0.7))
-    fresh, _ = _fresh(largest.model, known, sampled, settings, 15 if run.quick else 40,
-                      _own_seed(run.seed + 1, 0, 0), run.progress.part(0.7, 1.0))
+    sampled, known, seconds = _timed_field(learnt, settings, progress.part(0.5, 0.7))
+    fresh, _ = _fresh(largest.model, known, sampled, settings, setting.at_most(40, 15),
+                      _own_seed(setting.seed + 1, 0, 0), progress.part(0.7, 1.0))
     reduced, whole = int(known.samples.reduced.sum()), len(known.samples.poses)
-    return [_cost_row(f"field of {largest.name} on the reduced model (learnt in {learning:.0f} s; "
-                      f"{reduced} of {whole} poses by it)", largest, known, reading + seconds,
-                      5.0),
-            *(_error_row(f"{what}, field on the reduced model", getattr(fresh, name), *row)
-              for name, what, *row in _ERRORS)]
+    return [_cost_row(_REDUCED_COST, largest, known, reading + seconds, 5.0,
+                      f"; learnt in {learning:.0f} s; {reduced} of {whole} poses by it"),
+            *(_error_row(_error_asked(f"{what}, field on the reduced model", asked, unit),
+                         getattr(fresh, name), scale, asked, unit)
+              for name, what, scale, asked, unit in _ERRORS)]
 
 
-def _plan_time(run: _Run) -> list[Row]:
+def _plan_time(setting: Setting) -> list[Row]:
     """The times of plans by themselves, of three starts a branch."""
-    return _time_rows(_trials(run.fielded, _TIMED_STARTS, run.seed, None,
-                              run.progress.part(0.3, 1.0), limited=False))
+    return _time_rows(_trials(_Run(setting), _TIMED_STARTS, None, limited=False))
 
 
-WHOLE = {
-    "detours": _detour_table,
-    "trials": _trial_rows,
-    "field": lambda run: _field_rows(run.fielded, run.failed),
-    "no-path": lambda run: _no_path_rows(run.fielded),
-    "sure": lambda run: sure_rows(_sure(run.fielded, run.draws, run.seed, run.out), run.draws),
-    "reduced": _reduced_time,
-}
-PARTS = WHOLE | {"field-time": _field_time, "plan-time": _plan_time}
-"""What ``--only`` knows: those, and the times by themselves, for a machine that does nothing else.
-"""
+def _saved_asked(name: str) -> Asked:
+    return Asked(f"random starts, default weights: saved against {name}", "-")
+
+
+def _error_asked(what: str, asked: tuple[float, float], unit: str) -> Asked:
+    return Asked(f"field error on fresh poses: {what}, median / 95 %",
+                 f"{asked[0]} / {asked[1]} {unit}")
+
+
+_AGAINST = ("RRT*, not smoothed", "RRT*", "straight line")
+_FROM_REST = Asked("from rest, all branches: saved against the straight line", "-")
+_BOUND_ROWS = (
+    Asked("success where a path exists", "100 %"),
+    Asked("certified gap, median / worst", "2 / 5 %"),
+    Asked("the same: D-RRT* of 3,000 iterations, over the best, median / worst", "2 %"),
+    Asked("cost over an independent optimum's, worst", "1 %"),
+    Asked("no path below the bound", "never"))
+_TIME_ROWS = (
+    Asked("in: RRT*, D-RRT*, plan and bound, median / worst, two at once", "10 s"),
+    Asked("planning after the field to within 2 % of the best: eikonal, median / worst", "1 s"),
+    Asked("full-model check of both paths, median / worst, one process, two at once", "10 s"))
+_FULL_ROWS = (
+    Asked("the same in time, there and back, with a force that binds: median / worst", "10 s"),
+    Asked("limits broken on the full model by an accepted plan with a force that binds", "none"),
+    Asked("field's energy along planned paths (rms), median / worst", "-"))
+_FIELD_COST = Asked("field, slowest branch, fit included", "300 grasps, 2,500 tets: 35 s")
+_FIELD_ALONE = Asked("field of the largest forked branch alone, fit included",
+                     "300 grasps, 2,500 tets: 35 s")
+_REDUCED_COST = Asked("field of the largest forked branch on the reduced model, fit included",
+                      "300 grasps, 2,500 tets: 5 s")
+_REST_INSIDE = Asked("rest pose inside the sampled region: least depth", "inside")
+_WITHOUT_FIELD = Asked("branches without a field", "none")
+_NOT_TRUSTED = Asked("of the samples' hull not trusted, mean / most; fresh trusted poses where the "
+                     "motion does not come", "-")
+_NO_PATH = Asked("no path: force too low for the goal, goal outside the workspace",
+                 "said with its reason, in 10 s")
+
+PARTS = {
+    "field": Part(_field_rows, 120, (
+        *(_error_asked(what, asked, unit) for _, what, _, asked, unit in _ERRORS), _FIELD_COST,
+        _REST_INSIDE, _WITHOUT_FIELD, _NOT_TRUSTED), grows=True),
+    "detours": Part(_detour_table, 30, DETOUR_ROWS, grows=True),
+    "trials": Part(_trial_rows, 90, (*_BOUND_ROWS, *_TIME_ROWS, *_FULL_ROWS, *map(
+        _saved_asked, _AGAINST), _FROM_REST), grows=True),
+    "no-path": Part(_no_path_rows, 20, (_NO_PATH,)),
+    "sure": Part(_sure_table, 120, (SURE_ROW,), grows=True),
+    "reduced": Part(_reduced_time, 200, (_REDUCED_COST, *(
+        _error_asked(f"{what}, field on the reduced model", asked, unit)
+        for _, what, _, asked, unit in _ERRORS))),
+    "field-time": Part(_field_time, 60, (_FIELD_ALONE,), alone=True),
+    "plan-time": Part(_plan_time, 60, _TIME_ROWS, grows=True, alone=True)}
+"""The table, in order of importance; the last two only repeat times of others, for a machine that
+does nothing else."""

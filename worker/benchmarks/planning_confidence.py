@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.planning_branches import Subject
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row
 from limber.errors import LimberError, NoPathError
 from limber.planning.chance import YoungDoubt
 from limber.planning.field.energy_field import EnergyField
@@ -23,6 +23,8 @@ _LOW = 0.6  # of the limit: a pose of less force breaks it under no likely draw
 _TIGHT = (0.5, 0.75, 0.9, 1.0)
 """Where the limit lies between what the goal itself needs and what the motion without limit takes,
 each with the confidence: the first at which there is a plan."""
+SURE_ROW = Asked(f"force limit kept at --confidence {CONFIDENCE}, each draw on the full model",
+                 "90 to 100 %")
 
 
 @dataclass
@@ -112,15 +114,14 @@ def sure_rows(found: list[Sure], draws: int) -> list[Row]:
     good = [one for one in found if one.kept is not None]
     troubles = "; ".join(f"{one.branch}: {one.trouble}" for one in found if one.trouble)
     if not good:
-        return [Row(f"limits kept at --confidence {CONFIDENCE}", "90 to 100 %", troubles, False)]
+        return [Row(*SURE_ROW, troubles, False, len(found))]
     kept = 100.0 * np.array([one.kept for one in good])
     before = 100.0 * np.array([one.before for one in good])
     tight = [one.tight for one in good]
     return [Row(
-        f"force limit kept at --confidence {CONFIDENCE}, {draws} draws each on the full model, "
-        f"{len(good)} of {len(found)} branches; limit at {100 * min(tight):.0f} to "
+        *SURE_ROW, f"{kept.min():.0f} to {kept.max():.0f} %, mean {kept.mean():.1f}, of {draws} "
+        f"draws each; {len(good)} of {len(found)} branches, limit at {100 * min(tight):.0f} to "
         f"{100 * max(tight):.0f} % of the way from what the goal needs to what the free motion "
-        "takes", "90 to 100 %",
-        f"{kept.min():.0f} to {kept.max():.0f} %, mean {kept.mean():.1f}; planned for the estimate "
-        f"alone {before.min():.0f} to {before.max():.0f}" + (f"; {troubles}" if troubles else ""),
-        bool(kept.min() >= 90.0 and len(good) == len(found)))]
+        f"takes; planned for the estimate alone {before.min():.0f} to {before.max():.0f}"
+        + (f"; {troubles}" if troubles else ""),
+        bool(kept.min() >= 90.0 and len(good) == len(found)), len(found))]

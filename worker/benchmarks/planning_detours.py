@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.integrate import trapezoid
 
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row
 from limber.errors import LimberError
 from limber.planning.compare import plan_pair, random_start
 from limber.planning.cost import arc_lengths, resample
@@ -17,6 +17,11 @@ SAVED, ADDED = 35.69, 8.10
 """Percent, means over the paper's three branches."""
 
 _AGAINST = ("RRT*, not smoothed", "RRT*", "straight line")
+DETOUR_ROWS = (*(Asked(
+    f"paper's arcs, --max-detour {ADDED}: saved against {name}",
+    f"paper: {SAVED} %, {ADDED} % longer" if name == _AGAINST[0] else "-") for name in _AGAINST),
+    Asked("there: points of saving that the certified optimum may still have, median / worst",
+          "2"))
 
 
 @dataclass
@@ -63,21 +68,19 @@ def detour_rows(detours: list[Detour]) -> list[Row]:
     """Return the rows of the paper's table."""
     good = [one for one in detours if not one.trouble]
     table = []
-    for name in _AGAINST:
+    for row, name in zip(DETOUR_ROWS, _AGAINST, strict=False):
         saved = [one.saved[name] for one in good if name in one.saved]
         added = [one.added[name] for one in good if name in one.saved]
         asked = name == _AGAINST[0]
         table.append(Row(
-            f"paper's arcs, --max-detour {ADDED}: saved against {name}",
-            f"paper: {SAVED} %, {ADDED} % longer" if asked else "-",
+            *row,
             f"{np.mean(saved):.1f} %, {np.mean(added):+.1f} % long, {len(saved)} of "
             f"{len(detours)} starts" if saved else "none",
-            bool(saved and np.mean(saved) > SAVED) if asked else None))
+            bool(saved and np.mean(saved) > SAVED) if asked else None, len(detours)))
     below = [one.below_bound for one in good if one.below_bound is not None]
     table.append(Row(
-        "there: points of saving that the certified optimum may still have, median / worst",
-        "2", f"{np.median(below):.2f} / {np.max(below):.2f}" if below else "none",
-        bool(below) and float(np.median(below)) <= 2.0))
+        *DETOUR_ROWS[-1], f"{np.median(below):.2f} / {np.max(below):.2f}" if below else "none",
+        bool(below) and float(np.median(below)) <= 2.0, len(below)))
     return table
 
 

@@ -6,14 +6,13 @@ virtual controller and the driver share it.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.held_up import Voided, Witness
-from benchmarks.robot_branches import FAULTS_OF_BRANCHES, followed_paths, lost_branches
+from benchmarks.robot_branches import FOLLOWED_ROWS, LOST_ROW, followed_paths, lost_branches
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
     FAULTS,
@@ -24,11 +23,10 @@ from benchmarks.robot_faults import (
     restored,
     straight,
 )
-from benchmarks.robot_loop import closed_loops
-from benchmarks.robot_stream import recorded_stream
-from benchmarks.table import Row
+from benchmarks.robot_loop import LOOP_ROWS, closed_loops
+from benchmarks.robot_stream import LEAST_STREAM_S, STREAM_ROWS, recorded_stream
+from benchmarks.table import Asked, Part, Row, Setting
 from limber.errors import LimberError
-from limber.progress import Progress
 from limber.robot.arms import ARMS
 from limber.robot.expected import ExpectedWrench
 from limber.robot.kinematics import forward, inverse
@@ -39,30 +37,27 @@ from limber.robot.virtual.launch import VirtualRobot
 _ADDRESS = "127.0.0.71"
 
 
-@dataclass(frozen=True)
-class Setting:
-    """How much is measured: ``quick`` does each fault once, takes one branch, records for 8 s."""
-
-    quick: bool
-    seed: int
-    out: Path | None
-    voided: Voided
-
-
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int = 0,
-         only: tuple[str, ...] = ()) -> list[Row]:
-    """Measure the parts named in ``only``, or all."""
-    table: list[Row] = []
-    chosen = only or WHOLE
-    with Witness() as witness:
-        for number, name in enumerate(chosen):
-            share = progress.part(number / len(chosen), (number + 1) / len(chosen))
-            share(0.0, name)
-            table += PARTS[name](Setting(quick, seed, out, Voided(witness)), share)
-    return table
+_KINEMATICS = (
+    Asked("kinematics: position of every inverse solution, 10,000 poses, 7 arms", "1e-9 m"),
+    Asked("kinematics: poses whose own joints are not among the solutions", "0"),
+    Asked("kinematics against an independent library: position", "1e-9 m"),
+    Asked("poses with another number of inverse solutions than the library's", "0"))
+_STOP_SECONDS = {125: 0.012, 500: 0.006}
+"""Asked [s], by the controller's rate [Hz]."""
+_PATH = Asked("following a path at 30 mm/s: distance from it, worst", "1 mm")
 
 
-def _kinematics(setting: Setting, _progress: Progress) -> list[Row]:
+def _stop_asked(rate: int) -> tuple[Asked, ...]:
+    return (Asked(f"force over the hard limit until the stop command, {rate} Hz, worst",
+                  f"{1000 * _STOP_SECONDS[rate]:.0f} ms"),
+            Asked(f"way after the limit at 50 mm/s, {rate} Hz, worst", "reported"))
+
+
+def _faults_asked(told: str) -> Asked:
+    return Asked(f"{told} while moving: standstill and a report", "every one")
+
+
+def _kinematics(setting: Setting) -> list[Row]:
     rng = np.random.default_rng(setting.seed)
     worst, missing, count = 0.0, 0, 10_000 // len(ARMS) + 1
     for arm in ARMS.values():
@@ -75,15 +70,14 @@ def _kinematics(setting: Setting, _progress: Progress) -> list[Row]:
             (again - frames[:, None])[..., :3, 3], axis=-1)[exist].max()))
         apart = np.abs((solutions - joints[:, None] + np.pi) % (2 * np.pi) - np.pi).max(axis=-1)
         missing += int(np.sum(~(np.nanmin(apart, axis=1) < 1e-6)))
-    found = [Row("kinematics: position of every inverse solution, 10,000 poses, 7 arms",
-                 "1e-9 m", f"{worst:.1e} m", worst < 1e-9),
-             Row("kinematics: poses whose own joints are not among the solutions", "0",
-                 str(missing), missing == 0)]
+    total = count * len(ARMS)
+    found = [Row(*_KINEMATICS[0], f"{worst:.1e} m", worst < 1e-9, total),
+             Row(*_KINEMATICS[1], str(missing), missing == 0, total)]
     try:
         import ur_analytic_ik
     except ImportError:
-        return [*found, Row("kinematics against an independent library", "1e-9 m",
-                            "library not installed", None)]
+        return [*found, *(Row(*asked, "library not installed", None, 0)
+                          for asked in _KINEMATICS[2:])]
     off, lacking = 0.0, 0
     for name, arm in ARMS.items():
         library = getattr(ur_analytic_ik, name)
@@ -94,10 +88,8 @@ def _kinematics(setting: Setting, _progress: Progress) -> list[Row]:
         ours = np.isfinite(inverse(arm, frames)).all(axis=-1).sum(axis=1)
         lacking += sum(len(library.inverse_kinematics(frame)) != number
                        for frame, number in zip(frames, ours, strict=True))
-    return [*found, Row("kinematics against an independent library: position", "1e-9 m",
-                        f"{off:.1e} m", off < 1e-9),
-            Row("poses with another number of inverse solutions than the library's", "0",
-                str(lacking), lacking == 0)]
+    return [*found, Row(*_KINEMATICS[2], f"{off:.1e} m", off < 1e-9, total),
+            Row(*_KINEMATICS[3], str(lacking), lacking == 0, total)]
 
 
 @dataclass(frozen=True)
@@ -113,35 +105,42 @@ class _Stop:
     until: float
 
 
-def _stop_time(setting: Setting, _progress: Progress, model: str) -> list[Row]:
+def _stop_time(setting: Setting, voided: Voided, model: str) -> list[Row]:
     """From the step at which the force goes over the limit until the stop command has come.
 
     An FT300 tells its force every 10 ms, which is part of it. A stop that was late by no more
     than the machine stood still meanwhile is done again, and told with its time.
     """
-    rate, asked = (125, 0.012) if model == "ur5" else (500, 0.006)
-    stops, late = [], []
-    runs = 2 if setting.quick else 20
+    rate = 125 if model == "ur5" else 500
+    asked = _STOP_SECONDS[rate]
+    stops, late, runs = [], [], setting.at_most(20, 2)
     with new_robot(_ADDRESS, model, setting.seed) as robot:
-        while len(stops) < runs:
-            stop = setting.voided.again(partial(_one_stop, robot, model, 1.0 / rate),
-                                        f"stop at {rate} Hz")
+        for _ in setting.budget.seeds(0, 2 * runs):
+            stop = voided.again(partial(_one_stop, robot, model, 1.0 / rate),
+                                f"stop at {rate} Hz")
             over = stop.latency - asked
-            if over > 1e-6 and len(late) < runs and setting.voided.explains(
+            if over > 1e-6 and len(late) < runs and voided.explains(
                     stop.since, stop.until, over, f"stop at {rate} Hz"):
                 late.append(stop)
                 continue
             stops.append(stop)
+            if len(stops) == runs:
+                break
+    return _stop_rows(rate, stops, late)
+
+
+def _stop_rows(rate: int, stops: list[_Stop], late: list[_Stop]) -> list[Row]:
+    again = "" if not late else (f"; {len(late)} done again, the machine stood still: to "
+                                 f"{1000 * max(stop.latency for stop in late):.1f} ms")
+    time_asked, way_asked = _stop_asked(rate)
+    way = Row(*way_asked, f"{1000 * max(stop.way for stop in stops + late):.1f} mm", None,
+              len(stops + late))
+    if not stops:
+        return [Row(*time_asked, f"none that the machine let be measured{again}", None, 0), way]
     worst = max(stop.latency for stop in stops)
     median = np.median([stop.latency for stop in stops])
-    held_up = "" if not late else (f"; {len(late)} done again, the machine stood still: to "
-                                   f"{1000 * max(stop.latency for stop in late):.1f} ms")
-    return [Row(f"force over the hard limit until the stop command, {rate} Hz, worst of {runs}",
-                f"{1000 * asked:.0f} ms",
-                f"{1000 * worst:.1f} ms (median {1000 * median:.1f}){held_up}",
-                worst <= asked + 1e-6),
-            Row(f"way after the limit at 50 mm/s, {rate} Hz, worst", "reported",
-                f"{1000 * max(stop.way for stop in stops + late):.1f} mm", None)]
+    return [Row(*time_asked, f"{1000 * worst:.1f} ms (median {1000 * median:.1f}){again}",
+                worst <= _STOP_SECONDS[rate] + 1e-6, len(stops)), way]
 
 
 def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
@@ -171,7 +170,7 @@ def _one_stop(robot: VirtualRobot, model: str, step: float) -> _Stop:
     return _Stop(stopped - acts, way, since, came + stopped - acts)
 
 
-def _path(setting: Setting, _progress: Progress) -> list[Row]:
+def _path(setting: Setting, _voided: Voided) -> list[Row]:
     collected: list[np.ndarray] = []
     with new_robot(_ADDRESS, "ur5e", setting.seed) as robot:
         start = np.array(robot.state["pose"])
@@ -186,69 +185,81 @@ def _path(setting: Setting, _progress: Progress) -> list[Row]:
     samples = np.concatenate(collected)
     distance = max(float(np.linalg.norm(poses[:, :3] - row, axis=1).min())
                    for row in samples[:, 1:4])
-    return [Row("following a path at 30 mm/s: distance from it, worst", "1 mm",
-                f"{1000 * distance:.2f} mm", distance < 1e-3)]
+    return [Row(*_PATH, f"{1000 * distance:.2f} mm", distance < 1e-3)]
 
 
-def _faults(setting: Setting, progress: Progress, names: tuple[str, ...] = tuple(FAULTS),
+def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(FAULTS),
             ) -> list[Row]:
-    failed, total, slowest, runs = [], 0, 0.0, 1 if setting.quick else 20
-    for number, name in enumerate(names):
-        progress(number / len(names), name)
-        seed = setting.seed + list(FAULTS).index(name)
-        robot = new_robot(_ADDRESS, "ur5e", seed)
+    failed, slowest, runs = [], 0.0, {}
+    for name, budget in setting.budget.shares(list(names)):
+        setting.progress(len(runs) / len(names), name)
+        some, outcomes = _fault_runs(name, replace(setting, budget=budget), voided)
+        failed += some
+        runs[name] = len(some) + len(outcomes)
+        if name not in ENDS_ROBOT:
+            slowest = max([slowest, *(outcome.standstill_s for outcome in outcomes)])
+        print(f"{name}: {runs[name]} runs, {len(failed)} failed so far", flush=True)
+    total = sum(runs.values())
+    each = (f"{min(runs.values())} to {max(runs.values())} runs of {len(runs)} of {len(names)} "
+            "faults; " if len(names) > 1 else "")
+    # What did not come to its turn is not known to be good.
+    is_met = False if failed else True if len(runs) == len(names) else None
+    return [Row(*_faults_asked(_faults_told(names)), f"{total - len(failed)} of {total}; {each}"
+                f"slowest standstill {slowest:.2f} s{voided}", is_met, total)]
 
-        def run(name: str = name, seed: int = seed) -> Outcome:
-            nonlocal robot
-            if robot.process.poll() is not None:
-                robot.close()
-                robot = new_robot(_ADDRESS, "ur5e", seed)
-            restored(robot)
-            return provoke(name, robot, cell_for(_ADDRESS))
-        try:
-            for _ in range(runs):
-                total += 1
-                try:
-                    outcome = setting.voided.again(run, name)
-                except (AssertionError, LimberError) as error:
-                    failed.append(f"{name}: {error}")
-                    print(failed[-1], flush=True)
-                    continue
-                if name not in ENDS_ROBOT:
-                    slowest = max(slowest, outcome.standstill_s)
-        finally:
+
+def _faults_told(names: tuple[str, ...]) -> str:
+    return f"{len(names)} faults" if len(names) > 1 else names[0]
+
+
+def _fault_runs(name: str, setting: Setting, voided: Voided) -> tuple[list[str], list[Outcome]]:
+    """Provoke a fault as often as there is time for: what failed, and the other runs' outcomes."""
+    failed, outcomes = [], []
+    seed = setting.seed + list(FAULTS).index(name)
+    robot = new_robot(_ADDRESS, "ur5e", seed)
+
+    def run() -> Outcome:
+        nonlocal robot
+        if robot.process.poll() is not None:
             robot.close()
-        print(f"{name}: {runs} runs, {len(failed)} failed so far", flush=True)
-    told = f"{len(names)} faults" if len(names) > 1 else names[0]
-    return [Row(f"{told} while moving, {runs} runs each: standstill and a report", "every one",
-                f"{total - len(failed)} of {total}; slowest standstill {slowest:.2f} s"
-                f"{setting.voided}", not failed)]
+            robot = new_robot(_ADDRESS, "ur5e", seed)
+        restored(robot)
+        return provoke(name, robot, cell_for(_ADDRESS))
+    try:
+        for _ in setting.budget.seeds(0, setting.at_most(20, 1)):
+            try:
+                outcomes.append(voided.again(run, name))
+            except (AssertionError, LimberError) as error:
+                failed.append(f"{name}: {error}")
+                print(failed[-1], flush=True)
+    finally:
+        robot.close()
+    return failed, outcomes
 
 
-def _followed(setting: Setting, _progress: Progress) -> list[Row]:
-    return followed_paths(setting.seed, 1 if setting.quick else 10, _ADDRESS, setting.voided)
+def _watched(run: Callable[[Setting, Voided], list[Row]]) -> Callable[[Setting], list[Row]]:
+    """Return a part that is told when the machine stood still."""
+    def measured(setting: Setting) -> list[Row]:
+        with Witness() as witness:
+            return run(setting, Voided(witness))
+    return measured
 
 
-def _lost(setting: Setting, _progress: Progress) -> list[Row]:
-    return [lost_branches(setting.seed, 1 if setting.quick else 20, _ADDRESS,
-                          FAULTS_OF_BRANCHES[:1] if setting.quick else FAULTS_OF_BRANCHES,
-                          setting.voided)]
-
-
-def _stream(setting: Setting, _progress: Progress) -> list[Row]:
-    return recorded_stream(setting.seed, 8.0 if setting.quick else 600.0, _ADDRESS)
-
-
-def _loops(setting: Setting, progress: Progress) -> list[Row]:
-    return closed_loops(setting.seed, 1 if setting.quick else 10, _ADDRESS, progress, setting.out,
-                        setting.voided)
-
-
-WHOLE: dict[str, Callable[[Setting, Progress], list[Row]]] = {
-    "kinematics": _kinematics, "stop-125": partial(_stop_time, model="ur5"),
-    "stop-500": partial(_stop_time, model="ur5e"), "path": _path, "faults": _faults,
-    "branches": _followed, "lost": _lost, "stream": _stream, "loops": _loops}
-"""The table's parts, in its order."""
-PARTS = WHOLE | {f"fault:{name}".replace(" ", "-"): partial(_faults, names=(name,))
-                 for name in FAULTS}
-"""What ``--only`` knows: those, and each fault by itself."""
+PARTS = {
+    "kinematics": Part(_kinematics, 10, _KINEMATICS),
+    "stop-500": Part(_watched(partial(_stop_time, model="ur5e")), 15, _stop_asked(500),
+                     grows=True),
+    "stop-125": Part(_watched(partial(_stop_time, model="ur5")), 15, _stop_asked(125), grows=True),
+    "path": Part(_watched(_path), 20, (_PATH,)),
+    "faults": Part(_watched(_faults), 150, (_faults_asked(_faults_told(tuple(FAULTS))),),
+                   grows=True),
+    "branches": Part(_watched(partial(followed_paths, address=_ADDRESS)), 60, FOLLOWED_ROWS,
+                     grows=True),
+    "lost": Part(_watched(partial(lost_branches, address=_ADDRESS)), 100, (LOST_ROW,), grows=True),
+    "loops": Part(_watched(partial(closed_loops, address=_ADDRESS)), 240, LOOP_ROWS, grows=True),
+    "stream": Part(partial(recorded_stream, address=_ADDRESS), LEAST_STREAM_S, STREAM_ROWS,
+                   grows=True)}
+"""The table, in order of importance; ``--only`` also knows each fault by itself."""
+PARTS |= {f"fault:{name}".replace(" ", "-"): Part(
+    _watched(partial(_faults, names=(name,))), 15, (_faults_asked(name),), grows=True, alone=True)
+    for name in FAULTS}

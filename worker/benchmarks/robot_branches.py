@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.held_up import Voided
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.errors import LimberError, SafetyStop
 from limber.estimation.virtual_pull import VirtualPullSettings
 from limber.geometry.generated import generate_branch
@@ -39,6 +39,11 @@ _PEAK_N, _TRAVEL_M = 6.0, 0.04
 _WITHIN = 0.95
 _OFF_N = 0.5
 """From here on the virtual branch itself was off, by its own word: chosen."""
+
+FOLLOWED_ROWS = (
+    Asked("force within 5 % of the peak or the interval, least share of a branch's path", "95 %"),
+    Asked("following a branch's path: distance from it, worst", "1 mm"),
+    Asked("difference of the force, 95 % of a path below, worst branch", "reported"))
 
 
 def random_branch(folder: Path, seed: int) -> tuple[Branch, tuple[float, ...]]:
@@ -92,35 +97,30 @@ def _plan_sideways(branch: Branch, push: np.ndarray) -> None:
         stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def followed_paths(seed: int, count: int, address: str, voided: Voided) -> list[Row]:
-    """Follow a path with each of ``count`` branches: force as predicted, where the arm went."""
+def followed_paths(setting: Setting, voided: Voided, address: str) -> list[Row]:
+    """Follow a path with random branches: force as predicted, where the arm went."""
     within, errors, ways, stopped = [], [], [], []
-    for number in range(count):
+    for seed in setting.budget.seeds(setting.seed, setting.at_most(10, 1)):
         try:
-            result, state = voided.again(partial(_followed, seed + number, address),
-                                         f"seed {seed + number}")
+            result, state = voided.again(partial(_followed, seed, address), f"seed {seed}")
         except (AssertionError, LimberError) as error:
-            stopped.append(f"seed {seed + number}: {error}")
+            stopped.append(f"seed {seed}: {error}")
+            print(stopped[-1], flush=True)
             continue
         within.append(result["force_within_share"])
         errors.append(result["force_error_of_peak"])
         ways.append(result["path_error_m"])
-        print(f"seed {seed + number}: within {within[-1]:.3f}, 95 % of the path below "
+        print(f"seed {seed}: within {within[-1]:.3f}, 95 % of the path below "
               f"{100 * errors[-1]:.1f} % of {result['predicted_peak_force_n']:.1f} N, the virtual "
-              f"branch's extrapolation off by {state:.2f} N at most")
-    for line in stopped:
-        print(line)
+              f"branch's extrapolation off by {state:.2f} N at most", flush=True)
+    count = len(within) + len(stopped)
     if not within:
-        return [Row("predicted against measured force along the path", "95 % of it",
-                    "no run reached its end", False)]
+        return [Row(*asked, "no run reached its end", False, count) for asked in FOLLOWED_ROWS]
     return [
-        Row(f"force within 5 % of the peak or the interval, {count} branches, least share of a "
-            "path", "95 %", f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f}); "
-            f"{len(stopped)} failed{voided}", min(within) >= _WITHIN and not stopped),
-        Row("difference of the force, 95 % of a path below, worst branch", "reported",
-            f"{100 * max(errors):.1f} % of the peak", None),
-        Row("following a branch's path: distance from it, worst", "1 mm",
-            f"{1000 * max(ways):.2f} mm", max(ways) < 1e-3)]
+        Row(*FOLLOWED_ROWS[0], f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f}); "
+            f"{len(stopped)} failed{voided}", min(within) >= _WITHIN and not stopped, count),
+        Row(*FOLLOWED_ROWS[1], f"{1000 * max(ways):.2f} mm", max(ways) < 1e-3, len(ways)),
+        Row(*FOLLOWED_ROWS[2], f"{100 * max(errors):.1f} % of the peak", None, len(errors))]
 
 
 def _followed(seed: int, address: str) -> tuple[dict, float]:
@@ -181,27 +181,28 @@ def _watch(robot: VirtualRobot, largest: list[float], ended: threading.Event,
 FAULTS_OF_BRANCHES: tuple[tuple[str, Callable[[VirtualRobot], None]], ...] = (
     ("slips", lambda robot: robot.ask("slip", part=0.95) and None),
     ("breaks", lambda robot: robot.ask("break") and None))
+LOST_ROW = Asked("branch slips, branch breaks while it is led: stop for the lost force, and a "
+                 "report", "every one")
 
 
-def lost_branches(seed: int, runs: int, address: str,
-                  faults: tuple[tuple[str, Callable[[VirtualRobot], None]], ...],
-                  voided: Voided) -> Row:
+def lost_branches(setting: Setting, voided: Voided, address: str) -> list[Row]:
     """The branch slips in the grip, or breaks, while it is led: the arm stands and says so."""
-    told, failed = [], []
-    for number in range(runs):
-        for name, fault in faults:
-            began = time.monotonic()
-            try:
-                told.append(voided.again(partial(_stop_for_loss, seed + number, address, fault),
-                                         f"{name}, seed {seed + number}"))
-            except (AssertionError, LimberError) as error:
-                failed.append(f"{name}, seed {seed + number}: {error}")
-            print(f"branch {name}: {time.monotonic() - began:.0f} s in all", flush=True)
+    told, failed, runs = [], [], 0
+    tasks = [(setting.seed + number, *fault) for number in range(setting.at_most(20, 1))
+             for fault in FAULTS_OF_BRANCHES]
+    # One run at least of each fault.
+    for seed, name, fault in setting.budget.items(tasks, at_least=len(FAULTS_OF_BRANCHES)):
+        began = time.monotonic()
+        runs += 1
+        try:
+            told.append(voided.again(partial(_stop_for_loss, seed, address, fault),
+                                     f"{name}, seed {seed}"))
+        except (AssertionError, LimberError) as error:
+            failed.append(f"{name}, seed {seed}: {error}")
+        print(f"branch {name}: {time.monotonic() - began:.0f} s in all", flush=True)
     for line in (*failed, *told[:2]):
         print(line)
-    names = ", ".join(f"branch {name}" for name, _ in faults)
-    return Row(f"{names} while it is led, {runs} runs each: stop for the lost force, and a report",
-               "every one", f"{len(told)} of {len(faults) * runs}{voided}", not failed)
+    return [Row(*LOST_ROW, f"{len(told)} of {runs}{voided}", not failed, runs)]
 
 
 def _stop_for_loss(seed: int, address: str, fault: Callable[[VirtualRobot], None]) -> str:

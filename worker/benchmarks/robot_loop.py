@@ -3,14 +3,15 @@
 import shutil
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.held_up import Voided
-from benchmarks.kept_trials import keep, read_trials, source_digest
-from benchmarks.table import Row
+from benchmarks.kept_trials import go_on, read_trials, source_digest
+from benchmarks.table import Asked, Row, Setting, share_met
 from limber.closed_loop.loop import GOAL_TOLERANCE_M, OPEN_FACTOR, ClosedLoop, comparison
 from limber.errors import LimberError
 from limber.progress import Progress
@@ -29,24 +30,28 @@ class _Loop:
     error: str | None
 
 
-def closed_loops(seed: int, count: int, address: str, progress: Progress, out: Path | None,
-                 voided: Voided) -> list[Row]:
-    """Go around with each of ``count`` random branches.
+_LOOP = "closed loop on random branches"
+LOOP_ROWS = (
+    Asked(f"{_LOOP}: ended, no limit broken", "all"),
+    Asked(f"{_LOOP}: true E in its 95 % interval", "88 to 99 %"),
+    Asked(f"{_LOOP}: the flower within {1000 * GOAL_TOLERANCE_M:.0f} mm of its goal", "all"),
+    Asked(f"{_LOOP}: force within 5 % of the peak or the interval, least share of a path", "95 %"),
+    Asked(f"{_LOOP}: an interval of E open beyond a factor of {OPEN_FACTOR:g} that another pull "
+          "would be worth for the path", "reported"),
+    Asked(f"{_LOOP}: way after a provoked overload at 30 mm/s, worst", "reported"))
 
-    Where ``out`` is given folders stay there, and loops that were made before with these seeds and
+
+def closed_loops(setting: Setting, voided: Voided, address: str) -> list[Row]:
+    """Go around with as many random branches as there is time for.
+
+    Folders stay where the user named one; loops that were made before with these seeds and
     sources are taken over.
     """
-    source = source_digest(_PACKAGES, __file__)
-    kept = None if out is None else out / "loops.jsonl"
-    known = {loop.seed: loop for loop in read_trials(_Loop, kept) if loop.source == source}
-    loops = []
-    for number in range(count):
-        which = seed + number
-        if which not in known:
-            known[which] = _once(which, source, address, out, progress.part(
-                number / count, (number + 1) / count), voided)
-            keep(known[which], kept)
-        loops.append(known[which])
+    source, kept = source_digest(_PACKAGES, __file__), setting.kept / "loops.jsonl"
+    seeds = [setting.seed + number for number in range(setting.at_most(10, 1))]
+    loops = go_on(read_trials(_Loop, kept), seeds, lambda loop: loop.seed, partial(
+        _once, source=source, address=address, out=setting.out, progress=setting.progress,
+        voided=voided), source, kept, setting.budget)
     return _rows(loops, voided)
 
 
@@ -76,9 +81,8 @@ def _rows(loops: list[_Loop], voided: Voided) -> list[Row]:
     count = len(loops)
     for line in failed:
         print(line, flush=True)
-    told = f"closed loop, {count} branches"
     if not results:
-        return [Row(f"{told}: ended", "all", f"none: {failed[0]}", False)]
+        return [Row(*asked, f"none ended: {failed[0]}", False, count) for asked in LOOP_ROWS]
     covered = np.concatenate([result["covered"] for result in results])
     share = float(covered.mean())
     within = [result["force_within_share"] for result in results]
@@ -88,23 +92,17 @@ def _rows(loops: list[_Loop], voided: Voided) -> list[Row]:
     worst = max(result["flower_off_m"] or np.inf for result in results)
     opened = [result for result in results if result["open_factor"] > OPEN_FACTOR]
     pulls = sum(result["pull_count"] for result in results)
-    # So few intervals cannot tell 99 from 100 %.
-    is_covered = None if share > 0.99 else 0.88 <= share
     return [
-        Row(f"{told}: true E in its 95 % interval", "88 to 99 %",
-            f"{int(covered.sum())} of {len(covered)} ({100 * share:.0f} %)", is_covered),
-        Row(f"{told}: the flower within {1000 * GOAL_TOLERANCE_M:.0f} mm of its goal", "all",
-            f"{sum(flowers)} of {count}; farthest {1000 * worst:.1f} mm",
-            all(flowers) and not failed),
-        Row(f"{told}: ended, no limit broken", "all",
-            f"{len(results)} of {count} ended, {broken} broke one{voided}",
-            not failed and not broken),
-        Row(f"{told}: force within 5 % of the peak or the interval, least share of a path", "95 %",
-            f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f})",
-            min(within) >= 0.95 and not failed),
-        Row(f"{told}: an interval of E open beyond a factor of {OPEN_FACTOR:g} that another pull "
-            "would be worth for the path", "reported", f"{len(opened)} open after {pulls} pulls: "
+        Row(*LOOP_ROWS[0], f"{len(results)} of {count} ended, {broken} broke one{voided}",
+            not failed and not broken, count),
+        Row(*LOOP_ROWS[1], f"{int(covered.sum())} of {len(covered)} ({100 * share:.0f} %)",
+            share_met(share, len(covered), 0.88, 0.99), len(results)),
+        Row(*LOOP_ROWS[2], f"{sum(flowers)} of {count}; farthest {1000 * worst:.1f} mm",
+            all(flowers) and not failed, count),
+        Row(*LOOP_ROWS[3], f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f})",
+            min(within) >= 0.95 and not failed, count),
+        Row(*LOOP_ROWS[4], f"{len(opened)} open after {pulls} pulls: "
             f"{sum('keeps its limits' in one['no_further_pull'] for one in opened)} of no worth "
-            "for it", None),
-        Row(f"{told}: way after a provoked overload at 30 mm/s, worst", "reported",
-            f"{1000 * max(ways):.1f} mm" if ways else "none came to one", None)]
+            "for it", None, len(results)),
+        Row(*LOOP_ROWS[5],
+            f"{1000 * max(ways):.1f} mm" if ways else "none came to one", None, len(ways))]

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.batch.job_file import StageTask
 from limber.batch.task import run_task
 from limber.jobs import Pool
-from limber.progress import SILENT, Progress
+from limber.progress import SILENT
 from limber.stages.generate import GenerateInputs, GenerateSettings
 from limber.stages.registry import stage_description
 
@@ -24,14 +24,24 @@ _ESTIMATE = ('[[job.stage]]\nrun = "virtual-pull"\nname = "pull-1"\n'
              '[[job.stage]]\nrun = "estimate"\n')
 
 
-def speed_up(count: int, seed: int, progress: Progress) -> Row:
-    """``count`` branches, reconstruct and estimate, with one and with two workers."""
+MEMORY_ROW = Asked("memory over jobs in one worker, after the tenth", "under 5 %")
+DASK_ROWS = (
+    Asked("branches on a Dask scheduler and two workers, against the pool", "within 15 %"),
+    Asked("their files, times aside", "bit for bit the same"))
+SPEED_UP_ROW = Asked("generated branches, reconstruct and estimate: two workers against one",
+                     "1.8 times")
+
+
+def speed_up(setting: Setting) -> list[Row]:
+    """As many branches as there is time for, with one and with two workers."""
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         folder = Path(place)
-        make_scans(folder, count, seed)
+        # With one worker each takes its time, with two about half of it.
+        count = _fitting(setting, folder, setting.at_most(40, 4), 1.5)
+        make_scans(folder, count, setting.seed)
         seconds, done = [], []
         for workers in (1, 2):
-            progress(0.5 * (workers - 1), f"{workers} worker(s)")
+            setting.progress(0.5 * (workers - 1), f"{workers} worker(s)")
             jobs = write_jobs(folder, f"by-{workers}", RECONSTRUCT + _ESTIMATE)
             started = time.perf_counter()
             start_batch(jobs, workers).wait()
@@ -39,20 +49,20 @@ def speed_up(count: int, seed: int, progress: Progress) -> Row:
             done.append(sum("estimate" in manifest["stages"]
                             for manifest in manifests(folder / f"by-{workers}").values()))
     times = seconds[0] / seconds[1]
-    return Row(f"{count} generated branches, reconstruct and estimate: two workers against one",
-               "1.8 times", f"{times:.2f} times ({seconds[0]:.0f} s, {seconds[1]:.0f} s); "
-               f"{done[0]} and {done[1]} have an estimate",
-               times >= 1.8 and done[0] == done[1] > 0.9 * count)
+    return [Row(*SPEED_UP_ROW, f"{times:.2f} times ({seconds[0]:.0f} s, {seconds[1]:.0f} s); "
+                f"{done[0]} and {done[1]} have an estimate",
+                times >= 1.8 and done[0] == done[1] > 0.9 * count, count)]
 
 
-def on_dask(count: int, seed: int, progress: Progress) -> list[Row]:
+def on_dask(setting: Setting) -> list[Row]:
     """The same jobs on the pool's two processes and on a Dask scheduler with two workers."""
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         folder = Path(place)
-        make_scans(folder, count, seed)
+        count = _fitting(setting, folder, setting.at_most(8, 2), 1.0)
+        make_scans(folder, count, setting.seed)
         seconds, codes = [], []
         for number, where in enumerate(("pool", "dask")):
-            progress(0.5 * number, where)
+            setting.progress(0.5 * number, where)
             jobs = write_jobs(folder, where, RECONSTRUCT + _ESTIMATE)
             started = time.perf_counter()
             words = ["--cluster", "local"] if where == "dask" else []
@@ -63,31 +73,40 @@ def on_dask(count: int, seed: int, progress: Progress) -> list[Row]:
         print("files apart:", apart)
     more = seconds[1] / seconds[0] - 1
     return [
-        Row(f"{count} branches on a Dask scheduler and two workers, against the pool",
-            "within 15 %", f"{100 * more:+.1f} % ({seconds[0]:.0f} s, {seconds[1]:.0f} s)",
-            more <= 0.15 and codes == [0, 0]),
-        Row("their files, times aside", "bit for bit the same",
-            f"{len(apart)} of {len(one)} apart", not apart and len(one) > 0)]
+        Row(*DASK_ROWS[0], f"{100 * more:+.1f} % ({seconds[0]:.0f} s, {seconds[1]:.0f} s)",
+            more <= 0.15 and codes == [0, 0], count),
+        Row(*DASK_ROWS[1], f"{len(apart)} of {len(one)} apart", not apart and len(one) > 0, count)]
 
 
-def memory(jobs: int, template: Path, progress: Progress) -> Row:
+def _fitting(setting: Setting, folder: Path, at_most: int, times: float) -> int:
+    """How many branches fit where each takes ``times`` its time alone, at least 2: one is timed."""
+    trial = folder / "timed"
+    trial.mkdir()
+    started = time.perf_counter()
+    make_scans(trial, 1, setting.seed)
+    start_batch(write_jobs(trial, "alone", RECONSTRUCT + _ESTIMATE), 1).wait()
+    each = times * (time.perf_counter() - started)
+    return int(np.clip(setting.budget.remaining / each, 2, at_most))
+
+
+def memory(setting: Setting, template: Path) -> Row:
     """Memory of one worker over many jobs, after the tenth."""
+    jobs = setting.at_most(100, 30)
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place, \
             Pool(1, name="a job of the bench") as pool:
         folder = Path(shutil.copytree(template, Path(place, "a.branch")))
         stage = stage_description("load")
         used = []
-        for number in range(jobs):
-            progress(number / jobs, f"job {number + 1}")
+        for number in setting.budget.seeds(0, jobs, at_least=20):
+            setting.progress(number / jobs, f"job {number + 1}")
             task = StageTask("load", stage.inputs(branch_folder=folder), stage.settings(
                 wind=(3.0 + 0.01 * number, 0.0, 0.0)), stage.options())
             outcome = pool.submit(run_task, task, folder).result()
             if outcome["error"]:
-                return Row("memory over jobs in one worker", "under 5 %", outcome["error"], None)
+                return Row(*MEMORY_ROW, outcome["error"], False, number)
             used.append(outcome["memory_mb"])
     grown = float(np.median(used[-5:]) / np.median(used[9:14]) - 1)
-    return Row(f"memory over {jobs} jobs in one worker, after the tenth", "under 5 %",
-               f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05)
+    return Row(*MEMORY_ROW, f"{100 * grown:+.1f} % ({used[-1]:.0f} MB)", grown < 0.05, len(used))
 
 
 def make_scans(folder: Path, count: int, seed: int) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.linalg import eigh
 
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.exports.abaqus import inp_text
 from limber.exports.mjcf import mjcf_text
 from limber.exports.usd import as_deformable
@@ -36,35 +36,50 @@ class Bent:
     frequency: float
 
 
-def rows(seeds: list[int], progress: Progress) -> list[Row]:
+_PROGRAMS = ("MuJoCo, weightless", "MuJoCo, hanging", "USD (its mesh and modulus by our solver)",
+             "CalculiX, weightless")
+EXPORT_ROWS = tuple(Asked(f"export in {label}, worst: static tip; first frequency", "2 %; 2 %")
+                    for label in _PROGRAMS)
+
+
+def exported(setting: Setting) -> list[Row]:
     """Generated branches, weightless and hanging, in MuJoCo; weightless in CalculiX."""
     found: dict[str, list[tuple[float, float]]] = {}
-    for number, seed in enumerate(seeds):
-        progress(number / len(seeds), f"exports, seed {seed}")
-        branch = generate_branch(seed)
-        mesh = mesh_skeleton(branch.skeleton, ReconstructSettings(), progress).mesh
-        for label, gravity in (("MuJoCo, weightless", None), ("MuJoCo, hanging", (0, 0, -9.81))):
-            model = BranchModel(mesh, young=1e9, poisson=0.35, density=800.0, gravity=gravity)
-            model = model.as_scanned() if gravity else model
-            node, load = _load(model, branch.skeleton)
-            ours = bent_here(model, node, load)
-            theirs = bent_in_mujoco(model, branch.skeleton, mesh.nodes[node], load)
-            if theirs is not None:
-                found.setdefault(label, []).append(_apart(ours, theirs))
-            if gravity is None:
-                found.setdefault("USD (its mesh and modulus by our solver)", []).append(
-                    _apart(ours, bent_as_usd(model, node, load)))
-            if gravity is None and (theirs := bent_in_calculix(model, node, load)) is not None:
-                found.setdefault("CalculiX, weightless", []).append(_apart(ours, theirs))
-    return [_row(label, errors) for label, errors in found.items()] or [
-        Row("exports in other programs", "2 %, 2 %", "none is installed", None)]
+    seeds = setting.seeds(20, 2)
+    for number, seed in enumerate(setting.budget.items(seeds)):
+        setting.progress(number / len(seeds), f"exports, seed {seed}")
+        for label, apart in _bent(seed, setting.progress).items():
+            found.setdefault(label, []).append(apart)
+    return [_row(asked, found[label]) if label in found else
+            Row(*asked, "the program is not installed", None, 0)
+            for asked, label in zip(EXPORT_ROWS, _PROGRAMS, strict=True)]
 
 
-def _row(label: str, errors: list[tuple[float, float]]) -> Row:
+def _bent(seed: int, progress: Progress) -> dict[str, tuple[float, float]]:
+    """How far each program is apart from our elements, for one generated branch."""
+    found = {}
+    branch = generate_branch(seed)
+    mesh = mesh_skeleton(branch.skeleton, ReconstructSettings(), progress).mesh
+    mujoco_still, mujoco_hanging, usd, calculix = _PROGRAMS
+    for label, gravity in ((mujoco_still, None), (mujoco_hanging, (0, 0, -9.81))):
+        model = BranchModel(mesh, young=1e9, poisson=0.35, density=800.0, gravity=gravity)
+        model = model.as_scanned() if gravity else model
+        node, load = _load(model, branch.skeleton)
+        ours = bent_here(model, node, load)
+        theirs = bent_in_mujoco(model, branch.skeleton, mesh.nodes[node], load)
+        if theirs is not None:
+            found[label] = _apart(ours, theirs)
+        if gravity is None:
+            found[usd] = _apart(ours, bent_as_usd(model, node, load))
+            if (theirs := bent_in_calculix(model, node, load)) is not None:
+                found[calculix] = _apart(ours, theirs)
+    return found
+
+
+def _row(asked: Asked, errors: list[tuple[float, float]]) -> Row:
     tip, frequency = np.max(errors, axis=0)
-    return Row(f"export in {label}, worst of {len(errors)}: static tip; first frequency",
-               "2 %; 2 %", f"{100 * tip:.2f} %; {100 * frequency:.2f} %",
-               bool(tip <= 0.02 and frequency <= 0.02))
+    return Row(*asked, f"{100 * tip:.2f} %; {100 * frequency:.2f} %",
+               bool(tip <= 0.02 and frequency <= 0.02), len(errors))
 
 
 def _apart(ours: Bent, theirs: Bent) -> tuple[float, float]:

@@ -6,23 +6,24 @@ reader's name and a file; it answers with one line of JSON.
 
 import json
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
 import numpy as np
 
+from benchmarks.table import Setting
 from benchmarks.worker_mutations import mutated
 from benchmarks.worker_readers import READERS, Reader
 from limber.errors import LimberError
-from limber.progress import Progress
 
 MOST_SECONDS = 10.0
 MOST_BYTES = 2 << 30
@@ -42,40 +43,55 @@ class Outcomes:
     examples: list[tuple[str, str, str]] = field(default_factory=list)
 
     @property
+    def total(self) -> int:
+        return sum(self.counts.values())
+
+    @property
     def bad(self) -> int:
-        return sum(self.counts.values()) - self.counts["read"] - self.counts["refused"]
+        return self.total - self.counts["read"] - self.counts["refused"]
 
 
-def fuzz(names: list[str], count: int, seed: int, template: Path, keep: Path,
-         progress: Progress) -> dict[str, Outcomes]:
-    """Give ``count`` mutated files to each of these readers; files that did harm are kept."""
+def fuzz(names: list[str], setting: Setting, template: Path, keep: Path) -> dict[str, Outcomes]:
+    """Give mutated files to readers, each as many as there is time for.
+
+    Returns:
+        What became of them, by reader; files that did harm are moved to ``keep``.
+    """
     found: dict[str, Outcomes] = {}
     keep.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="limber-fuzz-") as place:
         child = _Child(template)
         try:
-            for number, name in enumerate(names):
-                progress(number / len(names), name)
-                reader = READERS[name]
-                originals = reader.make(template, Path(place))
-                rng = np.random.default_rng([seed, *name.encode()])
-                found[name] = outcomes = Outcomes()
-                for index in range(count):
-                    original = originals[index % len(originals)]
-                    content = mutated(original.read_bytes(), reader.kind, rng)
-                    file = Path(place, f"{index}-{original.name}")
-                    file.write_bytes(content)
-                    word, told = child.ask(name, file)
-                    outcomes.counts[word] += 1
-                    if word not in ("read", "refused"):
-                        kept = keep / f"{name.replace('/', '_')}-{word}-{file.name}"
-                        file.replace(kept)
-                        outcomes.examples.append((word, str(kept), told))
-                    else:
-                        file.unlink(missing_ok=True)
+            for name, budget in setting.budget.shares(names):
+                setting.progress(len(found) / len(names), name)
+                found[name] = _fuzzed(name, child, replace(setting, budget=budget), template,
+                                      Path(place), keep)
         finally:
             child.close()
     return found
+
+
+def _fuzzed(name: str, child: "_Child", setting: Setting, template: Path, place: Path,
+            keep: Path) -> Outcomes:
+    """Mutate the files of one reader."""
+    reader, outcomes = READERS[name], Outcomes()
+    originals = reader.make(template, place)
+    rng = setting.generator(*name.encode())
+    # Each original once at least.
+    for index in setting.budget.seeds(0, setting.at_most(200, 20), at_least=len(originals)):
+        original = originals[index % len(originals)]
+        content = mutated(original.read_bytes(), reader.kind, rng)
+        file = place / f"{index}-{original.name}"
+        file.write_bytes(content)
+        word, told = child.ask(name, file)
+        outcomes.counts[word] += 1
+        if word not in ("read", "refused"):
+            kept = keep / f"{name.replace('/', '_')}-{word}-{file.name}"
+            shutil.move(file, kept)
+            outcomes.examples.append((word, str(kept), told))
+        else:
+            file.unlink(missing_ok=True)
+    return outcomes
 
 
 class _Child:

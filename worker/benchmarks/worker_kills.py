@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.kept_trials import keep, read_trials, source_digest
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from benchmarks.worker_batches import (
     RECONSTRUCT,
     digests,
@@ -27,7 +27,6 @@ from benchmarks.worker_batches import (
     start_batch,
     write_jobs,
 )
-from limber.progress import Progress
 
 _DRAWS = 4  # for each kill, until the batch is still running at the moment drawn
 _STAGES = RECONSTRUCT + """[[job.stage]]
@@ -56,48 +55,48 @@ class Kill:
     code: int
 
 
-def killed(kills: int, branches: int, seed: int, kept: Path | None, progress: Progress) -> Row:
-    """``kills`` moments, each in a new run of the batch, which then goes on to its end.
+KILLS_ROW = Asked("kill -9 of batch and workers, or of a worker, at random moments (30 asked)",
+                  "identical, nothing stored redone")
+_BRANCHES = 2
 
-    Args:
-        kills: How many moments; only those count at which the batch was still running.
-        branches: In each run.
-        seed: Draws scans, moments, and who is killed.
-        kept: File of the kills that were made already.
-        progress: Called as it goes.
+
+def killed(setting: Setting) -> list[Row]:
+    """Random moments, each in a new run of a batch of two branches, which then goes on to its end.
+
+    Only those count at which the batch was still running; those that an earlier run made count too.
     """
     sources = source_digest(("store", "batch", "jobs", "stages", "geometry"), __file__)
+    kept, kills = setting.kept / "kills.jsonl", setting.at_most(30, 3)
     made = {kill.number: kill for kill in read_trials(Kill, kept)
-            if (kill.seed, kill.sources) == (seed, sources)}
+            if (kill.seed, kill.sources) == (setting.seed, sources) and kill.number < kills}
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
         folder = Path(place)
-        make_scans(folder, branches, seed)
+        make_scans(folder, _BRANCHES, setting.seed)
         started = time.perf_counter()
         code = start_batch(write_jobs(folder, "undisturbed", _STAGES), 1).wait()
         whole = time.perf_counter() - started
         wanted = digests(folder / "undisturbed")
-        for number in range(kills):
-            progress(number / kills, f"kill {number + 1} of {kills}")
-            if number not in made:
-                made[number] = _kill(folder, number, seed, sources, whole, wanted)
-                keep(made[number], kept)
+        missing = [number for number in range(kills) if number not in made]
+        for number in setting.budget.items(missing, at_least=0 if made else 1):
+            setting.progress(number / kills, f"kill {number + 1} of {kills}")
+            made[number] = _kill(folder, number, setting.seed, sources, whole, wanted)
+            keep(made[number], kept)
             print(f"kill {made[number]}", flush=True)
-    return _row([made[number] for number in range(kills)], branches, bool(wanted) and code == 0)
+    return [_row(list(made.values()), bool(wanted) and code == 0)]
 
 
-def _row(kills: Sequence[Kill], branches: int, is_valid: bool) -> Row:
+def _row(kills: Sequence[Kill], is_valid: bool) -> Row:
     redone = Counter(key for kill in kills for key in kill.redone)
     again = ", ".join(f"{key} {count} times" for key, count in redone.items()) or "nothing"
     apart = sum(kill.apart > 0 for kill in kills)
     ended = sum(kill.code == 0 for kill in kills)
     stored = Counter(key for kill in kills for key in kill.found)
     told = (f"{len(kills)} kills, {sum(kill.is_alone for kill in kills)} of one worker alone, "
-            f"{branches} branches each; stored when they fell: "
+            f"{_BRANCHES} branches each; stored when they fell: "
             f"{', '.join(f'{key} {count}' for key, count in stored.items()) or 'nothing'}; "
             f"{apart} runs with other files, redone: {again}, {ended} went on to the end")
-    return Row("kill -9 of batch and workers, or of a worker, at random moments (30 asked)",
-               "identical, nothing stored redone", told,
-               is_valid and apart == 0 and not redone and ended == len(kills))
+    return Row(*KILLS_ROW, told, is_valid and apart == 0 and not redone and ended == len(kills),
+               len(kills))
 
 
 def _kill(folder: Path, number: int, seed: int, sources: str, whole: float,

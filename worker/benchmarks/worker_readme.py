@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.table import Row
-from limber.progress import Progress
+from benchmarks.table import Asked, Row, Setting
 
 README = Path(__file__).parents[2] / "README.md"
 _AT_A_ROBOT = ("virtual-robot", "robot", "record", "execute")
@@ -29,24 +28,31 @@ def shown_commands(text: str) -> list[str]:
     return [line.split(" #")[0].strip() for line in lines if line.startswith("limber ")]
 
 
-def run_readme(seed: int, progress: Progress) -> Row:
+README_ROW = Asked("commands of the README, run as they stand", "all")
+
+
+def run_readme(setting: Setting) -> list[Row]:
     """Run them one after the other in one folder; what each needs is made before it."""
     lines = shown_commands(README.read_text(encoding="utf-8"))
     chosen = [line for line in lines if shlex.split(line)[1] not in _AT_A_ROBOT]
-    failed = []
+    failed, count = [], 0
     with tempfile.TemporaryDirectory(prefix="limber-readme-") as place:
         folder = Path(place)
-        for number, line in enumerate(chosen):
-            progress(number / len(chosen), line[:60])
+        for line in setting.budget.items(chosen):
+            setting.progress(count / len(chosen), line[:60])
+            count += 1
             for beginning, make in _MADE_BEFORE.items():
                 if line.startswith(f"limber {beginning}"):
-                    make(folder, seed)
+                    make(folder, setting.seed)
             done = _limber(folder, *shlex.split(line)[1:])
             if done.returncode != 0:
                 failed.append(line)
                 print(f"{line}: exit {done.returncode}: {(done.stderr or done.stdout)[-400:]}")
-    told = f"{len(chosen) - len(failed)} of {len(chosen)}; {len(lines) - len(chosen)} want a robot"
-    return Row("commands of the README, run as they stand", "all", told, not failed)
+    told = f"{count - len(failed)} of {count}; {len(lines) - len(chosen)} want a robot"
+    if count < len(chosen):
+        told += f"; no time for {len(chosen) - count} more"
+    is_met = False if failed else True if count == len(chosen) else None
+    return [Row(*README_ROW, told, is_met, count)]
 
 
 def _limber(folder: Path, *words: str) -> subprocess.CompletedProcess:
