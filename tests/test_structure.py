@@ -42,6 +42,13 @@ def test_addon_computes_nothing():
     assert not {str(path) for path, names in modules.items() if names & numerical}
 
 
+def test_benches_need_no_tests():
+    """They measure where no tests are; tests may take their subjects."""
+    modules = imported_modules(ROOT / "worker" / "benchmarks")
+    assert modules
+    assert not {str(path) for path, names in modules.items() if "tests" in names}
+
+
 def test_top_level_is_as_designed():
     """Only the designed folders and the files that tools expect stand at the top."""
     import subprocess

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from benchmarks import scan_runs, scans
+from benchmarks.budget import Budget
 from benchmarks.scan_probabilities import TWIG_SIGNS, fitted
 from benchmarks.scan_runs import CaseRun
+from benchmarks.table import Row, Setting
 from limber.progress import SILENT
 
 _SCORES = {"forks": 2, "forks_found": 2, "forks_false": 0, "centre_radii": 0.1, "centre_m": 1e-4,
@@ -23,19 +25,25 @@ def test_parts_take_what_other_parts_kept(monkeypatch, tmp_path) -> None:
         return CaseRun(kind, seed, "now", _SCORES | far)
     monkeypatch.setattr(scan_runs, "case_source", lambda: "now")
     monkeypatch.setattr(scan_runs, "measured", measured)
-    monkeypatch.setattr(scan_runs, "core_budget", lambda: 1)
+    monkeypatch.setattr("benchmarks.budget.core_budget", lambda: 1)
+
+    def rows(part: str, seconds: float = 60.0) -> list[Row]:
+        return scans.PARTS[part].run(Setting(3, True, Budget(seconds), SILENT, tmp_path))
     for part in ("one-sided", "round"):
-        table = scans.rows(True, SILENT, tmp_path, 3, only=(part,))
-        assert all(row.met for row in table)
+        table = rows(part)
+        assert all(row.met and row.count == 4 for row in table)
     count = len(made)
-    root, = scans.rows(True, SILENT, tmp_path, 3, only=("root",))
-    assert len(made) == count == 8 and root.measured.startswith("8 of 8")
-    gaps, = scans.rows(True, SILENT, tmp_path, 3, only=("gaps",))
-    again, = scans.rows(True, SILENT, tmp_path, 3, only=("gaps",))
+    root, = rows("root")
+    assert len(made) == count == 8 and root.measured.startswith("8 of 8") and root.count == 8
+    gaps, = rows("gaps")
+    again, = rows("gaps")
     assert gaps == again and gaps.measured.startswith("2 of 4 (worst inf")
     monkeypatch.setattr(scan_runs, "case_source", lambda: "later")
-    scans.rows(True, SILENT, tmp_path, 3, only=("gaps",))
+    rows("gaps")
     assert len(made) == count + 8
+    # Of cases for which there is no time a row says nothing.
+    monkeypatch.setattr(scan_runs, "case_source", lambda: "last")
+    assert [row.count for row in rows("probabilities", -1.0)] == [1, 1]
 
 
 def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
@@ -43,7 +51,7 @@ def test_a_case_that_fails_is_counted(monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(scan_runs, "run_case", lambda case, folder: 1 / 0)
     run = scan_runs.measured("round", 5, None)
     assert "ZeroDivisionError" in run.failure and not run.scores
-    row, = scans.TOLD["gaps"]({"gaps": scan_runs.Outcomes([dict(_SCORES)], [run.failure])})
+    row, = scans.gap_rows(scan_runs.Outcomes([dict(_SCORES)], [run.failure]))
     assert row.met is False and "1 not reconstructed" in row.measured
 
 

@@ -1,24 +1,23 @@
 """Real scans in the bench `scans`: the same tree gives the same result; tubes without points."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks import scan_cases
-from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.scan_cases import one_sided_case, round_case
 from benchmarks.scan_scores import Dense
-from benchmarks.table import Row
+from benchmarks.table import Asked, Row, Setting
 from limber.errors import LimberError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.files import read_points
 from limber.geometry.reconstruct import Reconstruction, ReconstructSettings, reconstruct_cloud
 from limber.geometry.skeleton.skeleton import BRIDGED
-from limber.progress import Progress
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 SCANS = {"coffeetree_branch/branch.xyz": {}, "aRchi_tree_1/Tree_1.ply": {},
@@ -26,6 +25,9 @@ SCANS = {"coffeetree_branch/branch.xyz": {}, "aRchi_tree_1/Tree_1.ply": {},
          "apple_rgbd/frame_00125.ply": {"unit": "mm", "up": (0.0, -1.0, 0.0)},
          "tomato_maize/tomato_03-05.xyz": {"unit": "mm"},
          "tomato_maize/maize_03-13.ply": {"unit": "mm"}}
+AS_IT_IS = "as it is"
+CHANGES = (AS_IT_IS, "half", "turn", "shuffle", "shift", "unit")
+"""What is done to a scan, the most telling first."""
 _LEAFY = {"unexplained": 1.0, "leave_out": True}
 
 
@@ -82,58 +84,56 @@ class ScanRun:
                 (self.volume_interval_m3, other.volume_interval_m3)))
 
 
-def metamorphic_rows(quick: bool, seed: int, progress: Progress, out: Path | None,
-                     only: str | None = None) -> list[Row]:
-    """Length and volume of each changed scan against the scan itself.
+REAL_ROW = Asked("real scans: tube length more than a radius off any point, bridges aside",
+                 "under 8 %")
 
-    Args:
-        quick: Of the real scans the first alone.
-        seed: For the changes, and the generated scans.
-        progress: Called as it goes.
-        out: Where ``files.jsonl`` keeps what is done, or None.
-        only: The one scan to take.
-    """
+
+def same_tree_asked(names: str) -> Asked:
+    """What the row of a scan, or of all, measures."""
+    return Asked(f"{names} in another unit, shifted, turned, shuffled; halved: length and volume",
+                 "3 %; 10 %; no crash")
+
+
+def same_tree_rows(setting: Setting, only: str | None = None) -> list[Row]:
+    """Length and volume of each changed scan against the scan itself; ``only``: of one scan."""
     names = [Path(name).stem for name in SCANS] if DATA.is_dir() else []
-    names = [only] if only else ["round", "one-sided", *(names[:1] if quick else names)]
-    worst, half, agree, count, crashes, notes = 0.0, 0.0, 0, 0, [], []
-    for number, name in enumerate(names):
-        first, *others = _runs(name, seed, progress.part(
-            number / len(names), (number + 1) / len(names)), out)
-        crashes += [f"{name} {run.change}: {run.failure}" for run in (first, *others)
-                    if run.failure]
-        for run in others if not first.failure else ():
-            if run.failure:
-                continue
-            agree, count = agree + run.agrees(first), count + 1
-            off, limit = run.off(first), 0.10 if run.change == "half" else 0.03
-            half, worst = (max(half, off), worst) if run.change == "half" else (
-                half, max(worst, off))
-            if off > limit:
-                notes.append(f"{name} {run.change} {off:.1%}")
-    return [Row(f"{only or len(names)} in another unit, shifted, turned, shuffled; halved: length "
-                "and volume", "3 %; 10 %; no crash",
+    names = [only] if only else ["round", "one-sided", *(names[:1] if setting.quick else names)]
+    runs = _runs(setting, [(name, change) for change in CHANGES for name in names])
+    first = {run.scan: run for run in runs if run.change == AS_IT_IS and not run.failure}
+    crashes = [f"{run.scan} {run.change}: {run.failure}" for run in runs if run.failure]
+    worst, half, agree, count, notes = 0.0, 0.0, 0, 0, []
+    for run in runs:
+        if run.change == AS_IT_IS or run.failure or run.scan not in first:
+            continue
+        agree, count = agree + run.agrees(first[run.scan]), count + 1
+        off, limit = run.off(first[run.scan]), 0.10 if run.change == "half" else 0.03
+        half, worst = (max(half, off), worst) if run.change == "half" else (half, max(worst, off))
+        if off > limit:
+            notes.append(f"{run.scan} {run.change} {off:.1%}")
+    if not count and not crashes:
+        return []
+    return [Row(*same_tree_asked(only or "scans"),
                 f"worst {worst:.1%}; {half:.1%}; {len(crashes)} crashes; stated intervals meet in "
-                f"{agree} of {count}"
-                + "".join(f"; {text}" for text in notes + crashes),
-                worst < 0.03 and half < 0.10 and not crashes)]
+                f"{agree} of {count}" + "".join(f"; {text}" for text in notes + crashes),
+                worst < 0.03 and half < 0.10 and not crashes, count)]
 
 
-def _runs(name: str, seed: int, progress: Progress, out: Path | None, count: int | None = None,
-          ) -> Iterator[ScanRun]:
-    """A scan as it is, then changed in each way; the first ``count`` of them."""
-    kept = None if out is None else out / "files.jsonl"
-    source = source_digest(("geometry",), __file__, scan_cases.__file__)
-    known = {run.change: run for run in read_trials(ScanRun, kept)
-             if (run.scan, run.seed, run.source) == (name, seed, source)}
+def _runs(setting: Setting, tasks: list[tuple[str, str]]) -> list[ScanRun]:
+    """Scans as they are or changed, as many as there is time for, those kept included."""
+    kept, source = setting.kept / "files.jsonl", source_digest(("geometry",), __file__,
+                                                                 scan_cases.__file__)
+    seed = 1000 * setting.seed
+    earlier = [run for run in read_trials(ScanRun, kept) if run.seed == seed]
+    return go_on(earlier, tasks, lambda run: (run.scan, run.change), partial(
+        _run_of, seed=seed, source=source, out=setting.out), source, kept, setting.budget, None,
+        setting.progress)
+
+
+def _run_of(task: tuple[str, str], seed: int, source: str, out: Path | None) -> ScanRun:
+    name, change = task
     cloud, settings = _subject(name, seed)
-    made = {"as it is": (cloud, settings)} | changes(cloud, settings, seed)
-    for number, (change, (changed, other)) in enumerate(list(made.items())[:count]):
-        if change not in known:
-            known[change] = _run(ScanRun(name, change, seed, source), changed, other, out)
-            keep(known[change], kept)
-        progress((number + 1) / (count or len(made)), "same tree", scan=name, change=change,
-                 seconds=known[change].seconds)
-        yield known[change]
+    made = {AS_IT_IS: (cloud, settings)} | changes(cloud, settings, seed)
+    return _run(ScanRun(name, change, seed, source), *made[change], out)
 
 
 def _subject(name: str, seed: int) -> tuple[Cloud, dict]:
@@ -166,21 +166,18 @@ def _run(run: ScanRun, cloud: Cloud, settings: dict, out: Path | None) -> ScanRu
                    off_points=off_any_point(made), seconds=seconds)
 
 
-def real_rows(quick: bool, seed: int, progress: Progress, out: Path | None) -> list[Row]:
+def real_rows(setting: Setting) -> list[Row]:
     """Share of tube length more than a radius off any point, bridges aside."""
     if not DATA.is_dir():
-        return [Row("real scans", "all", "not measured: no ../shared/data", None)]
+        return [Row(*REAL_ROW, "not measured: no ../shared/data", None, 0)]
     names = [Path(name).stem for name in SCANS]
-    names = [names[0], names[2]] if quick else names
-    done = [run for number, name in enumerate(names)
-            for run in _runs(name, seed, progress.part(number / len(names),
-                                                       (number + 1) / len(names)), out, count=1)]
+    names = [names[0], names[2]] if setting.quick else names
+    done = _runs(setting, [(name, AS_IT_IS) for name in names])
     failed = [run for run in done if run.failure]
     shares = {run.scan: run.off_points for run in done if not run.failure}
     text = ", ".join(f"{name} {share:.1%}" for name, share in shares.items())
-    return [Row("real scans: tube length more than a radius off any point, bridges aside",
-                "under 8 %", text + "".join(f"; {run.scan}: {run.failure}" for run in failed),
-                bool(shares and max(shares.values()) < 0.08 and not failed))]
+    return [Row(*REAL_ROW, text + "".join(f"; {run.scan}: {run.failure}" for run in failed),
+                bool(shares and max(shares.values()) < 0.08 and not failed), len(done))]
 
 
 def off_any_point(made: Reconstruction) -> float:

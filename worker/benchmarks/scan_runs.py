@@ -1,14 +1,11 @@
-"""Cases of the bench `scans` run as a user runs them, side by side, and their scores by kind.
-
-Each case is kept as it is done: a run that was stopped goes on with the same seed and folder.
-"""
+"""Cases of the bench `scans` run as a user runs them, side by side, and their scores by kind."""
 
 import json
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks import scan_cases, scan_plants, scan_scores
-from benchmarks.kept_trials import keep, read_trials, source_digest
+from benchmarks.kept_trials import go_on, read_trials, source_digest
 from benchmarks.scan_cases import (
     ScanCase,
     gap_case,
@@ -26,15 +23,13 @@ from benchmarks.scan_cases import (
 )
 from benchmarks.scan_plants import crown_case, leafy_case
 from benchmarks.scan_scores import cylinder_volume, points_on_axes, score, seen_part
+from benchmarks.table import Setting
 from limber.alignment import Alignment
 from limber.errors import LimberError
 from limber.geometry.reconstruct import ReconstructSettings
 from limber.geometry.skeleton.files import read_fitted
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
-from limber.jobs.budget import core_budget
-from limber.jobs.pool import Pool
-from limber.progress import Progress
 from limber.stages.reconstruct import reconstruct
 
 KINDS: dict[str, Callable[[int], ScanCase]] = {
@@ -94,51 +89,37 @@ class Outcomes:
         return f"; {len(self.failed)} not reconstructed" if self.failed else ""
 
 
-def measure(wanted: dict[str, range], progress: Progress, out: Path | None,
-            ) -> dict[str, Outcomes]:
-    """Reconstruct and score the seeds of each kind, as many side by side as there are cores.
+def outcomes(setting: Setting, counts: dict[str, int]) -> dict[str, Outcomes]:
+    """Reconstruct and score cases of each kind in turn, as many as there is time for.
 
     Args:
-        wanted: Seeds of each kind.
-        progress: Called as it goes.
-        out: Where pictures of every case and ``cases.jsonl`` go, or None. What that file has from
-            the same sources is not done again.
+        setting: Pictures of every case go to its ``out``; cases that other parts or an earlier run
+            kept are not done again.
+        counts: How many of each kind at most.
     """
-    kept, source = None if out is None else out / "cases.jsonl", case_source()
-    known = {(run.kind, run.seed): run for run in read_trials(CaseRun, kept)
-             if run.source == source}
-    tasks = [(kind, seed) for kind, seeds in wanted.items() for seed in seeds]
-    missing = [task for task in tasks if task not in known]
-    progress.part(0.0, 0.01)(1.0, f"{len(tasks) - len(missing)} of {len(tasks)} cases were kept")
-    for number, run in enumerate(_computed([(*task, out) for task in missing])):
-        known[run.kind, run.seed] = run
-        keep(run, kept)
-        progress((number + 1) / len(missing), "scans", case=f"{run.kind} {run.seed}",
-                 seconds=run.seconds)
-    done = {kind: Outcomes() for kind in wanted}
-    for kind, seed in tasks:
-        run = known[kind, seed]
+    kept, source = setting.kept / "cases.jsonl", case_source()
+    first = 1000 * setting.seed
+    tasks = [(kind, first + number) for number in range(max(counts.values()))
+             for kind, count in counts.items() if number < count]
+    done = {kind: Outcomes() for kind in counts}
+    runs = go_on(read_trials(CaseRun, kept), tasks, lambda each: (each.kind, each.seed), partial(
+        _measured, out=setting.out), source, kept, setting.budget, None, setting.progress)
+    for run in runs:
         if run.failure:
-            done[kind].failed.append(run.failure)
+            done[run.kind].failed.append(run.failure)
         else:
-            done[kind].scores.append(run.scores)
+            done[run.kind].scores.append(run.scores)
     return done
+
+
+def _measured(task: tuple[str, int], out: Path | None) -> CaseRun:
+    return measured(*task, out)
 
 
 def case_source() -> str:
     """Digest of all that a case's scores depend on."""
     return source_digest(("geometry",), __file__, scan_cases.__file__, scan_plants.__file__,
                          scan_scores.__file__)
-
-
-def _computed(tasks: list[tuple[str, int, Path | None]]) -> Iterator[CaseRun]:
-    if core_budget() < 2:
-        for task in tasks:
-            yield measured(*task)
-        return
-    with Pool(name="scans") as pool:
-        for future in as_completed([pool.submit(measured, *task) for task in tasks]):
-            yield future.result()
 
 
 def measured(kind: str, seed: int, out: Path | None) -> CaseRun:

@@ -1,19 +1,18 @@
 """What the issue on real scans asked: `reconstruct` as a user calls it, on fresh seeds each run.
 
-With ``--out`` every case is kept as it is done, and drawn: the same ``--seed`` goes on with them,
-and ``--only`` takes the table's parts one after another.
+With ``--out`` every case is drawn as well.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.scan_files import SCANS, metamorphic_rows, real_rows
-from benchmarks.scan_runs import Outcomes, measure
-from benchmarks.table import Row
-from limber.progress import Progress
+from benchmarks.scan_files import REAL_ROW, SCANS, real_rows, same_tree_asked, same_tree_rows
+from benchmarks.scan_runs import Outcomes, outcomes
+from benchmarks.table import Asked, Part, Row, Setting
 
 _COUNTS = {"one-sided": 60, "2-mm": 60, "3-mm": 60, "round": 60, "single-view": 20, "gaps": 60,
            "crowns": 12, "leafy": 8}
@@ -21,93 +20,109 @@ _QUICK = 15  # times as few
 _BINOMIAL = 1.96  # standard deviations of a share of few, that its row tells beside it
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int,
-         only: tuple[str, ...] = ()) -> list[Row]:
-    """Measure the parts named in ``only``, or all; pictures and what is kept go to ``out``."""
-    first, chosen = 1000 * seed, only or WHOLE
-    # What several parts tell of is measured once.
-    needed = [kind for kind in _COUNTS if any(kind in NEEDED.get(name, ()) for name in chosen)]
-    done = measure({kind: range(first, first + (
-        max(_COUNTS[kind] // _QUICK, 2) if quick else _COUNTS[kind])) for kind in needed},
-        progress.part(0.0, 0.7), out)
-    table = []
-    for number, name in enumerate(chosen):
-        if name in TOLD:
-            table += TOLD[name](done)
-            continue
-        part = progress.part(*(0.7 + 0.3 * k / len(chosen) for k in (number, number + 1)))
-        if name == "real":
-            table += real_rows(quick, first, part, out)
-        else:
-            table += metamorphic_rows(quick, first, part, out, PARTS[name])
-    return table
+@dataclass(frozen=True)
+class View:
+    """Limits for scans of one view: shares of forks found and false, centreline failures of 60,
+    median radius error, worst volume error. None: all is only reported."""
+
+    name: str
+    limits: tuple[float, float, int, float, float] | None = None
+
+    @property
+    def rows(self) -> tuple[Asked, ...]:
+        found, false, failures, radius, volume = self.limits or (0.0, 0.0, 0, 0.0, 0.0)
+        told = (f"{found:.0%} / under {false:.0%}", f"at most {failures} of 60", f"{radius:.0%}",
+                f"{volume:.0%}") if self.limits else ("report",) * 4
+        return tuple(Asked(f"{self.name}: {what}", asked) for what, asked in zip((
+            "forks found / false", "centreline failures", "radius, median error",
+            "mesh volume, worst"), told, strict=True))
 
 
-def _view_rows(name: str, one: Outcomes, found: float | None, false: float | None,
-               failures: int | None, radius: float | None, volume: float | None) -> list[Row]:
-    asked = found is not None
+ONE_SIDED = View("one-sided, noise 1 mm", (0.90, 0.08, 2, 0.12, 0.08))
+ROUND = View("round", (0.97, 0.02, 0, 0.08, 0.05))
+SINGLE_VIEW = View("single-view")
+ROOT_ROW = Asked("round and one-sided: root within one diameter", "118 of 120")
+GAP_ROW = Asked("gaps of 20 to 80 mm, half at forks: main axis within a radius", "57 of 60")
+CROWN_ROW = Asked("generated crowns, twigs to 1.5 mm, 1 to 5 spacings: radius bias where resolved; "
+                  "length recalled / right; left out unsaid", "10 %; 90 / 95 %; 0")
+LEAFY_ROW = Asked("leafy plants: stems recalled / right; leaf points on stems",
+                  "90 / 90 %; under 5 % (or refused)")
+
+
+def noise_asked(kind: str) -> tuple[Asked, ...]:
+    """What is asked of one-sided scans with more noise."""
+    name = f"one-sided, noise {kind}"
+    return (Asked(f"{name}: radius bias", "under 8 %"),
+            Asked(f"{name}: stated sigma covers the error", "88-99 %"),
+            Asked(f"{name}: forks; centreline failures", "report"))
+
+
+def probability_asked(name: str) -> tuple[Asked, ...]:
+    """What is asked of stated probabilities; ``name`` says of which cases."""
+    return tuple(Asked(f"stated probability of {what}{name} against outcome, 10 bins",
+                       "within 10 points (and the binomial error)") for what in ("forks", "nodes"))
+
+
+def _view_rows(one: Outcomes, view: View) -> list[Row]:
     if not one.scores:
-        return [_nothing(name, one)]
+        return _nothing(view.rows, one)
     text, got, wrong = one.forks()
     error, volumes = one.column("radius_error"), np.abs(one.column("volume"))
     covered = one.column("covered").mean()
-    return [
-        Row(f"{one.count} {name}: forks found / false",
-            f"{found:.0%} / under {false:.0%}" if asked else "report", text + one.told(),
-            bool(got >= found and wrong < false and not one.failed) if asked else None),
-        Row(f"{one.count} {name}: centreline failures",
-            f"at most {failures} of 60" if asked else "report",
-            f"{one.centre_failures()} (mean {one.column('centre_radii').mean():.0%} of the radius, "
-            f"worst {one.column('centre_radii').max():.0%})",
-            one.centre_failures() <= failures * one.count / 60 if asked else None),
-        Row(f"{one.count} {name}: radius, median error", f"{radius:.0%}" if asked else "report",
-            f"median {np.median(error):.1%}, worst branch {error.max():.1%}, bias "
-            f"{np.median(one.column('radius_bias')):+.1%}, sigma covers {covered:.0%}",
-            bool(np.median(error) < radius) if asked else None),
-        Row(f"{one.count} {name}: mesh volume, worst", f"{volume:.0%}" if asked else "report",
-            f"worst {volumes.max():.1%}, median {np.median(volumes):.1%}, "
-            f"{int((volumes > 0.08).sum())} over 8 % (of what points show; of all wood worst "
-            f"{np.abs((1 + one.column('volume')) * one.column('shown') - 1).max():.1%}; stated "
-            f"intervals hold the volume of {int(one.column('volume_held').sum())}, the length of "
-            f"{int(one.column('length_held').sum())}){one.told()}",
-            bool(volumes.max() < volume and not one.failed) if asked else None)]
+    met: tuple[bool | None, ...] = (None,) * 4
+    if view.limits:
+        found, false, failures, radius, volume = view.limits
+        met = (bool(got >= found and wrong < false and not one.failed),
+               one.centre_failures() <= failures * one.count / 60,
+               bool(np.median(error) < radius), bool(volumes.max() < volume and not one.failed))
+    measured = (
+        text + one.told(),
+        f"{one.centre_failures()} (mean {one.column('centre_radii').mean():.0%} of the radius, "
+        f"worst {one.column('centre_radii').max():.0%})",
+        f"median {np.median(error):.1%}, worst branch {error.max():.1%}, bias "
+        f"{np.median(one.column('radius_bias')):+.1%}, sigma covers {covered:.0%}",
+        f"worst {volumes.max():.1%}, median {np.median(volumes):.1%}, "
+        f"{int((volumes > 0.08).sum())} over 8 % (of what points show; of all wood worst "
+        f"{np.abs((1 + one.column('volume')) * one.column('shown') - 1).max():.1%}; stated "
+        f"intervals hold the volume of {int(one.column('volume_held').sum())}, the length of "
+        f"{int(one.column('length_held').sum())}){one.told()}")
+    return [Row(*asked, told, is_met, one.count)
+            for asked, told, is_met in zip(view.rows, measured, met, strict=True)]
 
 
-def _noise_rows(kind: str, one: Outcomes) -> list[Row]:
-    name = f"one-sided, noise {kind}"
+def _noise_rows(one: Outcomes, kind: str) -> list[Row]:
+    asked = noise_asked(kind)
     if not one.scores:
-        return [_nothing(name, one)]
+        return _nothing(asked, one)
     biases, covered = one.column("radius_bias"), one.column("covered")
     bias = float(np.median(biases))
     return [
-        Row(f"{one.count} {name}: radius bias", "under 8 %",
-            f"{bias:+.1%} (worst branch {biases[np.abs(biases).argmax()]:+.1%}; "
+        Row(*asked[0], f"{bias:+.1%} (worst branch {biases[np.abs(biases).argmax()]:+.1%}; "
             f"{int((np.abs(biases) > 0.08).sum())} over 8 %){one.told()}",
-            bool(abs(bias) < 0.08 and not one.failed)),
-        Row(f"{one.count} {name}: stated sigma covers the error", "88-99 %",
+            bool(abs(bias) < 0.08 and not one.failed), one.count),
+        Row(*asked[1],
             f"{covered.mean():.0%} (worst branch {covered.min():.0%}){one.told()}",
-            bool(0.88 <= covered.mean() <= 0.99 and not one.failed)),
-        Row(f"{one.count} {name}: forks; centreline failures", "report",
-            f"{one.forks()[0]}; {one.centre_failures()}", None)]
+            bool(0.88 <= covered.mean() <= 0.99 and not one.failed), one.count),
+        Row(*asked[2], f"{one.forks()[0]}; {one.centre_failures()}", None, one.count)]
 
 
-def _root_row(views: list[Outcomes]) -> Row:
-    rooted = np.concatenate([view.column("root_diameters") for view in views])
+def _root_rows(views: list[Outcomes]) -> list[Row]:
     total = sum(view.count for view in views)
+    scored = [view.column("root_diameters") for view in views if view.scores]
+    rooted = np.concatenate(scored) if scored else np.zeros(0)
     held = int((rooted <= 1).sum())
-    return Row(f"{total} round and one-sided: root within one diameter", "118 of 120",
-               f"{held} of {total} (worst {rooted.max(initial=0):.1f} diameters)",
-               held >= total * 118 / 120)
+    return [Row(*ROOT_ROW, f"{held} of {total} (worst {rooted.max(initial=0):.1f} diameters)",
+                held >= total * 118 / 120, total)]
 
 
-def _gap_row(gaps: Outcomes) -> Row:
+def gap_rows(gaps: Outcomes) -> list[Row]:
+    """Whether the main axis goes on over gaps."""
     if not gaps.scores:
-        return _nothing("gaps", gaps)
+        return _nothing((GAP_ROW,), gaps)
     off = gaps.column("main_axis_radii")
     held = int((off <= 1).sum())
-    return Row(f"{gaps.count} gaps of 20 to 80 mm, half at forks: main axis within a radius",
-               "57 of 60", f"{held} of {gaps.count} (worst {off.max():.1f} radii); forks "
-               f"{gaps.forks()[0]}{gaps.told()}", held >= 0.95 * gaps.count)
+    return [Row(*GAP_ROW, f"{held} of {gaps.count} (worst {off.max():.1f} radii); forks "
+                f"{gaps.forks()[0]}{gaps.told()}", held >= 0.95 * gaps.count, gaps.count)]
 
 
 def probability_rows(name: str, kinds: list[Outcomes]) -> list[Row]:
@@ -122,10 +137,12 @@ def probability_rows(name: str, kinds: list[Outcomes]) -> list[Row]:
         np.ones(len(forks)), forks[:, 0], forks[:, 1], np.ones(len(forks)))], axis=1)
     nodes = sum((np.array(score["told_nodes"]) for one in kinds for score in one.scores),
                 np.zeros((10, 4)))
-    return [_probability_row(f"forks{name}", counted), _probability_row(f"nodes{name}", nodes)]
+    count = sum(len(one.scores) for one in kinds)
+    return [_probability_row(asked, bins, count) for asked, bins in zip(
+        probability_asked(name), (counted, nodes), strict=True)] if count else []
 
 
-def _probability_row(name: str, bins: np.ndarray) -> Row:
+def _probability_row(asked: Asked, bins: np.ndarray, cases: int) -> Row:
     """Of each tenth: count, sum stated, sum right, number of independent ones."""
     texts, good, worst = [], True, 0.0
     for low, (count, stated, right, members) in enumerate(bins):
@@ -138,74 +155,77 @@ def _probability_row(name: str, bins: np.ndarray) -> Row:
         good &= bool(off <= 0.10 + slack)
         texts.append(f"{low / 10:.1f}: said {100 * said:.0f}, were {100 * was:.0f} "
                      f"(+-{100 * slack:.0f}) of {members:.0f}")
-    return Row(f"stated probability of {name} against outcome, 10 bins",
-               "within 10 points (and the binomial error)",
-               f"worst {100 * worst:.0f}; " + "; ".join(texts), good and bool(texts))
+    return Row(*asked, f"worst {100 * worst:.0f}; " + "; ".join(texts), good and bool(texts),
+               cases)
 
 
-def _crown_row(crowns: Outcomes) -> Row:
+def _crown_rows(crowns: Outcomes) -> list[Row]:
     if not crowns.scores:
-        return _nothing("generated crowns", crowns)
+        return _nothing((CROWN_ROW,), crowns)
     bias = crowns.column("resolved_bias")
     recall, right = (float(crowns.column(key).mean()) for key in ("recall", "right"))
     unsaid = float(crowns.column("unsaid_m").sum())
-    return Row(f"{crowns.count} generated crowns, twigs to 1.5 mm, 1 to 5 spacings: radius bias "
-               "where resolved; length recalled / right; left out unsaid", "10 %; 90 / 95 %; 0",
-               f"{np.median(bias):+.1%} (worst {np.abs(bias).max():.1%}); {recall:.0%} (worst "
-               f"{crowns.column('recall').min():.0%}) / {right:.0%} (worst "
-               f"{crowns.column('right').min():.0%}); {1000 * unsaid:.0f} mm; sigma covers "
-               f"{crowns.column('covered').mean():.0%}; forks {crowns.forks()[0]}{crowns.told()}",
-               bool(np.abs(bias).max() < 0.10 and recall >= 0.90 and right >= 0.95
-                    and unsaid == 0 and not crowns.failed))
+    return [Row(*CROWN_ROW,
+                f"{np.median(bias):+.1%} (worst {np.abs(bias).max():.1%}); {recall:.0%} (worst "
+                f"{crowns.column('recall').min():.0%}) / {right:.0%} (worst "
+                f"{crowns.column('right').min():.0%}); {1000 * unsaid:.0f} mm; sigma covers "
+                f"{crowns.column('covered').mean():.0%}; forks {crowns.forks()[0]}{crowns.told()}",
+                bool(np.abs(bias).max() < 0.10 and recall >= 0.90 and right >= 0.95
+                     and unsaid == 0 and not crowns.failed), crowns.count)]
 
 
-def _leafy_row(leafy: Outcomes) -> Row:
-    name = f"{leafy.count} leafy plants: stems recalled / right; leaf points on stems"
-    asked = "90 / 90 %; under 5 % (or refused)"
+def _leafy_rows(leafy: Outcomes) -> list[Row]:
     refused = f"{len(leafy.failed)} of {leafy.count} refused"
     if not leafy.scores:
-        return Row(name, asked, refused, True)
+        return [Row(*LEAFY_ROW, refused, True, leafy.count)] if leafy.count else []
     recall, right, taken = (float(leafy.column(key).mean()) for key in (
         "recall", "right", "leaf_points_on_stems"))
-    return Row(name, asked, f"{recall:.0%} / {right:.0%}; {taken:.0%}; {refused}",
-               recall >= 0.9 and right >= 0.9 and taken < 0.05)
+    return [Row(*LEAFY_ROW, f"{recall:.0%} / {right:.0%}; {taken:.0%}; {refused}",
+                recall >= 0.9 and right >= 0.9 and taken < 0.05, leafy.count)]
 
 
-def _nothing(name: str, one: Outcomes) -> Row:
-    return Row(f"{one.count} {name}", "-", f"none reconstructed: {'; '.join(one.failed[:3])}",
-               False)
+def _nothing(rows: tuple[Asked, ...], one: Outcomes) -> list[Row]:
+    """The rows of cases of which none was reconstructed; none where there was no case."""
+    return [Row(*asked, f"none reconstructed: {'; '.join(one.failed[:3])}", False, one.count)
+            for asked in rows] if one.count else []
 
 
-def _kind_rows(done: dict[str, Outcomes], kind: str,
-               told: Callable[[Outcomes], list[Row]]) -> list[Row]:
-    return told(done[kind])
+def _probabilities(done: dict[str, Outcomes]) -> list[Row]:
+    return [*probability_rows("", [one for kind, one in done.items() if kind != "leafy"]),
+            *probability_rows(LEAFY, [done["leafy"]])]
 
 
-def _of(kind: str, told: Callable[[Outcomes], list[Row]]) -> Callable[[dict], list[Row]]:
-    return partial(_kind_rows, kind=kind, told=told)
+def _told(setting: Setting, kinds: tuple[str, ...],
+          rows: Callable[[dict[str, Outcomes]], list[Row]]) -> list[Row]:
+    """The rows of cases of some kinds, as many as there is time for."""
+    return rows(outcomes(setting, {
+        kind: setting.at_most(_COUNTS[kind], max(_COUNTS[kind] // _QUICK, 2)) for kind in kinds}))
 
 
-TOLD: dict[str, Callable[[dict[str, Outcomes]], list[Row]]] = {
-    "one-sided": _of("one-sided", lambda one: _view_rows(
-        "one-sided, noise 1 mm", one, 0.90, 0.08, 2, 0.12, 0.08)),
-    "2-mm": _of("2-mm", lambda one: _noise_rows("2 mm", one)),
-    "3-mm": _of("3-mm", lambda one: _noise_rows("3 mm", one)),
-    "round": _of("round", lambda one: _view_rows("round", one, 0.97, 0.02, 0, 0.08, 0.05)),
-    "single-view": _of("single-view", lambda one: _view_rows(
-        "single-view", one, None, None, None, None, None)),
-    "root": lambda done: [_root_row([done["one-sided"], done["round"]])],
-    "gaps": _of("gaps", lambda one: [_gap_row(one)]),
-    "crowns": _of("crowns", lambda one: [_crown_row(one)]),
-    "leafy": _of("leafy", lambda one: [_leafy_row(one)]),
-    "probabilities": lambda done: [
-        *probability_rows("", [one for kind, one in done.items() if kind != "leafy"]),
-        *probability_rows(" of leafy plants", [done["leafy"]])]}
-"""Rows of generated cases, by part."""
-NEEDED = {kind: (kind,) for kind in _COUNTS} | {
-    "root": ("one-sided", "round"), "probabilities": tuple(_COUNTS)}
-"""Kinds of cases that each part tells of."""
-WHOLE = (*TOLD, "same-tree", "real")
-"""The table's parts, in its order."""
-PARTS: dict[str, str | None] = dict.fromkeys(WHOLE) | {
-    f"same-tree:{Path(name).stem}": Path(name).stem for name in SCANS}
-"""What ``--only`` knows: those, and one scan of the same tree's row."""
+def _part(kind: str, rows: Callable[[Outcomes], list[Row]], gives: tuple[Asked, ...],
+          seconds: float = 30.0) -> Part:
+    """The part of one kind of case."""
+    return Part(partial(_told, kinds=(kind,), rows=lambda done: rows(done[kind])), seconds, gives,
+                grows=True)
+
+
+LEAFY = " of leafy plants"
+PARTS = {
+    "one-sided": _part("one-sided", partial(_view_rows, view=ONE_SIDED), ONE_SIDED.rows),
+    "round": _part("round", partial(_view_rows, view=ROUND), ROUND.rows),
+    "real": Part(real_rows, 60, (REAL_ROW,), grows=True),
+    "gaps": _part("gaps", gap_rows, (GAP_ROW,)),
+    "2-mm": _part("2-mm", partial(_noise_rows, kind="2 mm"), noise_asked("2 mm")),
+    "3-mm": _part("3-mm", partial(_noise_rows, kind="3 mm"), noise_asked("3 mm")),
+    "same-tree": Part(same_tree_rows, 60, (same_tree_asked("scans"),), grows=True),
+    "root": Part(partial(_told, kinds=("one-sided", "round"), rows=lambda done: _root_rows(
+        list(done.values()))), 30, (ROOT_ROW,), grows=True),
+    "leafy": _part("leafy", _leafy_rows, (LEAFY_ROW,), 60),
+    "crowns": _part("crowns", _crown_rows, (CROWN_ROW,), 90),
+    "probabilities": Part(partial(_told, kinds=tuple(_COUNTS), rows=_probabilities), 90, (
+        *probability_asked(""), *probability_asked(LEAFY)), grows=True),
+    "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
+"""The table, in order of importance; ``--only`` also knows one scan of the same tree's row."""
+PARTS |= {f"same-tree:{name}": Part(
+    partial(same_tree_rows, only=name), 60, (same_tree_asked(name),), grows=True, alone=True)
+    for name in (Path(file).stem for file in SCANS)}

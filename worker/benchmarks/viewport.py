@@ -9,43 +9,50 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.table import Row
+from benchmarks.table import Asked, Part, Row, Setting
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.generated import generate_branch
-from limber.progress import Progress
 from limber.scene.data import scene_data
 from limber.store import Branch
 
 _ROOT = Path(__file__).parents[2]
-_LONGEST_SECONDS = 1400
+_FRAME = Asked("frame write of 50,000 vertices", "0.5 ms")
+_GRAB = (Asked("grab loop on Blender's side, median / 95 %", "1 / 2 ms"),
+         Asked("pose to drawn mesh (without drawing), median / 95 %", "under 33 ms"),
+         Asked("memory over grabs", "flat"))
+_IMPORT = (Asked("import of 1,000,000 points", "3 s"),
+           Asked("the interface stands while it is read / shown", "50 / 250 ms"))
+_REGISTER = Asked("registering", "100 ms")
+_JOBS = Asked("memory over job runs", "flat")
+_UNDO = Asked("undo and redo, random sequences", "state consistent, no crash")
 
 
-def rows(quick: bool, progress: Progress, out: Path | None, seed: int) -> list[Row]:
-    """Measure; ``quick`` takes a fifth of the repeats and a tenth of the sequences."""
+def _probed(setting: Setting, part: str) -> dict[str, Any]:
+    """What one part of the probe says, by measure; empty where Blender did not start."""
     with tempfile.TemporaryDirectory(prefix="limber-bench-") as place:
-        found = _measured(Path(place), quick, seed, progress)
-    for name, numbers in found.items():
-        if "error" in numbers:
-            print(f"{name}: {numbers['error']}")
-    return _table(found)
+        return _measured(Path(place), setting, part)
 
 
-def _measured(place: Path, quick: bool, seed: int, progress: Progress) -> dict[str, Any]:
+def _measured(place: Path, setting: Setting, part: str) -> dict[str, Any]:
     branch = place / "twig.branch"
     shutil.copytree(_ROOT / "blend_files" / "bending_branch", branch)
     scene_data(Branch.open(branch)).write(branch.with_suffix(".npz"))
-    generate_branch(seed % 1000, length=0.4, fork_count=0, point_spacing=0.004).cloud.write_ply(
-        place / "scan.ply")
-    Cloud(np.random.default_rng(seed).random((1_000_000, 3))).write_ply(place / "million.ply")
+    generate_branch(setting.seed % 1000, length=0.4, fork_count=0,
+                    point_spacing=0.004).cloud.write_ply(place / "scan.ply")
+    if part == "import":
+        Cloud(np.random.default_rng(setting.seed).random((1_000_000, 3))).write_ply(
+            place / "million.ply")
     settings = place / "settings.json"
     settings.write_text(json.dumps({
         "addon": str(_ROOT / "addon"), "branch": str(branch), "cloud": str(place / "scan.ply"),
-        "large_cloud": str(place / "million.ply"), "quick": quick, "seed": seed}))
+        "large_cloud": str(place / "million.ply"), "quick": setting.quick, "seed": setting.seed,
+        "part": part, "seconds": setting.budget.remaining}))
     probe = str(Path(__file__).with_name("viewport_probe.py"))
     blender = os.environ.get("LIMBER_BLENDER")
     command = [blender, "-b", "--factory-startup", "--python", probe] if blender else (
@@ -59,51 +66,81 @@ def _measured(place: Path, quick: bool, seed: int, progress: Progress) -> dict[s
         if line.startswith('{"measure"'):
             told = json.loads(line)
             found[told.pop("measure")] = told
-            progress(len(found) / 8, "measuring")
         else:
             said.append(line)
-    if process.wait(_LONGEST_SECONDS):
+    if process.wait():
         print(f"Blender ended with exit code {process.returncode}:\n{''.join(said[-20:])}")
+    for name, numbers in found.items():
+        if "error" in numbers:
+            print(f"{name}: {numbers['error']}")
+    print(f"Blender {found.get('blender', {}).get('version', 'did not start')}", flush=True)
     return found
 
 
-def _table(found: dict[str, Any]) -> list[Row]:
-    print(f"Blender {found.get('blender', {}).get('version', 'did not start')}")
+def _frame_rows(setting: Setting) -> list[Row]:
+    return [_row(_probed(setting, "frame write"), "frame write", _FRAME, "frames",
+                 lambda m: (f"{m['median_ms']:.2f} ms (95 %: {m['high_ms']:.2f})",
+                            m["median_ms"] <= 0.5))]
+
+
+def _grab_rows(setting: Setting) -> list[Row]:
+    found = _probed(setting, "grab")
     return [
-        _row(found, "frame write", "frame write of 50,000 vertices", "0.5 ms",
-             lambda m: (f"{m['median_ms']:.2f} ms (95 %: {m['high_ms']:.2f})",
-                        m["median_ms"] <= 0.5)),
-        _row(found, "grab", "grab loop on Blender's side, median / 95 %", "1 / 2 ms",
+        _row(found, "grab", _GRAB[0], "poses",
              # The rest of the time other programs had the processor.
              lambda m: (f"{m['median_ms']:.2f} / {m['high_ms']:.2f} ms (of the processor "
                         f"{m['own_median_ms']:.2f} / {m['own_high_ms']:.2f})",
                         m["median_ms"] <= 1 and m["high_ms"] <= 2)),
-        _row(found, "grab", "pose to drawn mesh (without drawing), median / 95 %", "under 33 ms",
+        _row(found, "grab", _GRAB[1], "poses",
              lambda m: (f"{m['drawn_median_ms']:.1f} / {m['drawn_high_ms']:.1f} ms ({m['who']})",
                         m["drawn_high_ms"] < 33)),
-        _row(found, "import", "import of 1,000,000 points", "3 s",
+        _row(found, "grab memory", _GRAB[2], "grabs",
+             lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5", m["grown_mb"] < 5))]
+
+
+def _import_rows(setting: Setting) -> list[Row]:
+    found = _probed(setting, "import")
+    return [
+        _row(found, "import", _IMPORT[0], None,
              lambda m: (f"{m['seconds']:.2f} s", m["seconds"] <= 3 and m["points"] == 1_000_000)),
-        _row(found, "import", "the interface stands while it is read / shown", "50 / 250 ms",
+        _row(found, "import", _IMPORT[1], None,
              lambda m: (f"{m['reading_ms']:.0f} / {m['shown_ms']:.0f} ms",
-                        m["reading_ms"] <= 50 and m["shown_ms"] <= 250)),
-        _row(found, "register", "registering", "100 ms",
-             lambda m: (f"{m['again_ms']:.0f} ms ({m['first_ms']:.0f} with the first import)",
-                        m["again_ms"] <= 100)),
-        _row(found, "grab memory", "memory over grabs", "flat",
-             lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5 of {m['grabs']}",
-                        m["grown_mb"] < 5)),
-        _row(found, "job memory", "memory over job runs", "flat",
-             lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5 of {m['jobs']}; "
-                        f"{m['threads']} threads, {m['files']} files open",
-                        m["grown_mb"] < 5 and m["threads"] < 5)),
-        _row(found, "undo", "undo and redo, random sequences", "state consistent, no crash",
-             lambda m: (f"{m['wrong_count']} of {m['sequences']} wrong ({m['steps']} steps)",
-                        m["wrong_count"] == 0))]
+                        m["reading_ms"] <= 50 and m["shown_ms"] <= 250))]
 
 
-def _row(found: dict[str, Any], name: str, measure: str, asked: str, judged) -> Row:
+def _register_rows(setting: Setting) -> list[Row]:
+    return [_row(_probed(setting, "register"), "register", _REGISTER, None,
+                 lambda m: (f"{m['again_ms']:.0f} ms ({m['first_ms']:.0f} with the first import)",
+                            m["again_ms"] <= 100))]
+
+
+def _job_rows(setting: Setting) -> list[Row]:
+    return [_row(_probed(setting, "job memory"), "job memory", _JOBS, "jobs",
+                 lambda m: (f"{m['grown_mb']:+.1f} MB over the last 4/5; "
+                            f"{m['threads']} threads, {m['files']} files open",
+                            m["grown_mb"] < 5 and m["threads"] < 5))]
+
+
+def _undo_rows(setting: Setting) -> list[Row]:
+    return [_row(_probed(setting, "undo"), "undo", _UNDO, "sequences",
+                 lambda m: (f"{m['wrong_count']} of {m['sequences']} wrong ({m['steps']} steps)",
+                            m["wrong_count"] == 0))]
+
+
+def _row(found: dict[str, Any], name: str, asked: Asked, count: str | None,
+         judged: Callable[[dict[str, Any]], tuple[str, bool]]) -> Row:
+    """The row of a measure; ``count`` names the number that says how many trials it has."""
     numbers = found.get(name)
     if numbers is None or "error" in numbers:
-        return Row(measure, asked, "could not be measured", None)
-    measured, met = judged(numbers)
-    return Row(measure, asked, measured, met)
+        return Row(*asked, "could not be measured", None, 0)
+    return Row(*asked, *judged(numbers), numbers[count] if count else 1)
+
+
+PARTS = {
+    "frame-write": Part(_frame_rows, 15, (_FRAME,)),
+    "grab": Part(_grab_rows, 240, _GRAB),
+    "import": Part(_import_rows, 20, _IMPORT),
+    "register": Part(_register_rows, 15, (_REGISTER,)),
+    "undo": Part(_undo_rows, 40, (_UNDO,), grows=True),
+    "job-memory": Part(_job_rows, 30, (_JOBS,))}
+"""The table, in order of importance; each part has a Blender of its own."""

@@ -72,7 +72,7 @@ def frame_write(count: int, repeats: int) -> None:
         meshes.set_positions(mesh, frames[number % 4])
         written.append(time.perf_counter() - started)
         bpy.context.view_layer.update()
-    say("frame write", **spread(written))
+    say("frame write", frames=repeats, **spread(written))
 
 
 def import_points(path: Path) -> None:
@@ -110,7 +110,7 @@ def grab_loop(branch: Path, count: int) -> None:
         # The reduced model answers from here on.
         learnt = _until(lambda: _who(held, number, start) == "reduced", 400, fail=False)
         held_back, own, waits = _streamed(held, surface, meshes, number, start, count)
-        say("grab", who="reduced" if learnt else "full", **spread(held_back),
+        say("grab", poses=count, who="reduced" if learnt else "full", **spread(held_back),
             **{f"own_{name}": value for name, value in spread(own).items()},
             **{f"drawn_{name}": value for name, value in spread(waits).items()})
         before = _memory_mb()
@@ -182,10 +182,13 @@ def job_memory(count: int) -> None:
         files=len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else None)
 
 
-def undo_sequences(branch: Path, cloud: Path, count: int, seed: int) -> None:
+def undo_sequences(branch: Path, cloud: Path, count: int, seed: int, seconds: float) -> None:
     """Random actions with undo and redo between them: each state comes back as it was."""
-    wrong, steps = [], 0
+    wrong, steps, done, end = [], 0, 0, time.monotonic() + seconds
     for sequence in range(count):
+        if done and time.monotonic() > end:
+            break
+        done += 1
         rng = np.random.default_rng([seed, sequence])
         bpy.ops.wm.read_factory_settings(use_empty=True)
         bpy.context.scene.limber.branch_folder = str(branch)
@@ -209,7 +212,7 @@ def undo_sequences(branch: Path, cloud: Path, count: int, seed: int) -> None:
             if _state() != states[at]:
                 wrong.append({"sequence": sequence, "step": steps})
                 break
-    say("undo", sequences=count, steps=steps, wrong=wrong[:5], wrong_count=len(wrong))
+    say("undo", sequences=done, steps=steps, wrong=wrong[:5], wrong_count=len(wrong))
 
 
 def _act(name: str, branch: Path, cloud: Path, rng: np.random.Generator) -> None:
@@ -271,23 +274,25 @@ def _memory_mb() -> float:
 
 
 def main(settings: dict) -> None:
-    """Measure each part; one that fails does not take the others along."""
+    """Register the add-on and measure the part that the settings name."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     say("blender", version=bpy.app.version_string)
+    began = time.monotonic()
     registering(Path(settings["addon"]))
     branch, cloud = Path(settings["branch"]), Path(settings["cloud"])
-    quick = settings["quick"]
-    steps = (
-        ("frame write", lambda: frame_write(50_000, 60 if quick else 400)),
-        ("import", lambda: import_points(Path(settings["large_cloud"]))),
-        ("grab", lambda: grab_loop(branch, 200 if quick else 1000)),
-        ("job memory", lambda: job_memory(20 if quick else 100)),
-        ("undo", lambda: undo_sequences(branch, cloud, 20 if quick else 200, settings["seed"])))
-    for name, measure in steps:
-        try:
-            measure()
-        except Exception:
-            say(name, error=traceback.format_exc())
+    quick, name = settings["quick"], settings["part"]
+    measures = {
+        "register": lambda: None,
+        "frame write": lambda: frame_write(50_000, 60 if quick else 400),
+        "import": lambda: import_points(Path(settings["large_cloud"])),
+        "grab": lambda: grab_loop(branch, 200 if quick else 1000),
+        "job memory": lambda: job_memory(20 if quick else 100),
+        "undo": lambda: undo_sequences(branch, cloud, 20 if quick else 200, settings["seed"],
+                                       settings["seconds"] - (time.monotonic() - began))}
+    try:
+        measures[name]()
+    except Exception:
+        say(name, error=traceback.format_exc())
     sys.modules["limber_addon"].unregister()
 
 
