@@ -152,3 +152,16 @@ def test_ply_with_other_letters_in_its_header(tmp_path, coding, kind):
     np.testing.assert_allclose(cloud.points, POINTS, atol=1e-6)
     assert sorted(values[1] for values in cloud.attributes.values()) == [1.5, 3.0]
     assert "Höhe" in cloud.titles.values()
+
+
+@pytest.mark.parametrize("written", [
+    lambda color: color / np.float32(255), lambda color: color.astype(np.uint16) * 257,
+    lambda color: color.astype(float), lambda color: color.astype(np.int64)])
+def test_colours_of_any_scale_are_bytes(tmp_path, written):
+    """Fractions of 1 as Blender and Open3D write them, 8 bits, and 16 bits."""
+    color = np.random.default_rng(0).integers(0, 256, (COUNT, 3)).astype(np.uint8)
+    np.savez(tmp_path / "a.npz", points=POINTS, colors=written(color))
+    cloud = read_points(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.attributes["color"], color)
+    cloud.write_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read_points(tmp_path / "a.ply").attributes["color"], color)

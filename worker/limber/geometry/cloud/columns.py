@@ -45,8 +45,8 @@ def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], cou
                   taken: Collection[str] = ()) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return attributes that every writer can take, and the file's names of those renamed.
 
-    ``normal`` is of shape [n, 3] and ``color`` as well; all other attributes are columns of numbers
-    with valid names. What is no number of each point is dropped.
+    ``normal`` is of shape [n, 3] and ``color`` as well, in 0..255; all other attributes are columns
+    of numbers with valid names. What is no number of each point is dropped.
 
     Args:
         attributes: Name to array, as a reader made them.
@@ -60,7 +60,7 @@ def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], cou
         if values.dtype.kind not in "biuf" or values.shape[:1] != (count,):
             continue
         if name in PARTS and values.ndim == 2 and values.shape[1] >= 3:
-            kept[name] = values[:, :3]
+            kept[name] = _bytes(values[:, :3]) if name == "color" else values[:, :3]
         else:
             columns += _split(titles.get(name, name), name, values)
     names = property_names((name for _, name, _ in columns), _RESERVED | set(taken))
@@ -68,6 +68,19 @@ def valid_columns(attributes: dict[str, np.ndarray], titles: dict[str, str], cou
                if name != title}
     return kept | {name: values for name, (_, _, values) in zip(names, columns, strict=True)
                    }, renamed
+
+
+def _bytes(color: np.ndarray) -> np.ndarray:
+    """Colours in 0..255, of such ones, of fractions of 1 or of 16 bits."""
+    if color.dtype == np.uint8:
+        return color
+    values = np.nan_to_num(color.astype(float), posinf=0.0, neginf=0.0)
+    top = values.max(initial=0.0)
+    if top > 255:
+        values = values / 257
+    elif top <= 1 and color.dtype.kind == "f":
+        values = values * 255
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
 def _split(title: str, name: str, values: np.ndarray) -> list[tuple[str, str, np.ndarray]]:
@@ -80,8 +93,6 @@ def _split(title: str, name: str, values: np.ndarray) -> list[tuple[str, str, np
 
 def ply_columns(name: str, values: np.ndarray) -> list[tuple[str, np.ndarray]]:
     """Return the properties of a PLY file that a valid attribute becomes, in types that PLY has."""
-    if name == "color":
-        values = values.astype(np.uint8)
     values = _in_ply_type(values)
     return [(part, values[:, k]) for k, part in enumerate(PARTS[name])] if name in PARTS else [
         (name, values)]
