@@ -116,6 +116,8 @@ def test_bad_files_are_named(tmp_path, name, content, complaint):
     ("a.csv", '"Points:0","Points:1","Points:2"\n"1.5","2","3.25"\n"4","5","6.5"\n'),
     ("a.csv", "x,y,z,\n1.5,2,3.25,\n4,5,6.5,\n"), ("a.pts", "2\n1.5 2 3.25\n4 5 6.5\n"),
     ("a.csv", "id,z,y,x\n0,3.25,2,1.5\n1,6.5,5,4\n"),
+    ("a.asc", "//X Y Z R G B Scalar_field_#1\n2\n1.5 2 3.25 9 8 7 0.5\n4 5 6.5 9 8 7 0.5\n"),
+    ("a.pts", "1\n1.5 2 3.25 -900 9 8 7\n1\n4 5 6.5 -900 9 8 7\n"),
 ])
 def test_text_as_programs_write_it(tmp_path, name, content):
     """Decimal commas, headers with units or other names, quotes, closing separators, counts."""
@@ -123,6 +125,18 @@ def test_text_as_programs_write_it(tmp_path, name, content):
         (tmp_path / name).write_bytes(content.encode(coding))
         np.testing.assert_array_equal(
             read_points(tmp_path / name).points, [[1.5, 2, 3.25], [4, 5, 6.5]])
+
+
+@pytest.mark.parametrize(("name", "row", "scalar"), [
+    ("a.pts", "-1200 110 118 156", "intensity"), ("a.pts", "17 110 118 156", "intensity"),
+    ("a.xyz", "110 118 156 0.5", "scalar_0"), ("a.xyz", "110 118 156 17", "scalar_0"),
+    ("a.xyz", "0.25 110 118 156", "intensity")])
+def test_colour_beside_a_scalar_is_told(tmp_path, name, row, scalar):
+    """A scanner's intensity comes before the colour, CloudCompare's scalar field after it."""
+    (tmp_path / name).write_text(f"1 2 3 {row}\n4 5 6 {row}\n")
+    cloud = read_points(tmp_path / name)
+    assert cloud.attributes.keys() == {"color", scalar}
+    np.testing.assert_array_equal(cloud.attributes["color"][0], [110, 118, 156])
 
 
 def test_points_that_are_no_numbers_are_left_away_and_counted(tmp_path):

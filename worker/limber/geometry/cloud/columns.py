@@ -30,7 +30,7 @@ def property_names(titles: Iterable[str], taken: Collection[str] = ()) -> list[s
     for title in titles:
         plain = unicodedata.normalize("NFKD", title).encode("ascii", "ignore").decode()
         if not re.fullmatch(r"\w+", plain, re.ASCII):
-            plain = re.sub(r"\W+", "_", plain, flags=re.ASCII).strip("_") or "unnamed"
+            plain = re.sub(r"[\W_]+", "_", plain, flags=re.ASCII).strip("_") or "unnamed"
         name, number = plain[:_LONGEST_NAME], 1
         while name.lower() in used:
             number += 1

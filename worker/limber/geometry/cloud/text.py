@@ -24,7 +24,8 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
         and the numbers, shape [n, columns].
 
     Numbers stand between blanks, tabs, commas or semicolons; a header may name the columns, the
-    number of points may come first, and decimals may be commas where commas do not separate.
+    number of points may come before the points of each scan, and decimals may be commas where
+    commas do not separate.
 
     Raises:
         InputError: no numbers, too few columns, or a line that is none of the table; it is named.
@@ -34,13 +35,12 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
     if not lines:
         raise InputError(f"{path} has no lines with numbers.", "A point cloud was expected.",
                          "Export it again.")
+    lines = _without_counts(lines)
     # A header says little of how numbers are written.
     separator = _separator(lines[min(1, len(lines) - 1)])
     names, titles = _header(path, lines, separator)
     if names:
         lines = lines[1:]
-    elif len(lines) > 1 and lines[0].strip().isdigit():
-        lines = lines[1:]  # some programs write the number of points first
     if not lines:
         raise InputError(f"{path} has a header and no points.", "A point cloud was expected.",
                          "Export it again.")
@@ -52,8 +52,21 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
         # R's write.table gives no title to its row names.
         names, titles = ["", *names], ["", *titles]
     if len(names) != table.shape[1]:
-        names = titles = ["x", "y", "z", *_guessed(table.shape[1] - 3)]
+        names = titles = ["x", "y", "z", *_guessed(table[:, 3:], path.suffix.lower() == ".pts")]
     return names, titles, table
+
+
+def _without_counts(lines: list[str]) -> list[str]:
+    """Lines without those that say how many points follow: first, below titles, at each scan."""
+    start = next((k for k, line in enumerate(lines[:2]) if line.strip().isdigit()), None)
+    if start is None or start + 1 == len(lines):
+        return lines
+    kept = lines[:start]
+    while start < len(lines) and lines[start].strip().isdigit():
+        stop = start + 1 + int(lines[start])
+        kept += lines[start + 1:stop]
+        start = stop
+    return kept + lines[start:]
 
 
 def _counts_up(column: np.ndarray) -> bool:
@@ -136,10 +149,25 @@ def _numbers(path: Path, lines: list[str], separator: str | None, text: str) -> 
                      "Its lines differ in how they are written.", "Export it again.")
 
 
-def _guessed(extra: int) -> list[str]:
-    """Names of unnamed columns after x, y, z, as scanners and CloudCompare order them."""
-    if extra == 3:
+def _guessed(extra: np.ndarray, intensity_first: bool) -> list[str]:
+    """Names of unnamed columns [n, k] after x, y, z, as scanners and CloudCompare order them.
+
+    Of four, a scanner writes intensity and colour, CloudCompare colour and a scalar: where their
+    values do not tell, ``intensity_first`` does.
+    """
+    count = extra.shape[1]
+    if count == 3:
         return ["red", "green", "blue"]
-    if extra == 6:
+    if count == 4:
+        before, after = _are_bytes(extra[:, :3]), _are_bytes(extra[:, 1:])
+        if after and (intensity_first or not before):
+            return ["intensity", "red", "green", "blue"]
+        if before:
+            return ["red", "green", "blue", "scalar_0"]
+    if count == 6:
         return ["red", "green", "blue", "nx", "ny", "nz"]
-    return [f"scalar_{k}" for k in range(extra)]
+    return [f"scalar_{k}" for k in range(count)]
+
+
+def _are_bytes(columns: np.ndarray) -> bool:
+    return bool(((columns >= 0) & (columns <= 255) & (columns % 1 == 0)).all())
