@@ -4,8 +4,15 @@ CHOLMOD (through cvxopt) where it is installed, else SuperLU from scipy. Limber'
 branches, is :mod:`limber.mechanics.linear.supernodal`.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy import sparse
+
+from limber.present import present
+
+if TYPE_CHECKING:
+    from scipy.sparse.linalg import SuperLU
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -73,7 +80,7 @@ class SuperLuFactor:
                  is_ordered: bool = True):
         self._rows, self._columns, self._size = rows, columns, size
         self._is_ordered = is_ordered
-        self._factor = None
+        self._factor: SuperLU | None = None
 
     def twin(self) -> "SuperLuFactor":
         """As :meth:`CholmodFactor.twin`."""
@@ -86,18 +93,19 @@ class SuperLuFactor:
         lower = sparse.csc_matrix((values, (self._rows, self._columns)), shape=(self._size,) * 2)
         whole = (lower + sparse.tril(lower, -1).T).tocsc()
         try:
-            self._factor = splu(
+            factor = splu(
                 whole, permc_spec="NATURAL" if self._is_ordered else "MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError as error:
             raise NotPositiveDefiniteError("a pivot is zero") from error
-        swapped = (self._factor.perm_r != self._factor.perm_c).any()
-        if swapped or self._factor.U.diagonal().min() <= 0:
+        self._factor = factor
+        swapped = (factor.perm_r != factor.perm_c).any()
+        if swapped or factor.U.diagonal().min() <= 0:
             raise NotPositiveDefiniteError("a pivot is not positive")
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """As :meth:`CholmodFactor.solve`."""
-        return self._factor.solve(np.ascontiguousarray(right))
+        return present(self._factor, "factor").solve(np.ascontiguousarray(right))
 
 
 def general_factor(rows: np.ndarray, columns: np.ndarray, size: int, *,

@@ -52,8 +52,13 @@ class HungTwig(PointMass):
 
     def heavier(self, factor: float) -> "HungTwig":
         """Return it ``factor`` times as dense."""
-        rows = tuple(tuple(factor * value for value in row) for row in self.inertia)
-        return replace(self, mass=factor * self.mass, inertia=rows)
+        x, y, z = (_scaled(row, factor) for row in self.inertia)
+        return replace(self, mass=factor * self.mass, inertia=(x, y, z))
+
+
+def _scaled(row: Place, factor: float) -> Place:
+    x, y, z = row
+    return factor * x, factor * y, factor * z
 
 
 @dataclass(frozen=True)
@@ -94,10 +99,10 @@ class Tied:
         left, _, right = np.linalg.svd(turn)
         turn = left @ right
         arm = np.array(self.added.position) - np.array(self.added.attached)
-        inertia = turn @ np.array(self.added.inertia) @ turn.T
+        x, y, z = map(tuple, turn @ np.array(self.added.inertia) @ turn.T)
         return replace(self.added, position=tuple(position),
                        attached=tuple(position - turn @ arm),
-                       inertia=tuple(map(tuple, inertia)))
+                       inertia=(x, y, z))
 
 
 def tied(mesh: TetMesh, added: Iterable[PointMass], gradients: np.ndarray, weights: np.ndarray,

@@ -1,5 +1,6 @@
 """A grasp: the patch of nodes that a gripper holds, and poses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -123,7 +124,7 @@ class Grasp:
 
     @classmethod
     def from_mesh(cls, mesh: TetMesh, mode: Literal["clamped", "pinned"] = "clamped",
-                  point: np.ndarray | None = None) -> "Grasp":
+                  point: np.ndarray | Sequence[float] | None = None) -> "Grasp":
         """Return the grasp marked in the mesh's point data ``grasp``.
 
         Args:
@@ -141,7 +142,7 @@ class Grasp:
     @classmethod
     def of_nodes(cls, mesh: TetMesh, nodes: np.ndarray,
                  mode: Literal["clamped", "pinned"] = "clamped",
-                 point: np.ndarray | None = None) -> "Grasp":
+                 point: np.ndarray | Sequence[float] | None = None) -> "Grasp":
         """Return the grasp of the given nodes.
 
         Args:

@@ -74,8 +74,8 @@ class WindRecord:
         if not push > 0:
             raise InputError("The recorded wind pushes against --wind on average.", "",
                              "Turn --wind round.")
-        way = np.sqrt(push) * np.array(direction) / np.linalg.norm(direction)
-        return tuple(map(float, way))
+        x, y, z = map(float, np.sqrt(push) * np.array(direction) / np.linalg.norm(direction))
+        return x, y, z
 
 
 @dataclass(frozen=True)

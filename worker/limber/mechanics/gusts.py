@@ -9,6 +9,7 @@ application to gust loading*, 1964; EN 1991-1-4:2005, annex B, for spectrum (B.1
 (B.4), rate of crossings (B.5).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +123,7 @@ def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seco
     power = max(1 + resonance, 0.0)
     crossing = max(float(sway.frequencies[0]) * np.sqrt(max(resonance, 0.0) / max(power, 1e-12)),
                    _LEAST_CROSSING)
-    rare = np.sqrt(2 * np.log(max(crossing * seconds, np.e)))
+    rare = np.sqrt(2 * np.log(max(crossing * seconds, math.e)))
     peak = max(rare + 0.6 / rare, _LEAST_PEAK)
     deviation = 2 * intensity * np.sqrt(power)
     return GustResponse(1 + peak * deviation, deviation, peak, crossing, float(np.sqrt(power)))

@@ -100,10 +100,13 @@ def carried(model: "BranchModel") -> Hanging:
     if not tangent.is_positive_definite:
         raise NotPositiveDefiniteError("the stiffness of the scanned shape has no positive pivots")
     own, added = model.nodal_masses
-    loads = [mass[:, None] * model.gravity for mass in (own, added)]
-    parts = [_carried(plain, load, tangent.solve(equations.free_part(load)))
-             if load.any() or number == 0 else None for number, load in enumerate(loads)]
-    return Hanging(parts[0], parts[1], len(model.point_masses))
+
+    def carrying(load: np.ndarray) -> CarriedWeight:
+        return _carried(plain, load, tangent.solve(equations.free_part(load)))
+
+    own_load, added_load = (mass[:, None] * model.gravity for mass in (own, added))
+    return Hanging(carrying(own_load), carrying(added_load) if added_load.any() else None,
+                   len(model.point_masses))
 
 
 def _carried(model: "BranchModel", load: np.ndarray, moved: np.ndarray) -> CarriedWeight:

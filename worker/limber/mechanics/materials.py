@@ -6,6 +6,7 @@ and the reduced model rest on that.
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import overload
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class Material(IntEnum):
             InputError: there is none of that name.
         """
         try:
-            return cls(name) if isinstance(name, cls) else cls[name]
+            return name if isinstance(name, Material) else cls[name]
         except KeyError:
             raise InputError(f"There is no material {name!r}.", "It must be one of those known: "
                              + ", ".join(cls.__members__) + ".", "Choose one.") from None
@@ -59,7 +60,14 @@ class RayleighDamping:
                              "It would feed energy into the motion.", "Use 0 or more.")
 
 
-def lame(young: np.ndarray, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@overload
+def lame(young: float, poisson: float) -> tuple[float, float]: ...
+@overload
+def lame(young: np.ndarray, poisson: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+@overload
+def lame(young: float, poisson: np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
+def lame(young: float | np.ndarray, poisson: float | np.ndarray,
+         ) -> tuple[float | np.ndarray, float | np.ndarray]:
     """Return Lamé's lambda and mu [Pa] of Young's modulus [Pa] and Poisson's ratio."""
     return (young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson)))
 

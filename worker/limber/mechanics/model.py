@@ -144,7 +144,8 @@ class BranchModel:
         self.lumped_mass = lumped_mass
         self.point_masses = tuple(point_masses)
         self.hanging: Hanging | None = None
-        self.density: np.ndarray | None = None
+        # Not known yet: whatever comes is a change of it.
+        self.density = np.zeros(0)
         self.stiffening: np.ndarray | float = 1.0
         self._set(young, poisson, density)
 

@@ -223,8 +223,8 @@ def _snow(model: BranchModel, middle: np.ndarray, ways: np.ndarray, radius: np.n
         return []
     down = model.gravity / np.linalg.norm(model.gravity)
     flat = np.linalg.norm(ways - (ways @ down)[:, None] * down, axis=1)
-    return [PointMass(tuple(map(float, place)), float(mass))
-            for place, mass in zip(middle, load * 2 * radius * flat, strict=True) if mass > 0]
+    return [PointMass((float(x), float(y), float(z)), float(mass))
+            for (x, y, z), mass in zip(middle, load * 2 * radius * flat, strict=True) if mass > 0]
 
 
 def _beyond(skeleton: Skeleton, cuts: Sequence[tuple[float, float, float]]) -> np.ndarray:

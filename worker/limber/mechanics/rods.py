@@ -313,10 +313,10 @@ def _masses(model: BranchModel, points: np.ndarray, mass: np.ndarray, link: np.n
 def _with_hung(tree: RodTree, model: BranchModel) -> RodTree:
     mass, centre, inertia = tree.mass.copy(), tree.centre.copy(), tree.inertia.copy()
     for hung in model.point_masses:
-        is_twig = isinstance(hung, HungTwig)
         place = np.array(hung.position)
-        link = tree.link_at(hung.attached if is_twig else hung.position)
-        own = np.array(hung.inertia) if is_twig else np.zeros((3, 3))
+        link, own = tree.link_at(hung.position), np.zeros((3, 3))
+        if isinstance(hung, HungTwig):
+            link, own = tree.link_at(hung.attached), np.array(hung.inertia)
         joined = mass[link] + hung.mass
         middle = (mass[link] * centre[link] + hung.mass * place) / max(joined, 1e-300)
         inertia[link] += own + _about(mass[link], centre[link] - middle) + _about(

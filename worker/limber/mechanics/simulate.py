@@ -1,6 +1,9 @@
 """A pull as settings describe it: the loaded branch, the grasp and where it goes."""
 
 
+from collections.abc import Sequence
+from typing import Literal
+
 import numpy as np
 
 from limber.errors import InputError
@@ -11,12 +14,17 @@ from limber.mechanics.dynamics.load_case import (
     dynamic_motion,
     static_motion,
 )
-from limber.mechanics.dynamics.motion import EnergyMomentumSettings, NewmarkSettings
+from limber.mechanics.dynamics.motion import (
+    EnergyMomentumSettings,
+    MotionSettings,
+    NewmarkSettings,
+)
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.pose_table import PoseTable
 from limber.mechanics.settings import Point, SimulateSettings
 from limber.mechanics.statics.solve import solve_static
+from limber.present import present
 from limber.progress import SILENT, Progress
 
 _PROBE = 1e-6
@@ -41,7 +49,7 @@ def bending_force(model: BranchModel, grasp: Grasp) -> np.ndarray:
 
 
 def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTable | None = None,
-                 grasp_point: np.ndarray | None = None) -> LoadCase:
+                 grasp_point: np.ndarray | Sequence[float] | None = None) -> LoadCase:
     """Return the load case that settings ask for.
 
     Args:
@@ -53,7 +61,7 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
     Raises:
         InputError: options that do not fit. ConvergenceError: the branch finds no rest.
     """
-    def patch(point: Point, mode: str) -> Grasp:
+    def patch(point: Point, mode: Literal["clamped", "pinned"]) -> Grasp:
         if mode == "clamped" and settings.grasp_radius > 0:
             return Grasp.gripping(model.mesh, np.array(point), settings.grasp_radius)
         return Grasp.at(model.mesh, np.array(point), settings.grasp_radius, mode)
@@ -75,8 +83,9 @@ def load_case_of(model: BranchModel, settings: SimulateSettings, along: PoseTabl
     times, part = _ramp(settings, along.duration if along else settings.duration)
     changes = along.changes(times) if along else part[:, None] * np.concatenate(
         [settings.move or (0.0, 0, 0), settings.turn or (0.0, 0, 0)])
+    first = present(start.pose, "pose of the grasps")[0]
     return LoadCase(model, start, grasp, follows_pose, holds,
-                _way(start.pose[0], changes, settings.grasp_mode), force, loads, times, part)
+                    _way(first, changes, settings.grasp_mode), force, loads, times, part)
 
 
 def with_masses(model: BranchModel, settings: SimulateSettings) -> BranchModel:
@@ -102,7 +111,7 @@ def motion_of(case: LoadCase, settings: SimulateSettings,
     """Pull, along equilibria or in time."""
     if settings.kind == "static":
         return static_motion(case, progress)
-    scheme = EnergyMomentumSettings(max_step=settings.step)
+    scheme: MotionSettings = EnergyMomentumSettings(max_step=settings.step)
     if settings.scheme == "newmark":
         scheme = NewmarkSettings(max_step=settings.step, beta=settings.newmark_beta,
                                  gamma=settings.newmark_gamma)

@@ -59,8 +59,8 @@ def deformation_gradients(model: BranchModel, displacement: np.ndarray,
 def principal_stretch(model: BranchModel, displacement: np.ndarray) -> Place:
     """Return the largest principal stretch of any tetrahedron (1: unstretched), and where."""
     value, tet = model.largest_stretch(displacement)
-    place = tuple(float(x) for x in model.mesh.nodes[model.mesh.tets[tet, :4]].mean(axis=0))
-    return Place(value, tet, place)
+    x, y, z = map(float, model.mesh.nodes[model.mesh.tets[tet, :4]].mean(axis=0))
+    return Place(value, tet, (x, y, z))
 
 
 def strain_state(model: BranchModel, displacement: np.ndarray) -> StrainState:

@@ -13,6 +13,7 @@ from limber.mechanics.motion_state import MotionState
 from limber.mechanics.statics.problem import checked_forces
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
+from limber.present import present
 
 
 class Drive:
@@ -33,8 +34,9 @@ class Drive:
                  nodal_forces: np.ndarray | None, times: np.ndarray):
         self.model, self.times = model, _checked_times(times)
         self.single = isinstance(grasp, Grasp)
-        self.grasps = [] if grasp is None else [grasp] if self.single else list(grasp)
-        self.path = None
+        self.grasps = ([] if grasp is None else [grasp] if isinstance(grasp, Grasp)
+                       else list(grasp))
+        self.path: PosePath | None = None
         if poses is not None:
             if not self.grasps or grasp_forces is not None:
                 raise InputError("Poses without a grasp, or together with grasp forces.",
@@ -97,17 +99,18 @@ class Drive:
 
     def impose(self, state: MotionState) -> None:
         """Give held nodes, and the means of pinned patches, all of the path's motion."""
+        path = present(self.path, "path of the grasps")
         held, pins = self._at(state.time)
         fields = (state.displacement, state.velocity, state.acceleration)
         for field_, values, means in zip(fields, held, pins, strict=True):
-            for grasp, patch in zip(self.path.clamped, values, strict=True):
+            for grasp, patch in zip(path.clamped, values, strict=True):
                 field_[grasp.nodes] = patch
-            for grasp, mean in zip(self.path.pinned, means, strict=True):
+            for grasp, mean in zip(path.pinned, means, strict=True):
                 field_[grasp.nodes] += mean - grasp.weights @ field_[grasp.nodes]
 
     def _at(self, instant: float) -> tuple:
         if self._known is None or self._known[0] != instant:
-            self._known = (instant, self.path.at(instant))
+            self._known = (instant, present(self.path, "path of the grasps").at(instant))
         return self._known[1]
 
     def _between(self, values: np.ndarray, instant: float) -> np.ndarray:

@@ -18,12 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from limber.mechanics.dynamics.drive import Drive
-from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.materials import Material, neo_hookean_energy, neo_hookean_stress
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
+from limber.present import present
 from limber.sparse import NotPositiveDefiniteError
 
 _STRAIN_CHANGE = 1e-6
@@ -38,7 +39,7 @@ chosen, not measured."""
 class EnergyMomentumStepper(Stepper):
     """Takes steps that keep energy and momentum."""
 
-    def __init__(self, drive: Drive, settings: NewmarkSettings):
+    def __init__(self, drive: Drive, settings: MotionSettings):
         super().__init__(drive, settings)
         self._balances: deque[tuple[float, np.ndarray]] = deque(maxlen=2)
         self._is_polynomial = self.model.material != Material.stable_neo_hookean
@@ -68,7 +69,9 @@ class EnergyMomentumStepper(Stepper):
         moved, pins = self.drive.moves(new)
         moved, pins = None if moved is None else moved / 2, pins / 2
         before = self.model.strains(old.displacement)
-        increment, norms, made = None, [], 0
+        increment: np.ndarray | None = None
+        norms: list[float] = []
+        made = 0
         for _ in range(settings.max_iterations):
             self._follow(old, new, dt)
             middle = 0.5 * (old.displacement + new.displacement)
@@ -77,12 +80,14 @@ class EnergyMomentumStepper(Stepper):
             residual = equations.free_part(out)
             norm = float(np.linalg.norm(residual))
             if not np.isfinite(norm):
-                return self._failed("the motion grew without bound")
+                self._failed("the motion grew without bound")
+                return None
             reference = float(np.linalg.norm(load) + np.linalg.norm(inertial)
                               + np.linalg.norm(out - residual))
             if (len(norms) > 6 and norm > 0.9 * min(norms)
                     and norms[-1] > 0.9 * min(norms[:-1])):
-                return self._failed("the iteration does not converge")
+                self._failed("the iteration does not converge")
+                return None
             if increment is not None and norm <= max(settings.tolerance * reference,
                                                      self._floor()):
                 return self._accepted(new, old, out)
@@ -90,18 +95,20 @@ class EnergyMomentumStepper(Stepper):
             if first or (norm > _GOOD_TANGENT * norms[-1] and made < _FRESH):
                 made += 1
                 if not self._make_tangent(middle, increment, bearing, dt):
-                    return self._failed("the stiffness has no positive pivots")
+                    self._failed("the stiffness has no positive pivots")
+                    return None
             norms.append(norm)
             self.iteration_count += 1
             if first and moved is not None:
                 residual = equations.free_part(
                     out - self._bearing.tangent_times(middle, moved))
-            increment = self.tangent.solve(residual, pins)
+            increment = present(self.tangent, "tangent").solve(residual, pins)
             if moved is not None and equations.held.any():
                 increment = increment + moved
             moved, pins = None, np.zeros_like(pins)
             new.displacement = new.displacement + 2 * increment
-        return self._failed(f"no convergence in {settings.max_iterations} iterations")
+        self._failed(f"no convergence in {settings.max_iterations} iterations")
+        return None
 
     def borne(self, instant: float) -> np.ndarray | None:
         """Return what holds the branch bears on each node [N], shape [node_count, 3].
@@ -166,7 +173,8 @@ class EnergyMomentumStepper(Stepper):
 
     def _floor(self) -> float:
         # Differences of displacements in an element carry round-off of about one unit each.
-        return 8 * np.finfo(float).eps * self.tangent.diagonal_norm * self.model.mean_edge
+        tangent = present(self.tangent, "tangent")
+        return 8 * float(np.finfo(float).eps) * tangent.diagonal_norm * self.model.mean_edge
 
     def _failed(self, trouble: str) -> None:
         self.trouble, self.status = trouble, Status.stalled

@@ -9,6 +9,7 @@ from limber.mechanics.grasp import Grasp
 from limber.mechanics.model import BranchModel
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.statics.solve import solve_static
+from limber.present import present
 from limber.progress import Progress
 
 
@@ -47,7 +48,8 @@ class LoadCase:
 
     def poses(self) -> np.ndarray:
         """Poses of :attr:`held` [m, rad], shape [frames, held, 6]."""
-        still = np.tile(self.start.pose[1:], (len(self.times), 1, 1))
+        pose = present(self.start.pose, "pose of the grasps")
+        still = np.tile(pose[1:], (len(self.times), 1, 1))
         return np.concatenate([self.way[:, None], still], axis=1) if self.follows_pose else still
 
     def nodal_forces(self) -> np.ndarray:

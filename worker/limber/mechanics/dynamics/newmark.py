@@ -10,6 +10,7 @@ from limber.mechanics.dynamics.stepper import Stepper
 from limber.mechanics.linear.equations import Viscous
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
+from limber.present import present
 from limber.sparse import NotPositiveDefiniteError
 
 _GOOD_TANGENT = 1e-3
@@ -19,6 +20,8 @@ chosen, not measured."""
 
 class NewmarkStepper(Stepper):
     """Takes steps by Newmark's formulas."""
+
+    settings: NewmarkSettings
 
     def __init__(self, drive: Drive, settings: NewmarkSettings):
         super().__init__(drive, settings)
@@ -46,7 +49,9 @@ class NewmarkStepper(Stepper):
                       displacement=old.displacement.copy())
         moved, pins = self.drive.moves(new)
         self._follow(old, new, dt)
-        increment, norms, fresh = None, [], False
+        increment: np.ndarray | None = None
+        norms: list[float] = []
+        fresh = False
         for _ in range(settings.max_iterations):
             out, inertial, min_det_f = self._imbalance(new, load, viscous)
             residual = equations.free_part(out)
@@ -76,7 +81,7 @@ class NewmarkStepper(Stepper):
             if first and moved is not None:
                 residual = equations.free_part(
                     out - model.tangent_times(old.displacement, moved, viscous))
-            increment = self.tangent.solve(residual, pins)
+            increment = present(self.tangent, "tangent").solve(residual, pins)
             if moved is not None and equations.held.any():
                 increment = increment + moved
             moved, pins = None, np.zeros_like(pins)
@@ -130,7 +135,8 @@ class NewmarkStepper(Stepper):
 
     def _floor(self) -> float:
         # Differences of displacements in an element carry round-off of about one unit each.
-        return 8 * np.finfo(float).eps * self.tangent.diagonal_norm * self.model.mean_edge
+        tangent = present(self.tangent, "tangent")
+        return 8 * float(np.finfo(float).eps) * tangent.diagonal_norm * self.model.mean_edge
 
     def _accepted(self, new: MotionState, min_det_f: float) -> MotionState | None:
         if min_det_f <= 0:

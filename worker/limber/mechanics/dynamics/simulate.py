@@ -34,6 +34,7 @@ from limber.mechanics.statics.problem import base_forces, checked_forces, strain
 from limber.mechanics.statics.result import StaticResult
 from limber.mechanics.status import Status
 from limber.mechanics.strain import principal_stretch
+from limber.present import present
 from limber.progress import SILENT, Progress
 
 
@@ -90,9 +91,9 @@ class _Run:
                  tangents: MotionTangents | None):
         self.drive, self.settings, self.tangents = drive, settings, tangents
         self.model, self.equations = drive.model, drive.equations
-        self.is_newmark = isinstance(settings, NewmarkSettings)
-        self.stepper = (NewmarkStepper if self.is_newmark else EnergyMomentumStepper)(
-            drive, settings)
+        self.stepper: NewmarkStepper | EnergyMomentumStepper = (
+            NewmarkStepper(drive, settings) if isinstance(settings, NewmarkSettings)
+            else EnergyMomentumStepper(drive, settings))
         self.step_count = 0
         self.factorisations_before = self.equations.factorisation_count
         self.viscous: Viscous | None = None
@@ -177,7 +178,7 @@ class _Run:
         self.viscous, self.state = viscous, new
         tangents = self.tangents
         if tangents:
-            tangents.advance(old, new, dt, viscous, stepper.tangent)
+            tangents.advance(old, new, dt, viscous, present(stepper.tangent, "tangent"))
             before = tangents.explicit(new, viscous)
         if drive.path:
             drive.impose(new)
@@ -191,12 +192,13 @@ class _Run:
         internal = model.internal(state.displacement, viscous=self.viscous)
         load = self.drive.load_at(state.time)
         momentum = model.mass_times(state.velocity)
-        out = None if self.is_newmark else self.stepper.borne(state.time)
+        stepper = self.stepper
+        out = (stepper.borne(state.time) if isinstance(stepper, EnergyMomentumStepper) else None)
         if out is None:
             out = (internal.force - load
                    + model.mass_times(state.acceleration) + model.damping.mass * momentum)
-            if not self.is_newmark:
-                self.stepper.begin(state, out)
+            if isinstance(stepper, EnergyMomentumStepper):
+                stepper.begin(state, out)
         positions = model.mesh.nodes + state.displacement
         forces, torques = np.zeros((len(grasps), 3)), np.zeros((len(grasps), 3))
         if self.drive.path:

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 
 from limber.mechanics.dynamics.drive import Drive
-from limber.mechanics.dynamics.motion import NewmarkSettings
+from limber.mechanics.dynamics.motion import MotionSettings
 from limber.mechanics.linear.equations import Tangent, Viscous
 from limber.mechanics.motion_state import MotionState
 from limber.mechanics.status import Status
@@ -18,7 +18,7 @@ class Stepper(ABC):
         tangent: The last step was solved with; None before the first.
     """
 
-    def __init__(self, drive: Drive, settings: NewmarkSettings):
+    def __init__(self, drive: Drive, settings: MotionSettings):
         self.drive, self.settings = drive, settings
         self.model, self.equations = drive.model, drive.equations
         self.iteration_count = 0

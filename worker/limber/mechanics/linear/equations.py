@@ -88,7 +88,10 @@ class Tangent:
     @cached_property
     def _pin_halves(self) -> np.ndarray:
         # Not before they are asked for: many a tangent only says whether a state is stable.
-        return self._factor.down(self.equations.pin_rows)
+        factor = self._factor
+        if not isinstance(factor, SupernodalFactor):
+            raise TypeError(f"{type(factor).__name__} has no first half of a solve.")
+        return factor.down(self.equations.pin_rows)
 
     @cached_property
     def _pin_solutions(self) -> np.ndarray:
@@ -262,12 +265,12 @@ class Equations:
             growth, memory = viscous.growth, layout.per_point(viscous.memory)
         elif strain is not None:
             memory = layout.per_point(strain - model.strains(displacement))
-        mixed = increment is not None and model.material == Material.st_venant_kirchhoff
-        tangent_stiffness(for_kernels(displacement),
-                          for_kernels(increment) if mixed else _NO_INCREMENT,
-                          layout.gradients, layout.weights, lam, mu, layout.nodes,
-                          int(model.material), growth, memory, layout.slots, layout.lengths,
-                          self._values)
+        mixed = _NO_INCREMENT
+        if increment is not None and model.material == Material.st_venant_kirchhoff:
+            mixed = for_kernels(increment)
+        tangent_stiffness(for_kernels(displacement), mixed, layout.gradients, layout.weights,
+                          lam, mu, layout.nodes, int(model.material), growth, memory,
+                          layout.slots, layout.lengths, self._values)
         self._add_pins()
         return self._values[:self.pattern.value_count]
 

@@ -153,8 +153,9 @@ class ReducedStepper:
         by_mass = 1 / (settings.beta * step**2)
         # Without the acceleration: that of the stiff coordinates swings from step to step.
         q = old.coordinates + step * old.velocity
-        jump: np.ndarray | None = held - q[:count]
-        if not foresee or np.abs(jump).max() <= _JUMP * model.extent:
+        way = held - q[:count]
+        jump: np.ndarray | None = way
+        if not foresee or np.abs(way).max() <= _JUMP * model.extent:
             q[:count], jump = held, None
         viscous, massive = model.damping.stiffness, model.damping.mass
         mass_part = (by_mass + massive * by_rate) * model.mass[free, free]
@@ -227,7 +228,8 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
     stepper.state.time = float(times[0])
     if not isinstance(begin, ReducedMotionState):
         stepper.begin(_held_at(model, path, float(times[0]))[2])
-    rows, seconds, message = [_row(stepper, poses[0])], [], ""
+    rows, message = [_row(stepper, poses[0])], ""
+    seconds: list[float] = []
     for number in range(1, len(times)):
         progress(number / len(times), "moving the reduced model", time=float(times[number]))
         pieces = max(1, int(np.ceil((times[number] - times[number - 1]) / settings.max_step
@@ -238,9 +240,9 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
             message = f"the step to {times[number]:.4g} s did not converge"
             break
         rows.append(_row(stepper, path(times[number])))
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return ReducedMotion(not message, times[:len(rows)], *columns, np.array(seconds),
-                         stepper.iteration_count, stepper.state, message)
+    coordinates, strain, kinetic, force, torque = map(np.array, zip(*rows, strict=True))
+    return ReducedMotion(not message, times[:len(rows)], coordinates, strain, kinetic, force,
+                         torque, np.array(seconds), stepper.iteration_count, stepper.state, message)
 
 
 def _pairs(first: float, second: float, pieces: int) -> list[tuple[float, float]]:

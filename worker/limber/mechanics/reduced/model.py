@@ -43,6 +43,7 @@ from limber.mechanics.reduced.training import (
     sample_young,
 )
 from limber.mechanics.reduced.training_poses import TrainingPoses
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.reading import read_arrays
 
@@ -205,7 +206,8 @@ class ReducedModel:
         """
         self.strain_energy(q)
         shares = np.linalg.solve(self.root.T, self._work.strain).astype(np.float32)
-        return (self.strain_fields @ shares).astype(float)
+        fields = present(self.strain_fields, "strain field of the reduced model")
+        return (fields @ shares).astype(float)
 
     def displacement_of(self, q: np.ndarray) -> np.ndarray:
         """Return the displacement of all nodes [m], shape [node_count, 3]."""
@@ -232,7 +234,8 @@ class ReducedModel:
         began = time.perf_counter()
         pose = check_pose(pose)
         load = self.load if nodal_forces is None else self.load + self.load_of(nodal_forces)
-        best, iterations = None, 0
+        best: _Found | None = None
+        iterations = 0
         for at_pose, q in self._starts(pose, start)[:settings.start_count]:
             found = self._follow(at_pose, q, pose, load, settings,
                                  settings.iteration_limit - iterations)
@@ -244,7 +247,7 @@ class ReducedModel:
             if ((best.converged and best.novelty < settings.novelty_limit)
                     or iterations >= settings.iteration_limit):
                 break
-        return self._state(best, pose, load, iterations, began, settings)
+        return self._state(present(best, "start"), pose, load, iterations, began, settings)
 
     def followed(self, start: np.ndarray, pose: np.ndarray,
                  settings: ReducedStaticSettings = _STATIC) -> ReducedState:
@@ -441,11 +444,12 @@ class ReducedModel:
         if int(arrays.get("format", -1)) != FORMAT:
             raise InputError(f"{path} has another format.", "", "Build it again.")
         grasp = Grasp(arrays["grasp_nodes"], arrays["grasp_weights"], arrays["grasp_centre"],
-                      str(arrays["grasp_mode"]))
+                      "pinned" if str(arrays["grasp_mode"]) == "pinned" else "clamped")
         basis = Basis(arrays["columns"], int(arrays["lift_count"]), arrays["states"],
                       float(arrays["captured"]), arrays["reach"])
-        polynomial = StrainPolynomial(*(arrays[f"polynomial_{name}"] for name in
-                                        ("linear", "quadratic", "by_lambda", "by_mu")),
+        linear, quadratic, by_lambda, by_mu = (
+            arrays[f"polynomial_{name}"] for name in ("linear", "quadratic", "by_lambda", "by_mu"))
+        polynomial = StrainPolynomial(linear, quadratic, by_lambda, by_mu,
                                       float(arrays["polynomial_poisson"]))
         error = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                          strict=True))

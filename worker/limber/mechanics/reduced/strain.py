@@ -30,6 +30,7 @@ from limber.mechanics.reduced.basis import (
     tangent_steps,
 )
 from limber.mechanics.reduced.training import Snapshots
+from limber.present import present
 
 _CHUNK_POINTS = 1000
 _PAIRS = np.array([[0, 0], [1, 1], [2, 2], [0, 1], [0, 2], [1, 2]])
@@ -198,7 +199,7 @@ def make_polynomial(model: BranchModel, basis: Basis, weights: np.ndarray,
         transform = _all_fields(points, basis)
         sources = None
     else:
-        sources = _strain_sources(model, snapshots)
+        sources = _strain_sources(model, present(snapshots, "snapshot"))
         transform = _leading_fields(points, sources, field_count)
     return _projected(points, basis, sources, transform, keeps_fields)
 
@@ -315,7 +316,7 @@ def _strain_sources(model: BranchModel, snapshots: Snapshots) -> _Sources:
 
 def _leading_fields(points: _Points, sources: _Sources, count: int) -> np.ndarray:
     """Return coefficients of the leading strain fields in the sources, [sources, fields]."""
-    gram = 0.0
+    gram = np.zeros((1, 1))
     for chunk in points.chunks():
         strain = sources.strains(points, chunk)
         flat = strain.reshape(-1, strain.shape[2])
@@ -344,7 +345,7 @@ def _terms(points: _Points, basis: Basis, chunk: slice) -> np.ndarray:
 
 
 def _all_fields(points: _Points, basis: Basis) -> np.ndarray:
-    gram = 0.0
+    gram = np.zeros((1, 1))
     for chunk in points.chunks():
         terms = _terms(points, basis, chunk)
         flat = terms.reshape(-1, terms.shape[2])
@@ -358,7 +359,7 @@ def _projected(points: _Points, basis: Basis, sources: _Sources | None,
                transform: np.ndarray, keeps_fields: bool,
                ) -> tuple[StrainPolynomial, np.ndarray | None]:
     count, regions = transform.shape[1], points.weights.shape[1]
-    coupling = 0.0
+    coupling = np.zeros((count, 1))
     own = np.zeros((count, count))
     by_lambda = np.zeros((regions, count, count))
     by_mu = np.zeros((regions, count, count))

@@ -322,7 +322,7 @@ class Trainer:
                                                  model.lame_mu * part)).force
             stiffer.append(tangent.solve(-force))
         return {"poses": pose, "young": young, "displacement": u,
-                "energy": np.float64(result.strain_energy), "force": result.reaction_force,
+                "energy": np.array(result.strain_energy), "force": result.reaction_force,
                 "pose_tangents": np.array(moved, np.float32),
                 "young_tangents": np.array(stiffer, np.float32).reshape(-1, *u.shape)}
 

@@ -274,7 +274,7 @@ class Path:
 
     def _floor(self, diagonal_norm: float) -> float:
         # Differences of displacements in an element carry round-off of about one unit each.
-        return 8 * np.finfo(float).eps * diagonal_norm * self.model.mean_edge
+        return 8 * float(np.finfo(float).eps) * diagonal_norm * self.model.mean_edge
 
     def _accept(self, trial: np.ndarray, state: InternalState, part: float,
                 stable: bool, steady: bool) -> float | None:
@@ -310,7 +310,7 @@ class Path:
                            - ((trial + self.displacement) * (now - before)).sum())
         change = (state.energy - float((now * trial).sum())
                   - self.state.energy + float((before * self.displacement).sum()))
-        return (work - change) / max(abs(work) + abs(change), np.finfo(float).tiny)
+        return (work - change) / max(abs(work) + abs(change), float(np.finfo(float).tiny))
 
     def _is_stable(self, trial: np.ndarray) -> bool:
         """Whether no pivot of the exact tangent's factor is negative."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Required, TypedDict, Unpack
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from limber.mechanics.linear.equations import Equations
 from limber.mechanics.materials import Material
 from limber.mechanics.model import BranchModel, InternalState
 from limber.mechanics.statics.result import StaticResult, StaticSettings
+from limber.mechanics.status import Status
 from limber.mechanics.strain import Place
 
 
@@ -55,7 +57,8 @@ class StaticProblem:
     def target(self, pose: np.ndarray | None, grasp_force: np.ndarray | None,
                nodal_forces: np.ndarray | None) -> Target:
         shape = (self.model.mesh.node_count, 3)
-        held, pins = np.zeros(shape), []
+        held = np.zeros(shape)
+        pins: list[np.ndarray] = []
         load = self.model.weight_force
         if nodal_forces is not None:
             load = load + checked_forces(nodal_forces, shape)
@@ -101,8 +104,22 @@ def strain_warnings(stretch: Place) -> list[str]:
             " Check the units of loads and of Young's modulus."]
 
 
+class HowFound(TypedDict, total=False):
+    """The fields of a result that tell how it was found; see StaticResult."""
+
+    status: Required[Status]
+    iterations: Required[int]
+    residual_history: Required[list[float]]
+    seconds: Required[float]
+    reached: float
+    message: str
+    warnings: list[str]
+    snapped_at: list[float]
+    doubt: str
+
+
 def make_result(problem: StaticProblem, displacement: np.ndarray, state: InternalState,
-                load: np.ndarray, **found: object) -> StaticResult:
+                load: np.ndarray, **found: Unpack[HowFound]) -> StaticResult:
     """Return a result with the reactions that belong to a displacement."""
     model = problem.model
     positions = model.mesh.nodes + displacement
@@ -150,7 +167,7 @@ def grasp_wrench(problem: StaticProblem, grasp: Grasp, positions: np.ndarray, ou
     return forces.sum(axis=0), np.cross(positions[grasp.nodes] - centre, forces).sum(axis=0)
 
 
-def checked_forces(values: np.ndarray, shape: tuple[int, int],
+def checked_forces(values: np.ndarray, shape: tuple[int, ...],
                    name: str = "Nodal forces") -> np.ndarray:
     """Return a nodal field as floats.
 
