@@ -152,3 +152,18 @@ def test_a_cancel_reaches_the_tasks(workers: int, monkeypatch):
     with pytest.raises(Cancelled):
         run_tasks(half, [()] * 100, workers=workers, progress=progress)
     assert time.monotonic() - started < 15
+
+
+def reports_for_long(progress: Progress) -> None:
+    for part in range(1000):
+        progress(part / 1000, "long")
+        time.sleep(0.02)
+
+
+def test_a_task_cancelled_by_its_own_progress_ends_alone():
+    """The pool itself was not cancelled: it goes on with other tasks."""
+    progress = Progress(lambda _fraction, _message, _numbers: progress.cancel())
+    with Pool(1) as pool:
+        with pytest.raises(Cancelled):
+            pool.submit(reports_for_long, progress=progress).result(60)
+        assert pool.submit(late_square, 5).result(60) == 25

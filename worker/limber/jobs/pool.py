@@ -30,6 +30,7 @@ from limber.jobs.pool_process import (
     Task,
     serve,
 )
+from limber.present import present
 from limber.progress import SILENT, Progress
 
 _TICK_SECONDS = 0.1
@@ -74,7 +75,6 @@ class Pool:
         self._guard = Lock()
         self._waiting: deque[_Job] = deque()
         self._workers: list[_Worker] = []
-        self._cancelled_at: float | None = None
         self._broken: BaseException | None = None
         self._closing = Event()
         self._bell, self._bell_button = self._context.Pipe(duplex=False)
@@ -120,8 +120,8 @@ class Pool:
             while True:
                 done, waiting = wait(futures, _TICK_SECONDS, FIRST_EXCEPTION)
                 for future in futures:
-                    if future in done and future.exception() is not None:
-                        raise future.exception()
+                    if future in done and (error := future.exception()) is not None:
+                        raise error
                 course.report(len(done))
                 if not waiting:
                     return [future.result() for future in futures]
@@ -134,7 +134,6 @@ class Pool:
         with self._guard:
             jobs = [*self._waiting, *(w.job for w in self._workers if w.job is not None)]
             self._waiting.clear()
-            self._cancelled_at = time.monotonic()
         for job in jobs:
             job.cancel()
         self._ring()
@@ -258,9 +257,9 @@ class Pool:
             job = worker.job
             if job is None:
                 continue
-            if job.is_cancelled:
+            if job.cancelled_at is not None:
                 worker.cancel_once()
-                if now - self._cancelled_at > _GRACE_SECONDS:
+                if now - job.cancelled_at > _GRACE_SECONDS:
                     self._end(worker, Cancelled())
                 continue
             seconds = now - worker.since
@@ -296,7 +295,7 @@ class _Job:
     limits: Limits
     progress: Progress
     future: Future = field(default_factory=Future)
-    is_cancelled: bool = False
+    cancelled_at: float | None = None
 
     def report(self, said: Reported) -> None:
         try:
@@ -305,14 +304,18 @@ class _Job:
             else:
                 self.progress(said.fraction, said.message, **said.numbers)
         except Cancelled:
-            self.is_cancelled = True
+            self._end_soon()
 
     def cancel(self) -> None:
         if self.future.cancel():
             # Nobody else will tell those who wait for it.
             self.future.set_running_or_notify_cancel()
         else:
-            self.is_cancelled = True
+            self._end_soon()
+
+    def _end_soon(self) -> None:
+        if self.cancelled_at is None:
+            self.cancelled_at = time.monotonic()
 
     def fail(self, error: BaseException) -> None:
         if not self.future.done():
@@ -351,7 +354,7 @@ class _Worker:
             self.take_job().fail(error)
 
     def take_job(self) -> _Job:
-        job, self.job = self.job, None
+        job, self.job = present(self.job, "task"), None
         return job
 
     def cancel_once(self) -> None:

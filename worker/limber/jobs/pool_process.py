@@ -83,7 +83,7 @@ def serve(pipe: Connection, begin: tuple[Callable | None, tuple], cores: int) ->
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ[CORES] = str(cores)
     parent = parent_process()
-    if parent is not None:
+    if parent is not None and parent.pid is not None:
         end_by_kernel(parent.pid)
     tasks: queue.SimpleQueue[Task] = queue.SimpleQueue()
     voice = _Voice(pipe)

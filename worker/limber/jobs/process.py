@@ -76,7 +76,8 @@ def run_json_process(name: str, command: Sequence[str], progress: Progress = SIL
             _stop(process)
             raise
         finally:
-            process.stdin.close()
+            if process.stdin is not None:
+                process.stdin.close()
         if process.returncode != 0:
             raise _failure(name, process.returncode, result, errors, fix)
     return result
