@@ -18,6 +18,8 @@ from limber.recordings.recording import read_pull, write_pull
 from limber.recordings.registration import rigid_fit
 from limber.recordings.streams import Stream, read_stream, write_stream
 from limber.stages.import_pull import import_pull
+from limber.stages.loading import load_mesh
+from limber.store import Branch
 
 
 @pytest.fixture
@@ -181,3 +183,20 @@ def test_masks_of_a_yolo_model_of_ones_own(bare_folder, source, monkeypatch, cap
     capsys.readouterr()
     assert call([*arguments, "--force"]) != 0
     assert "ultralytics" in json.loads(capsys.readouterr().out.strip().splitlines()[-1])["error"]
+
+
+def test_a_swing_by_its_own_weight_needs_no_grasp_point(branch_folder, tmp_path):
+    """No load hangs anywhere: the place that is seen to swing farthest stands for it."""
+    nodes = load_mesh(Branch.open(branch_folder)).nodes
+    places = nodes[np.argsort(nodes[:, 2])[[len(nodes) // 2, -1]]]
+    times = np.arange(400) / 100
+    swing = np.where(times > 0.5, 1 - np.cos(12 * (times - 0.5)) * np.exp(0.5 - times), 0.0)
+    seen = places + swing[:, None, None] * np.array([[0.002, 0, 0], [0.01, 0, 0]])
+    seen[-1, 1] = np.nan
+    write_stream(tmp_path / "swing.csv", Stream(times, seen.reshape(400, -1), tuple(
+        f"m{k}_{axis}_m" for k in range(2) for axis in "xyz")))
+    import_pull(branch_folder, tmp_path / "swing.csv", "swing", ImportSettings(
+        weight=0, own_weight=True, motion="swing"))
+    entry = read_pull(branch_folder / "pulls" / "swing").entry
+    assert np.allclose(entry.grasp.point_m, places[1], atol=1e-3)
+    assert entry.swing.load_mass_kg == 0

@@ -5,7 +5,12 @@ to be does not. A fit takes these errors as unknowns, with the deviations given 
 known of them beforehand.
 """
 
+from typing import TYPE_CHECKING
+
 from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from limber.recordings.recording import PullEntry
 
 
 class CalibrationEntry(BaseModel):
@@ -58,6 +63,6 @@ WITHOUT_GRIPPER = CalibrationEntry(
 that laying turned them."""
 
 
-def calibration_of(entry: "PullEntry") -> CalibrationEntry:  # noqa: F821
+def calibration_of(entry: "PullEntry") -> CalibrationEntry:
     """What is known of a pull's cell; the defaults where its recording does not say."""
     return entry.calibration or CalibrationEntry()

@@ -285,7 +285,7 @@ def _yolo_masks(source: Path, stamps: list[float], settings: Any) -> list[Any]:
                          "Record rgb/ (and rgb.txt), or leave --yolo-weights out.")
     segment = YoloSegmenter(Path(settings.yolo_weights), prompt=settings.yolo_prompt,
                             class_name=settings.yolo_class)
-    masks = []
+    masks: list[np.ndarray | None] = []
     for stamp in stamps:
         file = _nearest(images, stamp, stamps)
         if file is None:

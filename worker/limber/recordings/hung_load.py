@@ -107,7 +107,7 @@ def settled(seen: Observations, name: str) -> Settled:
     means = np.array([_mean(positions[block]) for block in blocks])
     middle = np.array([times[block].mean() for block in blocks])
     drift = float(np.nanmax(np.linalg.norm(means[-1] - means[0], axis=1)[whole]))
-    warnings = ()
+    warnings: tuple[str, ...] = ()
     if drift > 0.002 * moved + 2 * noise / np.sqrt(len(blocks[0])):
         warnings = (f"{name}: at rest it still creeps, by {100 * drift / moved:.1f} % of its "
                     f"displacement over {times[-1] - times[first]:.1f} s. Young's modulus is that "

@@ -14,6 +14,7 @@ from limber.constants import GRAVITY
 from limber.errors import InputError
 from limber.geometry.cloud.apart import read_apart
 from limber.names import refuse_links
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import estimate_offset
 from limber.recordings.bags.pull import JointPoses, pull_of_bag
@@ -195,18 +196,22 @@ def _import_motion(kind: str, source: Path, folder: Path, name: str, settings: I
         progress.warn(message)
     entry = pull.entry
     told = kind in ("pull", "bag") or settings.time_offset is not None
-    if not told and cleaned.observations is not None:
-        entry = _with_offset(cleaned, progress)
-        write_entry(folder / "pull.toml", entry)
     seen = cleaned.observations
+    if not told and seen is not None:
+        entry = _with_offset(cleaned, seen.times, progress)
+        write_entry(folder / "pull.toml", entry)
     return {"frame_count": len(seen.times) if seen is not None else len(pull.times),
             "point_count": seen.point_count if seen is not None else 0,
             "time_offset_s": entry.time_offset_s}
 
 
-def _with_offset(pull: Pull, progress: Progress) -> PullEntry:
-    """The pull's entry with the clocks' offset, as far as the recording tells it."""
-    seen, offset = pull.observations.times, 0.0
+def _with_offset(pull: Pull, seen: np.ndarray, progress: Progress) -> PullEntry:
+    """The pull's entry with the clocks' offset, as far as the recording tells it.
+
+    Args:
+        seen: Times of the observations [s].
+    """
+    offset = 0.0
     if seen[-1] < pull.times[0] or seen[0] > pull.times[-1]:
         offset = float(pull.times[0] - seen[0])
         progress.warn(
@@ -252,12 +257,13 @@ def _import_load(kind: str, source: Path, folder: Path, name: str, settings: Imp
         rest, positions = placed.apply(rest), placed.apply(positions)
     for message in (*still.warnings, *(placed.warnings if placed else ())):
         progress.warn(message)
-    _require_near(rest, name, branch.nodes)
+    nodes = present(branch.nodes, "mesh of the branch")
+    _require_near(rest, name, nodes)
     sigma = settings.position_sigma or still.sigma(placed.rms if placed else 1e-3)
     load = _load(settings, branch)
     moved = positions[-1] - rest
     # Of the branch's own weight alone no load hangs anywhere: where it is seen to sag most.
-    grasp = (_nearest(branch.nodes, rest[np.argmax(np.linalg.norm(moved, axis=1))])
+    grasp = (_nearest(nodes, rest[_farthest(moved[None])])
              if settings.grasp_point is None else _place(settings.grasp_point, settings, branch))
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
                    grasp=grasp, sigma=sigma)
@@ -294,13 +300,16 @@ def _import_swing(stream: Stream, labels: list[str], source: Path, folder: Path,
         rest, positions = placed.apply(rest), placed.apply(positions)
     for message in placed.warnings if placed else ():
         progress.warn(message)
-    _require_near(rest, name, branch.nodes)
-    load = _load(settings, branch)
-    hung = settings.weight is not None and settings.swing_start == "held"
-    mass = settings.weight / float(np.linalg.norm(branch.gravity)) if hung else 0.0
+    nodes = present(branch.nodes, "mesh of the branch")
+    _require_near(rest, name, nodes)
+    load, mass = _load(settings, branch), 0.0
+    if settings.weight is not None and settings.swing_start == "held":
+        mass = settings.weight / float(np.linalg.norm(branch.gravity))
+    # As for a steady load: of its own weight alone, where it is seen to swing farthest.
+    grasp = (_nearest(nodes, rest[_farthest(positions - rest)]) if settings.grasp_point is None
+             else _place(settings.grasp_point, settings, branch))
     entry = _entry("markers", source, settings, branch, rest, drive="force", mode="pinned",
-                   grasp=_place(settings.grasp_point, settings, branch),
-                   sigma=settings.position_sigma or noise)
+                   grasp=grasp, sigma=settings.position_sigma or noise)
     entry = entry.model_copy(update={"calibration": WITHOUT_GRIPPER, "swing": SwingEntry(
         start=settings.swing_start, load_mass_kg=mass, noise_m=noise,
         registration_m=placed.rms if placed else None)})
@@ -333,6 +342,12 @@ def _nearest(nodes: np.ndarray, place: np.ndarray) -> tuple[float, float, float]
     """The node nearest to a place [m]."""
     x, y, z = nodes[np.linalg.norm(nodes - place, axis=1).argmin()]
     return float(x), float(y), float(z)
+
+
+def _farthest(moved: np.ndarray) -> int:
+    """Which marker is seen to move farthest, by displacements [m], shape [frames, m, 3]."""
+    # A marker out of sight has not been seen to move.
+    return int(np.nan_to_num(np.linalg.norm(moved, axis=2)).max(axis=0).argmax())
 
 
 def _require_near(rest: np.ndarray, name: str, nodes: np.ndarray) -> None:
@@ -374,6 +389,12 @@ def _load(settings: ImportSettings, branch: BranchFrame) -> np.ndarray:
     return turn @ settings.load if settings.coordinates == "scan" else np.array(settings.load)
 
 
+def _point(pose: np.ndarray) -> tuple[float, float, float]:
+    """The place [m] of a pose."""
+    x, y, z = map(float, pose[:3])
+    return x, y, z
+
+
 def _place(point: tuple[float, float, float], settings: ImportSettings, branch: BranchFrame,
            ) -> tuple[float, float, float]:
     """A point [m] of the user's frame in the branch's."""
@@ -402,7 +423,9 @@ def _registered(rest: np.ndarray, labels: list[str], name: str, settings: Import
 
 def _assembled(kind: str, source: Path, folder: Path, name: str, settings: ImportSettings,
                branch: BranchFrame, progress: Progress) -> Pull:
-    observations, rest, messages = None, None, []
+    observations: Observations | None = None
+    rest: np.ndarray | None = None
+    messages: list[str] = []
     if kind == "robot":
         settings = settings.model_copy(update={"robot": str(source)})
     elif kind in ("markers", "c3d"):
@@ -428,7 +451,7 @@ def _assembled(kind: str, source: Path, folder: Path, name: str, settings: Impor
     if settings.frame_pose is not None:
         poses, wrenches = moved_into(settings.frame_pose, poses, wrenches)
     grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
-             else tuple(float(x) for x in poses[np.isfinite(poses).all(axis=1)][0, :3]))
+             else _point(poses[np.isfinite(poses).all(axis=1)][0]))
     observation = {"rgbd": "depth", "clouds": "clouds", "robot": "none"}.get(kind, "markers")
     entry = _entry(observation, source, settings, branch, rest, drive=settings.drive,
                    mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
@@ -466,7 +489,8 @@ def _given(settings: ImportSettings) -> set[str]:
 def _of_bag(source: Path, folder: Path, name: str, settings: ImportSettings, branch: BranchFrame,
             robot: RobotKnown | None, progress: Progress) -> Pull:
     bag = read_bag(source)
-    found = pull_of_bag(bag, folder, settings, robot and robot.joint_poses, progress)
+    found = pull_of_bag(bag, folder, settings, None if robot is None else robot.joint_poses,
+                        progress)
     told, warnings = _told_by_limber(bag)
     poses, wrenches = found.robot.values[:, :6], found.robot.values[:, 6:]
     if settings.torque_sigma is None:
@@ -475,8 +499,8 @@ def _of_bag(source: Path, folder: Path, name: str, settings: ImportSettings, bra
     if seen is not None:
         placed = _registered(seen.positions[0], [f"m{k}" for k in range(seen.point_count)], name,
                              settings, branch)
-        known = told is not None and not placed and len(told.rest_points_m or ()) == (
-            seen.point_count)
+        at_rest = None if told is None or placed else told.rest_points_m
+        known = at_rest is not None and len(at_rest) == seen.point_count
         used = placed.used if placed else np.flatnonzero(seen.visible[0] | known)
         if not len(used):
             raise InputError(f"{name}: no marker is seen in the first frame.",
@@ -484,11 +508,11 @@ def _of_bag(source: Path, folder: Path, name: str, settings: ImportSettings, bra
                              "Record from before the pull, or give --nominal.")
         positions = seen.positions[:, used]
         seen = replace(seen, positions=placed.apply(positions) if placed else positions)
-        rest = np.array(told.rest_points_m) if known else seen.positions[0]
+        rest = np.array(at_rest) if known else seen.positions[0]
         if branch.nodes is not None:
             _require_near(rest, name, branch.nodes)
     grasp = (_place(settings.grasp_point, settings, branch) if settings.grasp_point
-             else tuple(float(x) for x in poses[0, :3]))
+             else _point(poses[0]))
     entry = _entry(found.observation, source, settings, branch, rest, drive=settings.drive,
                    mode=settings.grasp_mode, grasp=grasp, sigma=settings.position_sigma or 1e-3)
     if told is not None:
@@ -513,17 +537,18 @@ def _told_by_limber(bag: Bag) -> tuple[PullEntry | None, tuple[str, ...]]:
 def _as_told(entry: PullEntry, told: PullEntry, settings: ImportSettings) -> PullEntry:
     """The entry of a bag that Limber wrote; what the settings ask for goes before."""
     given = _given(settings)
-    kept = {"calibration": told.calibration, "weightless": told.weightless, "truth": told.truth,
-            "source": f"{entry.source} ({told.source})" if told.source else entry.source}
+    kept: dict[str, Any] = {
+        "calibration": told.calibration, "weightless": told.weightless, "truth": told.truth,
+        "source": f"{entry.source} ({told.source})" if told.source else entry.source}
     if "own_weight" not in given:
         kept["gravity_m_s2"] = told.gravity_m_s2
     kept |= {name: getattr(told, name) for name in ("drive", "motion") if name not in given}
-    grasp = {"mode": told.grasp.mode} if "grasp_mode" not in given else {}
+    grasp: dict[str, Any] = {"mode": told.grasp.mode} if "grasp_mode" not in given else {}
     if "grasp_radius" not in given:
         grasp["radius_m"] = told.grasp.radius_m
     if not given & {"grasp_point", "frame_pose", "cell"}:
         grasp["point_m"] = told.grasp.point_m
-    sensor = {} if "position_sigma" in given else {
+    sensor: dict[str, float | None] = {} if "position_sigma" in given else {
         "position_sigma_m": told.sensor.position_sigma_m}
     if "force_sigma" not in given:
         sensor["force_sigma_n"] = told.sensor.force_sigma_n

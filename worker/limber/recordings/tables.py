@@ -107,8 +107,9 @@ def scale_of(title: Title, units: dict[str, float], default: str, where: Path) -
     unit = title.unit or default
     known = dict(units)
     known |= {key.lower(): value for key, value in units.items() if key.lower() not in known}
-    if unit in known or unit.lower() in known:
-        return known.get(unit, known.get(unit.lower()))
+    for spelt in (unit, unit.lower()):
+        if spelt in known:
+            return known[spelt]
     raise InputError(f"{where}: the column {title.name!r} is in {unit!r}.",
                      f"Known are {', '.join(units)}.", "Convert the column, or correct its name.")
 

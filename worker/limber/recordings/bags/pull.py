@@ -295,11 +295,12 @@ def _write_clouds(topic: Topic, times: np.ndarray, where: tuple[np.ndarray, Rota
                   folder: Path, settings: ImportSettings, progress: Progress) -> None:
     from plyfile import PlyData, PlyElement
 
-    ends = np.cumsum(topic.counts) if topic.counts is not None else None
+    counts = topic.counts
+    ends = np.cumsum(counts) if counts is not None else np.empty(0, int)
     with tempfile.TemporaryDirectory(prefix="limber-bag-") as place:
         for number, time in enumerate(times):
-            points = topic.values[number] if ends is None else topic.values[
-                ends[number] - topic.counts[number]:ends[number]]
+            points = topic.values[number] if counts is None else topic.values[
+                ends[number] - counts[number]:ends[number]]
             points = where[0] + where[1].apply(points[np.isfinite(points).all(axis=1)])
             rows = np.zeros(len(points), [("x", "f4"), ("y", "f4"), ("z", "f4")])
             for axis, column in zip("xyz", points.T, strict=True):

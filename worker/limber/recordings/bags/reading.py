@@ -87,13 +87,13 @@ def read_bag(path: Path) -> Bag:
     arrays = read_apart("limber.recordings.bags.reading:bag_arrays", path)
     kinds: dict[str, list[Topic]] = {}
     for number in range(int(arrays["topic_count"])):
-        def part(name: str, number: int = number) -> np.ndarray | None:
-            return arrays.get(f"{number}_{name}")
+        def part(name: str, number: int = number) -> np.ndarray:
+            return arrays[f"{number}_{name}"]
 
         name, kind, frame, *labels = str(part("names")).split(_SEPARATOR)
         kinds.setdefault(kind, []).append(Topic(
             name, frame, part("stamps"), part("logged"), part("values"), tuple(labels),
-            part("counts")))
+            arrays.get(f"{number}_counts")))
     read, broken = int(arrays["read"]), int(arrays["broken"])
     if broken > _MOST_BROKEN * (read + broken):
         raise InputError(f"{path}: {broken} of {read + broken} messages cannot be decoded.",
