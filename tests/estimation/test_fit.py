@@ -10,6 +10,7 @@ from limber.errors import Cancelled, InputError
 from limber.estimation.doubt.identifiability import identifiability, link_unresolved, require_scale
 from limber.estimation.doubt.uncertainty import uncertainty
 from limber.estimation.evaluations import EvaluationLog
+from limber.estimation.fit import best_so_far
 from limber.estimation.objective import Objective, Stopped
 from limber.estimation.optimise import gauss_newton, nelder_mead
 from limber.estimation.parameters import LINK_DEVIATION, ParameterSpace, Values
@@ -191,6 +192,15 @@ def test_a_stopped_estimate_keeps_its_best_and_resumes(tmp_path, small_bench, no
     known = again.find(start)
     assert known.objective == log.entries[0].objective
     assert EvaluationLog(path, "another").resumed_count == 0
+
+
+def test_a_stop_without_an_equilibrium_says_so(small_bench, noisy, monkeypatch):
+    """The best parameters of the log may find none when they are simulated anew."""
+    objective = small_bench.objective([noisy], SETTINGS)
+    objective.log.add(np.log(TRUTH), 1.0, 1.0)
+    monkeypatch.setattr(Objective, "evaluate", lambda *_arguments, **_options: None)
+    with pytest.raises(Cancelled, match="equilibrium"):
+        best_so_far(objective)
 
 
 def test_a_running_fit_tells_how_well_it_knows_the_moduli(small_bench, noisy):

@@ -32,7 +32,7 @@ class EvaluationLog:
         self._started = time.perf_counter()
         self._problem = problem
         if path is not None:
-            self._resume()
+            self._resume(path)
 
     @property
     def best(self) -> EvaluationEntry | None:
@@ -58,12 +58,12 @@ class EvaluationLog:
         if self._path is not None:
             self._path.unlink(missing_ok=True)
 
-    def _resume(self) -> None:
-        lines = (self._path.read_text(encoding="utf-8", errors="replace").splitlines()
-                 if self._path.exists() else [])
+    def _resume(self, path: Path) -> None:
+        lines = (path.read_text(encoding="utf-8", errors="replace").splitlines()
+                 if path.exists() else [])
         header = _parsed(lines[0]) if lines else None
         if header is None or header.get("problem") != self._problem:
-            self._path.write_text(json.dumps({"problem": self._problem}) + "\n", encoding="utf-8")
+            path.write_text(json.dumps({"problem": self._problem}) + "\n", encoding="utf-8")
             return
         for line in lines[1:]:
             record = _parsed(line) or {}

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from limber.estimation.parameters import Values
 from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
+from limber.present import present
 
 MIXTURE = (0.5, 0.5)
 """Mean and deviation of the part of the straight field in the mixture."""
@@ -105,7 +106,7 @@ class YoungField:
         """Deviations of the bumps [B], and their derivative to log E at the control points [B, K].
         """
         step = self.steps @ np.log(values.young)
-        sizes = np.hypot(self.widths, step)
+        sizes = np.hypot(present(self.widths, "bump of the field"), step)
         return sizes, (step / sizes)[:, None] * self.steps
 
     def _form(self, values: Values) -> np.ndarray:

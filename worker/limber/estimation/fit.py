@@ -42,6 +42,7 @@ from limber.estimation.reduced_fit import Reduction, fit_reduced
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.start import led_start, scaled_start, standing_start
 from limber.estimation.subject import Subject
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.recordings.calibration import calibration_of
 from limber.recordings.checks import force_unit_suspicion
@@ -201,7 +202,8 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
     if not (subject.hangs and any(under_its_weight(subject.model, pull.entry).hanging is not None
                                   for pull in pulls)):
         return fitted(subject)
-    heavy, failure = None, None
+    heavy: Estimate | None = None
+    failure: Exception | None = None
     try:
         heavy = fitted(subject)
         sound = heavy.uncertainty.variance_factor < MISFIT_FACTOR
@@ -219,7 +221,7 @@ def fit_branch(pulls: list[Pull], subject: Subject, settings: EstimateSettings, 
         # It was not the weight.
         if failure is not None:
             raise failure
-        return heavy
+        return present(heavy, "estimate with the weight")
     found.is_weightless = True
     progress.warn(
         "The branch is too soft to carry its own weight in the scanned shape: its weight is left "
@@ -266,7 +268,7 @@ def fit_pulls(objective: Objective, start: Values, settings: EstimateSettings,
     try:
         fit, objective = _fitted(objective, space.pack(start), settings, progress, reduction)
     except Stopped:
-        fit = _best_so_far(objective)
+        fit = best_so_far(objective)
     stopped = fit.status is FitStatus.stopped
     if settings.method == "gauss-newton" and not stopped:
         fit, objective = _linked_at_the_end(fit, objective, settings, progress)
@@ -368,13 +370,21 @@ def _refined(fit: Fit, objective: Objective, settings: EstimateSettings,
     return fit
 
 
-def _best_so_far(objective: Objective) -> Fit:
+def best_so_far(objective: Objective) -> Fit:
+    """Return the best of a stopped fit.
+
+    Raises:
+        Cancelled: there is none.
+    """
     best = objective.log.best
     if best is None or len(best.parameters) != objective.space.size:
         raise Cancelled("The estimate was stopped before its first fit step.",
                         "There is nothing to keep yet.", "Run it again.")
     quiet = Objective(objective.forwards, objective.space, force_sigma=objective.force_sigma)
     evaluation = quiet.evaluate(np.array(best.parameters), jacobian=True)
+    if evaluation is None:
+        raise Cancelled("The estimate was stopped before any parameters gave an equilibrium.",
+                        "There is nothing to keep yet.", "Run it again.")
     return Fit(evaluation, FitStatus.stopped, "stopped")
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from limber.errors import WorkError
+from limber.mechanics.dynamics.motion import DynamicResult
 from limber.mechanics.dynamics.simulate import NewmarkSettings, simulate_dynamics
 from limber.mechanics.grasp import Grasp, rotation_matrix
 from limber.mechanics.model import BranchModel
@@ -149,7 +150,7 @@ def _released(model: BranchModel, grasp: Grasp, wanted: MotionWanted,
     return _made(poses, centres, forces, np.zeros_like(forces), displacements)
 
 
-def _require(result: object) -> None:
+def _require(result: DynamicResult) -> None:
     if not result.converged:
         raise WorkError("The motion of the true branch cannot be followed.",
                         "It is too fast or goes too far for this branch.",

@@ -11,6 +11,8 @@ hundredth or two of a modulus, where the form matters.
 import numpy as np
 
 from limber.estimation.field_form import YoungField
+from limber.estimation.forward.dynamic import DynamicForward
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.optimise import Fit
 from limber.estimation.parameters import ParameterSpace
@@ -22,11 +24,14 @@ LONGEST_STEP = 0.5
 def averaged(fit: Fit, objective: Objective) -> Fit:
     """Return the fit moved to the mode of the moduli's marginal density; itself where the form of
     the field is no unknown."""
-    field = objective.forwards[0].full.field
+    full = objective.forwards[0].full
+    if not isinstance(full, QuasiStaticForward | DynamicForward):
+        return fit
+    field = full.field
     if not field.names or not set(field.names) <= set(objective.space.extra):
         return fit
     step = marginal_step(fit.evaluation, objective.space, field)
-    if not np.linalg.norm(fit.evaluation.jacobian @ step) < LONGEST_STEP:
+    if not np.linalg.norm(fit.evaluation.slopes @ step) < LONGEST_STEP:
         return fit
     lower, upper = objective.space.bounds()
     found = objective.evaluate(np.clip(fit.evaluation.free + step, lower, upper), jacobian=True)
@@ -41,7 +46,7 @@ def marginal_step(evaluation: Evaluation, space: ParameterSpace, field: YoungFie
         field: Its further unknowns are among the free ones.
     """
     count = space.group_count
-    information = evaluation.jacobian.T @ evaluation.jacobian
+    information = evaluation.slopes.T @ evaluation.slopes
     left_open = np.diag(np.linalg.inv(information[count:, count:]))
     told = 1 - left_open[[space.extra.index(name) for name in field.names]]
     slope = np.zeros(space.size)

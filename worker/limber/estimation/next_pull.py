@@ -22,6 +22,7 @@ from limber.estimation.preparation import forwards_of, parameter_space
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.subject import Subject
 from limber.jobs import run_tasks
+from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.strain import strain_state
 from limber.progress import SILENT, Progress
@@ -118,9 +119,9 @@ class Cell:
         if pull is None:
             return cls()
         seen, entry = pull.observations, pull.entry
-        is_alike = seen is not None and entry.motion == "quasi_static"
+        is_alike = entry.motion == "quasi_static"
         return cls(entry.sensor, calibration_of(entry),
-                   len(seen.times) if is_alike else _RECORDED_FRAMES)
+                   len(seen.times) if seen is not None and is_alike else _RECORDED_FRAMES)
 
     def in_frames(self, count: int) -> "Cell":
         """Return the cell in which ``count`` frames tell as much as all of this one's.
@@ -253,7 +254,7 @@ def expected_pull(choice: PullChoice, subject: Subject, values: Values, known: K
     if evaluation is None:
         raise WorkError("The pull's forces lead nowhere.", "Its branch finds no rest under them.",
                         "Choose another pull.")
-    told = evaluation.jacobian[:len(evaluation.jacobian) - space.own_row_count]
+    told = evaluation.slopes[:len(evaluation.slopes) - space.own_row_count]
     form_count = len(known.measured) - space.group_count
     information = _of_field(np.vstack([told, _own_rows(space, space.group_count + form_count)]),
                             space.group_count, form_count, cell.calibration.repeat_sigma)
@@ -287,7 +288,7 @@ def _of_field(jacobian: np.ndarray, count: int, form_count: int, repeat_sigma: f
     return 0.5 * (found + found.T)
 
 
-def _model(subject: Subject, values: Values):
+def _model(subject: Subject, values: Values) -> BranchModel:
     return subject.model.with_parameters(young=subject.young(values), poisson=values.poisson,
                                          density=values.density)
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from limber.estimation.forward.forward import Forward
+from limber.present import present
 from limber.recordings.alignment import Frames
 from limber.recordings.calibration import CalibrationEntry, calibration_of
 from limber.recordings.recording import PullEntry
@@ -137,6 +138,11 @@ class _Pull:
     forces: np.ndarray
 
     @property
+    def grip_axis(self) -> np.ndarray:
+        """Direction of the branch at the grasp, shape [f, 3]; of a pull whose path is watched."""
+        return present(self.tangent, "direction of the branch at the grasp")
+
+    @property
     def share(self) -> np.ndarray:
         """Part of the recording's time, shape [f]."""
         since = self.frames.times - self.frames.times[0]
@@ -226,9 +232,9 @@ def _sources(forward: Forward, known: CalibrationEntry) -> list[_Source]:
         add([f"gripper turn about {axis}" for axis in AXES], "rad", known.pose_sigma_rad, True,
             lambda pull: {"grasps": _rotations(pull.frames.poses[:, :3] - pull.pivot)})
         add(["grasp place along the branch"], "m", known.pose_sigma_m, False,
-            lambda pull: {"grasps": pull.tangent[..., None]})
+            lambda pull: {"grasps": pull.grip_axis[..., None]})
         add(["slip of the grasp along the branch"], "m", known.slip_sigma_m, False,
-            lambda pull: {"grasps": (pull.share[:, None] * pull.tangent)[..., None]})
+            lambda pull: {"grasps": (pull.share[:, None] * pull.grip_axis)[..., None]})
     return found
 
 

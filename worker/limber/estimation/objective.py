@@ -10,8 +10,10 @@ from limber.errors import Cancelled
 from limber.estimation.evaluations import EvaluationLog
 from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.input_force import Response
+from limber.estimation.forward.watched import is_watched
 from limber.estimation.nuisances import CellErrors, Eliminated, ErrorSlopes, eliminated
 from limber.estimation.parameters import ParameterSpace, Values
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
 
@@ -63,9 +65,18 @@ class Evaluation:
         return 2 * self.objective / max(freedom, 1)
 
     @property
+    def slopes(self) -> np.ndarray:
+        """The Jacobian of an evaluation with derivatives, shape [r, p].
+
+        Raises:
+            ValueError: it was made without them.
+        """
+        return present(self.jacobian, "derivative of this evaluation")
+
+    @property
     def deviations(self) -> np.ndarray:
         """Standard deviation that each free value has by these derivatives, shape [p]."""
-        _, values, rows = np.linalg.svd(self.jacobian, full_matrices=False)
+        _, values, rows = np.linalg.svd(self.slopes, full_matrices=False)
         spread = rows.T / np.maximum(values, 1e-12 * max(values[0], 1e-300))
         return np.sqrt(np.sum(spread**2, axis=1))
 
@@ -154,7 +165,7 @@ class Objective:
                 self.forward_count += 1
                 self.log.add(free, found.objective if found else FAILED_OBJECTIVE,
                              found.loss if found else np.inf)
-            best = self.log.best
+            best = present(self.log.best, "evaluation in the log")
             self._progress(min(self.forward_count / self._expected, 0.99), "fitting",
                            loss_m2=found.loss if found else np.inf, best_m2=best.loss,
                            young_mpa=" ".join(f"{young / 1e6:.3g}" for young in values.young),
@@ -196,31 +207,32 @@ class Objective:
 
     def _simulated(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
         """Simulate all pulls; forces that are unknowns beside a recorded path are settled."""
-        settling = [index for index, forward in enumerate(self.forwards) if forward.watches_pose]
+        settling = {index: forward for index, forward in enumerate(self.forwards)
+                    if is_watched(forward)}
         if not settling:
             return self._compared(free, values, jacobian)
-        left = sum(self.forwards[index].iteration_limit for index in settling)
+        left = sum(forward.iteration_limit for forward in settling.values())
         last, part, longest = np.inf, 1.0, LONGEST_MOVE * max(
-            float(np.linalg.norm(np.ptp(self.forwards[index].mesh.nodes, axis=0)))
-            for index in settling)
+            float(np.linalg.norm(np.ptp(forward.mesh.nodes, axis=0)))
+            for forward in settling.values())
         for _ in range(SETTLING_ROUNDS):
             found = self._compared(free, values, False)
             if found is None:
                 break
             # Linear in what is left of the way, the comparison has it already.
             changes = [self._force_change(index, found.pulls[index]) for index in settling]
-            moved = max(self.forwards[index].moved_by(change)
-                        for index, change in zip(settling, changes, strict=True))
+            moved = max(forward.moved_by(change)
+                        for forward, change in zip(settling.values(), changes, strict=True))
             if moved < SETTLED_FORCE_M:
                 found = self._compared(free, values, True) if jacobian else found
                 self.keep_forces()
                 return found
-            left -= sum(self.forwards[index].iteration_count for index in settling)
+            left -= sum(forward.iteration_count for forward in settling.values())
             if moved > (STILL_SETTLING if part == 1.0 else 1.0) * last or left < 0:
                 break
             last, part = moved, min(1.0, longest / moved)
-            for index, change in zip(settling, changes, strict=True):
-                self.forwards[index].shift_force(part * change)
+            for forward, change in zip(settling.values(), changes, strict=True):
+                forward.shift_force(part * change)
         # Parameters under which the force finds no rest are too far off: no step there.
         self.step_back()
         return None
@@ -228,23 +240,25 @@ class Objective:
     def keep_forces(self) -> None:
         """Remember the forces of pulls that settle; :meth:`step_back` returns to them."""
         for forward in self.forwards:
-            if forward.watches_pose:
+            if is_watched(forward):
                 forward.keep()
 
     def step_back(self) -> None:
         """Return to the forces that were kept last."""
         self._last = None
         for forward in self.forwards:
-            if forward.watches_pose:
+            if is_watched(forward):
                 forward.step_back()
 
     def _compared(self, free: np.ndarray, values: Values, jacobian: bool) -> Evaluation | None:
-        pulls = [forward.simulate(values, self.space.extra, jacobian) for forward in self.forwards]
-        return None if any(pull is None for pull in pulls) else self._compare(free, pulls)
+        found = [forward.simulate(values, self.space.extra, jacobian) for forward in self.forwards]
+        pulls = [pull for pull in found if pull is not None]
+        return None if len(pulls) < len(found) else self._compare(free, pulls)
 
     def _force_change(self, index: int, simulated: Simulated) -> np.ndarray:
         """How the unknowns of a pull's force would have to change to explain its residuals."""
-        columns, triangle = self._span(index, self.forwards[index].response)
+        columns, triangle = self._span(
+            index, present(self.forwards[index].response, "response of the pull to its force"))
         residual, _ = self._rows(index, simulated)
         return -np.linalg.lstsq(triangle, columns.T @ residual, rcond=1e-9)[0]
 
@@ -253,28 +267,25 @@ class Objective:
         with_errors = self.cell_errors.count > 0
         for index, simulated in enumerate(pulls):
             residual, jacobian = self._rows(index, simulated)
-            of_errors, by_errors = (self._by_errors(index, simulated) if with_errors
-                                    else (None, None))
+            # What another force would explain is no sign of the moduli.
             response = self.forwards[index].response
-            if response is not None:
-                # What another force would explain is no sign of the moduli.
-                span, _ = self._span(index, response)
-                residual, jacobian, by_errors = (
-                    None if each is None else each - span @ (span.T @ each)
-                    for each in (residual, jacobian, by_errors))
-                unknown_count += span.shape[1]
-            residuals.append(residual)
-            columns.append(by_errors)
-            slopes.append(of_errors)
+            span = None if response is None else self._span(index, response)[0]
+            unknown_count += 0 if span is None else span.shape[1]
+            residuals.append(_beside(residual, span))
             if jacobian is not None:
-                jacobians.append(jacobian)
+                jacobians.append(_beside(jacobian, span))
+            if with_errors:
+                of_errors, by_errors = self._by_errors(index, simulated)
+                columns.append(_beside(by_errors, span))
+                slopes.append(of_errors)
         residual = np.concatenate(residuals)
         jacobian = self.on_free(np.vstack(jacobians)) if jacobians else None
-        errors = None
+        errors: Eliminated | None = None
         if with_errors:
-            residual, jacobian, errors = eliminated(residual, jacobian, np.vstack(columns))
-            pulls = [_shown(simulated, of_errors, errors.values)
+            residual, jacobian, told = eliminated(residual, jacobian, np.vstack(columns))
+            pulls = [_shown(simulated, of_errors, told.values)
                      for simulated, of_errors in zip(pulls, slopes, strict=True)]
+            errors = told
             unknown_count += self.cell_errors.count
         rows, offsets = self.space.own_rows()
         residual = np.concatenate([residual, rows @ free - offsets])
@@ -306,7 +317,9 @@ class Objective:
             if forward.response is not None:
                 span, triangle = self._span(index, forward.response)
                 response = span @ triangle
-            found.append(RawSlopes(self.on_free(jacobian), errors, response, residual, kinds))
+            found.append(RawSlopes(
+                self.on_free(present(jacobian, "derivative of this evaluation")), errors, response,
+                residual, kinds))
         return found
 
     def residual_slopes(self, evaluation: Evaluation, changes: Sequence[ErrorSlopes],
@@ -322,18 +335,17 @@ class Objective:
         rows, columns = [], []
         for index, (piece, simulated, change) in enumerate(zip(
                 self.raw_slopes(evaluation), evaluation.pulls, changes, strict=True)):
-            row, column = self._standardised_slopes(
+            row = self._standardised_slopes(
                 index, change.points, change.forces,
-                None if simulated.torques is None else change.torques,
-                change.grasps), piece.errors
-            if piece.response is not None:
-                span, _ = self._span(index, self.forwards[index].response)
-                row, column = (each - span @ (span.T @ each) for each in (row, column))
-            rows.append(row)
-            columns.append(column)
+                None if simulated.torques is None else change.torques, change.grasps)
+            response = self.forwards[index].response
+            span = None if response is None else self._span(index, response)[0]
+            rows.append(_beside(row, span))
+            columns.append(_beside(piece.errors, span))
         found = np.vstack(rows)
         if self.cell_errors.count:
-            found = eliminated(np.zeros(len(found)), found, np.vstack(columns))[1]
+            _, left, _ = eliminated(np.zeros(len(found)), found, np.vstack(columns))
+            found = present(left, "derivative of the residuals")
         return np.vstack([found, np.zeros((self.space.own_row_count, found.shape[1]))])
 
     def _by_errors(self, index: int, simulated: Simulated) -> tuple[ErrorSlopes, np.ndarray]:
@@ -359,7 +371,8 @@ class Objective:
         if simulated.d_positions is None:
             return np.concatenate(residual), None
         return np.concatenate(residual), self._standardised_slopes(
-            index, simulated.d_positions, simulated.d_forces, simulated.d_torques,
+            index, simulated.d_positions,
+            present(simulated.d_forces, "derivative of the force"), simulated.d_torques,
             simulated.d_grasps)
 
     def _standardised_slopes(self, index: int, points: np.ndarray, forces: np.ndarray,
@@ -375,7 +388,8 @@ class Objective:
             slope = torques / self._torque_sigma(index)[:, None, None]
             rows.append(slope[torque].reshape(-1, slope.shape[-1]))
         if self.forwards[index].compares_grasp:
-            slope = grasps / self.forwards[index].pose_sigma
+            slope = present(grasps, "derivative of the grasp's place") / (
+                self.forwards[index].pose_sigma)
             rows.append(slope.reshape(-1, slope.shape[-1]))
         return np.vstack(rows)
 
@@ -427,10 +441,15 @@ def _shown(simulated: Simulated, slopes: ErrorSlopes, values: np.ndarray) -> Sim
     def moved(measured: np.ndarray | None, slope: np.ndarray) -> np.ndarray | None:
         return None if measured is None else measured + slope @ values
 
-    return replace(simulated, positions=moved(simulated.positions, slopes.points),
-                   forces=moved(simulated.forces, slopes.forces),
+    return replace(simulated, positions=simulated.positions + slopes.points @ values,
+                   forces=simulated.forces + slopes.forces @ values,
                    torques=moved(simulated.torques, slopes.torques),
                    grasps=moved(simulated.grasps, slopes.grasps))
+
+
+def _beside(rows: np.ndarray, span: np.ndarray | None) -> np.ndarray:
+    """What a force's unknowns, whose orthonormal columns are ``span``, leave of rows."""
+    return rows if span is None else rows - span @ (span.T @ rows)
 
 
 def _seen(frames: Frames) -> np.ndarray:

@@ -116,7 +116,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
             aim = moved + shift + step
             if length < shortest and np.all((lower < aim) & (aim < upper)):
                 raise _SettledError(moved)
-            return found.jacobian
+            return found.slopes
 
         try:
             return least_squares(
@@ -160,7 +160,7 @@ def _wanted_step(found: Evaluation, loss: str) -> tuple[np.ndarray, float]:
     weight = np.ones(len(found.residual))
     if loss == "soft_l1":
         weight = (1 + (found.residual / OUTLYING)**2)**-0.25
-    slopes = weight[:, None] * found.jacobian
+    slopes = weight[:, None] * found.slopes
     step = -np.linalg.lstsq(slopes, weight * found.residual, rcond=None)[0]
     return step, float(np.linalg.norm(slopes @ step))
 

@@ -10,6 +10,7 @@ from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.parameters import ParameterSpace, Values
 from limber.estimation.settings import PredictSettings
 from limber.estimation.subject import Subject
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.recordings.alignment import Frames
 from limber.recordings.recording import PullEntry
@@ -55,7 +56,8 @@ def predict_rest(known: dict[str, Any], subject: Subject, entry: PullEntry, down
         raise WorkError(f"The branch finds no rest under {np.linalg.norm(load):.3g} N.",
                         "It may be far more than it can carry.", "Check the load's unit.")
     moved = found.positions[0] - forward.rest_points
-    drop, sigma, drop_sigma = _uncertain(moved, found.d_positions[0], down, space, known)
+    slopes = present(found.d_positions, "derivative of the rest")[0]
+    drop, sigma, drop_sigma = _uncertain(moved, slopes, down, space, known)
     grasp = forward.grasp
     held = grasp.weights @ forward.displacements()[0][grasp.nodes]
     return {

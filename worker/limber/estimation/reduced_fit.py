@@ -113,11 +113,11 @@ class Reduction:
             for old in path.parent.glob(".reduced-*.npz"):
                 if not old.name.startswith(own):
                     old.unlink()
-        for path, basis in zip(self.paths, self.bases, strict=True):
-            if path is not None:
-                part = path.with_suffix(".part")
+        for place, basis in zip(self.paths, self.bases, strict=True):
+            if place is not None:
+                part = place.with_suffix(".part")
                 basis.write(part)
-                part.replace(path)
+                part.replace(place)
 
 
 def fit_reduced(objective: Objective, start: np.ndarray, optimise: Optimise, rough: Optimise,
@@ -171,7 +171,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progres
     for _ in range(ROUND_LIMIT):
         values = corrected.space.unpack(fit.evaluation.free)
         if not all(forward.correct(values, corrected.space.extra)
-                   for forward in corrected.forwards):
+                   for forward in corrected.forwards if isinstance(forward, CorrectedForward)):
             progress.warn(
                 "The full model finds no equilibrium at the reduced model's fit: it could not be "
                 "checked. Use --forward full.")
@@ -181,7 +181,7 @@ def _settled(corrected: Objective, free: np.ndarray, optimise: Optimise, progres
         again = optimise(corrected, fit.evaluation.free, is_near=True)
         moved = np.abs(again.evaluation.free - fit.evaluation.free)
         fit = again
-        spread = np.linalg.pinv(fit.evaluation.jacobian, rcond=1e-9)
+        spread = np.linalg.pinv(fit.evaluation.slopes, rcond=1e-9)
         deviation = np.linalg.norm(spread, axis=1)
         if np.all(moved <= np.maximum(SETTLED, SETTLED_DEVIATIONS * deviation)):
             return fit

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from limber.errors import InputError
+from limber.present import present
 from limber.recordings.importing import markers_from_c3d
 from limber.recordings.streams import Stream
 from limber.recordings.tables import read_table, split_title, time_stream
@@ -141,7 +142,7 @@ def _fitted(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
         if best is not None and score > best[0] - 10:
             break
         best = score, free
-    return _judged(best[1], times, channels, power)
+    return _judged(present(best, "vibration")[1], times, channels, power)
 
 
 def _basis(free: np.ndarray, times: np.ndarray) -> np.ndarray:

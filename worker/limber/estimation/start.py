@@ -6,6 +6,7 @@ import numpy as np
 
 from limber.errors import WorkError
 from limber.estimation.forward.forward import Forward
+from limber.estimation.forward.watched import WatchedForward, is_watched
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.optimise import gauss_newton
 from limber.estimation.parameters import YOUNG_BOUNDS_PA, Values
@@ -51,7 +52,7 @@ def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
     Returns:
         The values, and whether they explain the pulls at all.
     """
-    watched = [forward for forward in objective.forwards if forward.watches_pose]
+    watched = [forward for forward in objective.forwards if is_watched(forward)]
     if not watched:
         return values, True
     space = objective.space
@@ -79,7 +80,7 @@ def led_start(objective: Objective, values: Values) -> tuple[Values, bool]:
     return likely.unpack(found.free), explains
 
 
-def _followed(rough: Objective, found: Evaluation, watched: list[Forward]) -> Evaluation:
+def _followed(rough: Objective, found: Evaluation, watched: list[WatchedForward]) -> Evaluation:
     """Fit on where the force is as a first fit says that it was; there, unless that is worse."""
     rough.follow_forces(found)
     there = rough.evaluate(found.free, jacobian=True)
@@ -151,7 +152,7 @@ def _from_the_stiff_side(objective: Objective, values: Values) -> Values:
             moved.append((pull.positions - forward.rest_points)[known])
             seen.append((forward.frames.positions - forward.rest_points)[known])
         ratio = float(np.linalg.norm(np.concatenate(moved))
-                      / max(np.linalg.norm(np.concatenate(seen)), 1e-12))
+                      / max(float(np.linalg.norm(np.concatenate(seen))), 1e-12))
         # A small step to the soft side: a bent branch stiffens, so that the ratio overshoots.
         young = young * np.clip(ratio, 0.2, 1e4)
         if abs(ratio - 1) < 0.05 or ratio <= 0:
@@ -220,7 +221,7 @@ def _first_standing(objective: Objective, trials: list[Values],
     """Return the first that has an equilibrium; the force is taken as it was read."""
     for trial in trials:
         for forward in objective.forwards:
-            if forward.watches_pose:
+            if is_watched(forward):
                 forward.forget()
         found = objective.evaluate(objective.space.pack(trial), jacobian=True)
         if found is not None:

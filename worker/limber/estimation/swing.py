@@ -25,6 +25,7 @@ from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.recordings.hung_load import REGISTRATION_SHARE
 
@@ -232,9 +233,9 @@ class _Swing:
         from limber.mechanics.statics.solve import solve_static
 
         model = model.with_parameters(damping=damping)
-        held = {} if self.seen.start == "loaded" or not self.load.any() else {
-            "grasp": self.grasp, "grasp_force": self.load}
-        rest = solve_static(model, **held).require()
+        is_held = self.seen.start != "loaded" and self.load.any()
+        rest = solve_static(model, grasp=self.grasp if is_held else None,
+                            grasp_force=self.load if is_held else None).require()
         tangent = model.equations().tangent(model, rest.displacement)
         mode = np.random.default_rng(0).normal(size=rest.displacement.shape)
         for _ in range(25):
@@ -260,17 +261,19 @@ class _Swing:
             return self._known[1]
         model, step = self.with_values(free), self.period / STEPS_PER_PERIOD
         times = step * np.arange(int(np.ceil(duration / step)) + 2)
-        drive = {}
+        grasp: Grasp | None = None
+        forces: np.ndarray | None = None
         if self.load.any():
             forces = np.tile(self.load, (len(times), 1))
             if self.seen.start == "loaded":
                 forces[1:] = 0.0
-            drive = {"grasp": self.grasp, "grasp_forces": forces}
-        start = "equilibrium" if self.seen.start == "loaded" else "rest"
+            grasp = self.grasp
         wanted = ParameterSet(("log_young", "damping_mass", "damping_stiffness", "log_density"))
         result = simulate_dynamics(
-            model, times=times, start=start, settings=NewmarkSettings(max_step=step),
-            sensitivities=wanted, sensitivity_nodes=self.nodes, **drive)
+            model, grasp=grasp, grasp_forces=forces, times=times,
+            start="equilibrium" if self.seen.start == "loaded" else "rest",
+            settings=NewmarkSettings(max_step=step), sensitivities=wanted,
+            sensitivity_nodes=self.nodes)
         self.forward_count += 1
         if not result.converged:
             raise WorkError(f"The simulated swing fails: {result.message}.",
@@ -279,7 +282,8 @@ class _Swing:
         count = len(times)
         moved = (self.operator @ result.displacement.reshape(count, -1).T).T.reshape(count, -1, 3)
         slopes = np.stack([(self.near @ frame.reshape(-1, 4)).reshape(-1, 3, 4)
-                           for frame in result.sensitivities.displacement])
+                           for frame in present(
+                               result.sensitivities, "derivative of the swing").displacement])
         slopes = slopes * np.array([1.0, model.damping.mass, model.damping.stiffness, 1.0])
         self._known = key, (times, moved, slopes)
         return self._known[1]

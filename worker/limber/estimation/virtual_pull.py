@@ -8,6 +8,7 @@ that an estimate can be scored; nothing that estimates reads it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -170,7 +171,8 @@ def _model(truth: TrueBranch, settings: VirtualPullSettings,
     return model if settings.own_weight else hang(model, progress=progress).model
 
 
-def _kind(settings: VirtualPullSettings) -> str:
+def _kind(settings: VirtualPullSettings,
+          ) -> Literal["pull", "turned", "shake", "release", "weight"]:
     if settings.weight is not None:
         if settings.motion == "dynamic":
             raise InputError("A weight that is hung on in motion.",

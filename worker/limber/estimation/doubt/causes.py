@@ -7,6 +7,7 @@ the fit has to spend to find it; that too is in the part of what it was found fr
 """
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 
@@ -74,7 +75,16 @@ def variance_parts(evaluation: Evaluation, objective: Objective, scale: float = 
     return parts
 
 
-def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[dict[str, object]]:
+class Cause(TypedDict):
+    """What makes up part of the moduli's variance; see :func:`largest`."""
+
+    cause: str
+    share: float
+    deviation: float
+    advice: str
+
+
+def largest(parts: dict[str, np.ndarray], count: int = 3) -> list[Cause]:
     """The causes that make up most of the variance over all moduli, with what would shrink each.
 
     Each with ``cause``, ``share`` of the variance (mean over the moduli), ``deviation`` (largest

@@ -33,7 +33,7 @@ class Identifiability:
 
 def identifiability(evaluation: Evaluation, space: ParameterSpace) -> Identifiability:
     """Judge the data at an evaluation with derivatives."""
-    jacobian = evaluation.jacobian
+    jacobian = evaluation.slopes
     values = np.linalg.svd(jacobian, compute_uv=False)
     together = np.r_[np.ones(space.group_count), np.zeros(space.size - space.group_count)]
     # Of the scale with the ratios known: the best that the data can do for it.
@@ -73,7 +73,7 @@ def link_unresolved(evaluation: Evaluation, space: ParameterSpace,
     Args:
         evaluation: With derivatives; its last rows are those of the space's links.
     """
-    rows = evaluation.jacobian[:len(evaluation.jacobian) - len(space.links)]
+    rows = evaluation.slopes[:len(evaluation.slopes) - len(space.links)]
     links: list[tuple[int, int]] = []
     messages = []
     while len(links) < space.group_count - 1:

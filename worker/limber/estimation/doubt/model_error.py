@@ -173,11 +173,11 @@ def mesh_error(model: BranchModel, grasp: Grasp, operator: object, weights: np.n
             for partial in explicit_forces(coarse, wanted, little * moved)]) / (size * little))
     if not missing:
         return None
-    missing, slopes = np.concatenate(missing), np.vstack(slopes)
-    together = slopes.sum(axis=1)
-    alike = float(missing @ together / (together @ together))
+    lacking, slope = np.concatenate(missing), np.vstack(slopes)
+    together = slope.sum(axis=1)
+    alike = float(lacking @ together / (together @ together))
     # Around the change alike everywhere, as far as the response tells the moduli apart.
-    apart = np.linalg.lstsq(slopes, missing - alike * together, rcond=0.03)[0]
+    apart = np.linalg.lstsq(slope, lacking - alike * together, rcond=0.03)[0]
     # What all moduli have in common is told well and corrected; the rest shows how unevenly the
     # mesh errs, and is left open.
     count = len(young)

@@ -61,7 +61,7 @@ def path_error(evaluation: Evaluation, objective: Objective) -> np.ndarray | Non
             if found is None:
                 return None
             changes.append((found.residual - base.residual) / STEP)
-    steps = np.linalg.lstsq(base.jacobian, np.array(changes).T, rcond=1e-9)[0]
+    steps = np.linalg.lstsq(base.slopes, np.array(changes).T, rcond=1e-9)[0]
     groups = list(objective.space.groups)
     return np.minimum(np.linalg.norm(steps[groups], axis=1), WIDEST)
 

@@ -65,7 +65,7 @@ class _Profile:
         self._best, self._objective, self._quantile = evaluation, objective, sure.quantile
         self._progress = progress
         self._scale = sure.variance_factor * sure.repetition
-        self._slopes = self._scaled(evaluation.jacobian)
+        self._slopes = self._scaled(evaluation.slopes)
         self._covariance = inverse_information(self._slopes)
         self.deviations = np.sqrt(np.diag(self._covariance))
         # As in the fit, an outlier pulls no harder than what is just beyond the others.
@@ -131,7 +131,7 @@ class _Profile:
         found = objective.evaluate(free, jacobian=True)
         if found is None:
             return None
-        slopes = self._scaled(found.jacobian)
+        slopes = self._scaled(found.slopes)
         change = self._scaled(found.residual - best.residual)
         # The best is the mode of the moduli's own density, not of this one: what rises is counted
         # from the slope there.

@@ -11,6 +11,7 @@ from scipy import stats
 
 from limber.estimation.doubt.path_error import WIDEST
 from limber.estimation.doubt.shape_slopes import hung_slopes, shape_slopes, taken_up
+from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.objective import Evaluation, Objective
 from limber.estimation.subject import Subject
 from limber.geometry.likely_shapes import likely_skeletons, reshaped
@@ -64,7 +65,8 @@ def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np
     Returns:
         None where nothing hangs on the branch or nothing weighs, or as :func:`taken_up`.
     """
-    models = [forward.full.model for forward in objective.forwards if not forward.is_dynamic]
+    models = [forward.full.model for forward in objective.forwards
+              if isinstance(forward.full, QuasiStaticForward)]
     # Masses that somebody stated are known; twigs' and leaves' are those of their volume.
     if not sigma or not any(
             model.gravity.any() and any(isinstance(one, HungTwig) for one in model.point_masses)

@@ -56,8 +56,9 @@ def taken_up(evaluation: Evaluation, objective: Objective,
     if expected is None:
         return None
     values = objective.space.unpack(evaluation.free)
-    changes = alone.residual_slopes(expected, [slopes(forward, values) for forward in forwards])
-    steps = np.linalg.lstsq(expected.jacobian, -changes, rcond=1e-9)[0]
+    changes = alone.residual_slopes(expected, [
+        slopes(forward, values) for forward in forwards if isinstance(forward, QuasiStaticForward)])
+    steps = np.linalg.lstsq(expected.slopes, -changes, rcond=1e-9)[0]
     return steps[list(objective.space.groups)]
 
 

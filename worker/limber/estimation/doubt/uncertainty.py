@@ -1,6 +1,7 @@
 """How sure an estimate is: covariance and intervals, and which measurements do not fit."""
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 from scipy import stats
@@ -52,7 +53,7 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     # Priors and links are no measurements: neither do they tell the noise, nor does its scale act
     # on them.
     count = len(evaluation.residual) - objective.space.own_row_count
-    jacobian, residual = evaluation.jacobian[:count], evaluation.residual[:count]
+    jacobian, residual = evaluation.slopes[:count], evaluation.residual[:count]
     freedom = max(len(residual) - jacobian.shape[1] - evaluation.unknown_count, 1)
     # Huber's proposal: residuals beyond 3 deviations count as 3. Where they are many they are no
     # outliers, but a model that does not fit.
@@ -65,7 +66,7 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
         # that it is smaller.
         factor = max(factor, 1.0)
     repetition = repeated(objective.standardised(evaluation))
-    covariance = inverse_information(scaled_rows(evaluation.jacobian, objective.space.own_row_count,
+    covariance = inverse_information(scaled_rows(evaluation.slopes, objective.space.own_row_count,
                                                  factor * repetition))
     from_recording = recording_spread(evaluation, objective, factor * repetition)
     together = np.zeros(len(covariance))
@@ -177,10 +178,19 @@ def repeated(series: list[tuple[np.ndarray, np.ndarray]]) -> float:
     return float(total)
 
 
-def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> list[dict]:
+class Outlier(TypedDict):
+    """A measurement that does not fit: of which pull, when [s], of what, by how many deviations."""
+
+    pull: str
+    time_s: float
+    what: str
+    deviations: float
+
+
+def outliers(evaluation: Evaluation, objective: Objective, limit: int = 10) -> list[Outlier]:
     """Name the measurements that do not fit, worst first: pull, time, point or force, deviations.
     """
-    found = []
+    found: list[Outlier] = []
     for forward, (points, forces) in zip(objective.forwards, objective.scored(evaluation),
                                          strict=True):
         for frame, point in np.argwhere(points > OUTLIER):

@@ -8,6 +8,7 @@ from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.quasi_static import QuasiStaticForward
 from limber.estimation.forward.reduced import ReducedForward
 from limber.estimation.parameters import Values
+from limber.present import present
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,15 @@ class CorrectedForward(Forward):
         if exact is None:
             return False
         keys, spread = self._full.keys, self._full.spread
-        names = ("positions", "forces", "d_positions", "d_forces", "torques", "d_torques")
-        off = [None if getattr(exact, name) is None else np.tensordot(
-            spread, (getattr(exact, name) - getattr(rough, name))[keys], axes=1) for name in names]
-        self._correction = _Correction(values, *off)
+
+        def off(name: str) -> np.ndarray:
+            one, other = (present(getattr(each, name), name) for each in (exact, rough))
+            return np.tensordot(spread, (one - other)[keys], axes=1)
+
+        torques = None if exact.torques is None else off("torques")
+        d_torques = None if exact.d_torques is None else off("d_torques")
+        self._correction = _Correction(values, off("positions"), off("forces"), off("d_positions"),
+                                       off("d_forces"), torques, d_torques)
         return True
 
     @property
@@ -76,15 +82,16 @@ class CorrectedForward(Forward):
             found.forces + known.forces + known.d_forces @ step,
             found.d_positions + known.d_positions if sensitivities else None,
             found.d_forces + known.d_forces if sensitivities else None,
-            *self._torques(found, step, sensitivities))
+            *_torques(found, known, step))
 
-    def _torques(self, found: Simulated, step: np.ndarray, sensitivities: bool,
-                 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        known = self._correction
-        if found.torques is None:
-            return None, None
-        return (found.torques + known.torques + known.d_torques @ step,
-                found.d_torques + known.d_torques if sensitivities else None)
+
+def _torques(found: Simulated, known: _Correction, step: np.ndarray,
+             ) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The corrected torques, and their derivatives where those of ``found`` are known."""
+    if found.torques is None or known.torques is None or known.d_torques is None:
+        return None, None
+    return (found.torques + known.torques + known.d_torques @ step,
+            None if found.d_torques is None else found.d_torques + known.d_torques)
 
 
 def _coordinates(values: Values, extra: tuple[str, ...]) -> np.ndarray:

@@ -16,6 +16,7 @@ from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet
+from limber.present import present
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import grasp_on, pose_on
 from limber.recordings.recording import PullEntry
@@ -83,7 +84,7 @@ class DynamicForward(Forward):
             return Simulated(positions, forces)
         if self.response is None and not by_pose:
             self.response = self._response(model)
-        slopes = result.sensitivities
+        slopes = present(result.sensitivities, "derivative of the motion")
         count = slopes.displacement.shape[-1]
         # Damping enters the fit by its logarithm.
         scale = np.array([*np.ones(len(values.young)), *(

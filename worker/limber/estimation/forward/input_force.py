@@ -132,7 +132,7 @@ def compliance(model: BranchModel, displacement: np.ndarray, loads: np.ndarray) 
     """Change of an equilibrium by each nodal load, shape [c, node_count, 3]."""
     tangent = model.equations(()).exact_tangent(model, displacement)
     if tangent.is_positive_definite:
-        return np.array(tangent.solve_all(loads))
+        return np.array(tangent.solve_all(list(loads)))
 
     def force(direction: np.ndarray) -> np.ndarray:
         return model.tangent_times(displacement, direction)

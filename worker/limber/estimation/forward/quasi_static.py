@@ -25,6 +25,7 @@ from limber.mechanics.model import BranchModel
 from limber.mechanics.points import point_operator
 from limber.mechanics.sensitivities import ParameterSet, explicit_forces, static_sensitivities
 from limber.mechanics.statics.solve import StaticResult, StaticSettings, solve_static
+from limber.present import present
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import grasp_on, pose_on
 from limber.recordings.recording import PullEntry
@@ -168,9 +169,9 @@ class QuasiStaticForward(Forward):
         compliances: list[np.ndarray] = []
         for key, drive in enumerate(self._drives):
             memory = self._memory[key]
-            same = memory is not None and equal_values(self._values, values)
             hint = None if self._hints is None else self._hints[key]
-            result = memory.result if same else self._solved(
+            is_known = memory is not None and equal_values(self._values, values)
+            result = memory.result if memory is not None and is_known else self._solved(
                 model, self.load_at(key), memory, jump, before, hint)
             if result is None:
                 return None
@@ -179,22 +180,22 @@ class QuasiStaticForward(Forward):
             slope = None if memory is None else memory.slope
             points[key] = self.rest_points + self._observed(before)
             forces[key] = result.reaction_force if self.drive == "pose" else drive[:3]
-            if with_torque and self.drive == "force":
+            if torques is not None and self.drive == "force":
                 torques[key] = drive[3:]
-            elif with_torque:
+            elif torques is not None:
                 # About the recorded grasp point, which the patch's centre lies beside.
                 arm = drive[:3] - self.frames.poses[self.keys[key], :3]
                 torques[key] = result.reaction_torque + np.cross(arm, result.reaction_force)
             # While the factor of this state is at hand.
             if is_asked:
                 compliances.append(compliance(model, before, self._loads[key]))
-            if sensitivities:
+            if d_points is not None and d_forces is not None:
                 slope, d_forces[key] = self._slopes(model, values, extra, result)
                 for column in range(count):
                     d_points[key, ..., column] = self._observed(slope[..., column])
-                if with_torque and self.drive == "force":
+                if d_torques is not None and self.drive == "force":
                     d_torques[key] = 0.0
-                elif with_torque:
+                elif d_torques is not None:
                     d_torques[key] = self._torque_slopes(model, values, extra, result, slope,
                                                          self.frames.poses[self.keys[key], :3])
             states.append(_Memory(result, slope))
@@ -219,8 +220,8 @@ class QuasiStaticForward(Forward):
     def shift_force(self, change: np.ndarray) -> None:
         steps = change.reshape(len(self.keys), -1)
         self._drives = [drive + step for drive, step in zip(self._drives, steps, strict=True)]
-        self._hints = [memory.displacement + np.tensordot(step, moved, axes=1)
-                       for memory, step, moved in zip(self._memory, steps, self._compliances,
+        self._hints = [state.displacement + np.tensordot(step, moved, axes=1)
+                       for state, step, moved in zip(self.states(), steps, self._compliances,
                                                       strict=True)]
         self._values, self.response = None, None
 
@@ -336,6 +337,14 @@ class QuasiStaticForward(Forward):
         except WorkError:
             return None
 
+    def states(self) -> list[_Memory]:
+        """The states of all key frames under the last parameters.
+
+        Raises:
+            ValueError: one has not been simulated.
+        """
+        return [present(memory, "state of a key frame") for memory in self._memory]
+
     def displacements(self) -> list[np.ndarray]:
         """Nodal displacements [m] of the key frames under the last parameters."""
         return [memory.displacement for memory in self._memory if memory is not None]
@@ -345,12 +354,14 @@ class QuasiStaticForward(Forward):
         if len(self.keys) >= len(self.frames) or len(self.keys) < 4:
             return 0.0
         known = self.simulate(values, (), False)
+        if known is None:
+            return np.inf
         model, worst = self.model_with(values), 0.0
         for first, second in zip(self.keys[:-1], self.keys[1:], strict=True):
             middle = (first + second) // 2
             if middle in (first, second):
                 continue
-            start = self._memory[int(np.flatnonzero(self.keys == first)[0])]
+            start = self.states()[int(np.flatnonzero(self.keys == first)[0])]
             result = self._solve(model, self._load_between(middle), start.displacement)
             if result is not None:
                 exact = self.rest_points + self._observed(result.displacement)
@@ -378,20 +389,19 @@ class QuasiStaticForward(Forward):
     def _solved(self, model: BranchModel, drive: np.ndarray, memory: _Memory | None,
                 jump: np.ndarray | None, before: np.ndarray | None,
                 hint: np.ndarray | None) -> StaticResult | None:
-        starts = [] if hint is None else [hint]
+        starts: list[np.ndarray | None] = [] if hint is None else [hint]
         if memory is not None:
             start = memory.displacement
-            near = (jump is not None and np.abs(jump).max() < YOUNG_STEP_LIMIT
-                    and not self.watches_pose)
-            if memory.slope is not None and near:
+            if (memory.slope is not None and jump is not None and not self.watches_pose
+                    and np.abs(jump).max() < YOUNG_STEP_LIMIT):
                 start = start + memory.slope[..., :len(jump)] @ jump
             starts.append(start)
         starts += [before] if before is not None else []
-        for start in [*starts, None]:
+        for begin in [*starts, None]:
             if self.iteration_count > self.iteration_limit:
                 break
             try:
-                result = self._solve(model, drive, start)
+                result = self._solve(model, drive, begin)
             except NotPositiveDefiniteError:
                 continue
             if result is not None:
@@ -420,9 +430,11 @@ class QuasiStaticForward(Forward):
             columns.append(np.cross(arm, out[held]).sum(axis=0))
         return np.array(columns).T
 
-    def _at_all_frames(self, *at_keys: np.ndarray | None) -> Simulated:
-        return Simulated(*(None if values is None else np.tensordot(self.spread, values, axes=1)
-                           for values in at_keys))
+    def _at_all_frames(self, points: np.ndarray, forces: np.ndarray,
+                       *others: np.ndarray | None) -> Simulated:
+        points, forces = (np.tensordot(self.spread, each, axes=1) for each in (points, forces))
+        return Simulated(points, forces, *(
+            None if each is None else np.tensordot(self.spread, each, axes=1) for each in others))
 
 
 def uses_torque(entry: PullEntry, frames: Frames) -> bool:

@@ -12,6 +12,7 @@ from limber.estimation.parameters import Values
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedSensitivities, ReducedState
+from limber.present import present
 from limber.recordings.alignment import Frames
 from limber.recordings.grasping import pose_on
 from limber.recordings.recording import PullEntry
@@ -74,7 +75,7 @@ class ReducedForward(Forward):
             # About the recorded grasp point, which the patch's centre lies beside.
             arm = pose[:3] - self.frames.poses[self.keys[index], :3]
             forces[index] = _wrench(state, arm)
-            if not sensitivities:
+            if d_positions is None or d_forces is None:
                 continue
             slopes = model.sensitivities(state)
             d_positions[index, ..., :count] = (self._observe @ slopes.coordinates).reshape(
@@ -87,9 +88,11 @@ class ReducedForward(Forward):
                     return None
                 d_positions[index, ..., column] = (self._seen(ahead) - self._seen(behind)) / step
                 d_forces[index, :, column] = (_wrench(ahead, arm) - _wrench(behind, arm)) / step
-        positions, wrenches, d_positions, d_wrenches = (
+        positions, wrenches = (
+            np.tensordot(self.spread, value, axes=1) for value in (positions, forces))
+        d_positions, d_wrenches = (
             None if value is None else np.tensordot(self.spread, value, axes=1)
-            for value in (positions, forces, d_positions, d_forces))
+            for value in (d_positions, d_forces))
         torques = (wrenches[:, 3:], None if d_wrenches is None else d_wrenches[:, 3:])
         return Simulated(positions, wrenches[:, :3], d_positions,
                          None if d_wrenches is None else d_wrenches[:, :3],
@@ -100,7 +103,8 @@ class ReducedForward(Forward):
         simulation.
         """
         nearest = [int(np.argmin(np.abs(self.keys - frame))) for frame in frames]
-        return [self._reduced.displacement(self._states[index]) for index in nearest]
+        return [self._reduced.displacement(present(self._states[index], "state of a key frame"))
+                for index in nearest]
 
     def _seen(self, state: ReducedState) -> np.ndarray:
         return self.rest_points + (self._observe @ state.coordinates).reshape(-1, 3)

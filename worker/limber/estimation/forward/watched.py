@@ -10,13 +10,15 @@ force and path tells more counts more.
 """
 
 from dataclasses import replace
+from typing import TypeGuard
 
 import numpy as np
 
-from limber.estimation.forward.forward import Simulated
+from limber.estimation.forward.forward import Forward, Simulated
 from limber.estimation.forward.input_force import Response
 from limber.estimation.forward.quasi_static import QuasiStaticForward, equal_values
 from limber.estimation.parameters import Values
+from limber.present import present
 
 AT_REST_M = 5e-3
 """A first pose so near the grasp point is the branch at rest: what the sensor then reads is its
@@ -103,7 +105,8 @@ class WatchedForward(QuasiStaticForward):
 
     def moved_by(self, change: np.ndarray) -> float:
         """How far the gripper's place moves by a change of the force's unknowns, at most [m]."""
-        moved = (self.response.grasps @ change).reshape(-1, 3)
+        response = present(self.response, "response of the pull to its force")
+        moved = (response.grasps @ change).reshape(-1, 3)
         return float(np.linalg.norm(moved, axis=1).max())
 
     def shift_force(self, change: np.ndarray) -> None:
@@ -121,19 +124,21 @@ class WatchedForward(QuasiStaticForward):
         return simulated
 
     def _held(self, sensitivities: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        places = np.array([self.place(memory.displacement) for memory in self._memory])
+        states = self.states()
+        places = np.array([self.place(state.displacement) for state in states])
         self.grasp_tangent = self.spread @ np.array(
-            [self._tangent(memory.displacement) for memory in self._memory])
+            [self._tangent(state.displacement) for state in states])
         if not sensitivities:
             return places, None
-        return places, np.array([self.grasp.place_slopes(self.mesh.nodes, memory.displacement,
-                                                         memory.slope) for memory in self._memory])
+        return places, np.array([self.grasp.place_slopes(
+            self.mesh.nodes, state.displacement,
+            present(state.slope, "derivative of a key frame")) for state in states])
 
     def _response(self, compliances: list[np.ndarray]) -> Response:
         found = super()._response(compliances)
         at_keys = np.array([self.grasp.place_slopes(
-            self.mesh.nodes, memory.displacement, np.moveaxis(np.asarray(each), 0, -1)).T
-            for memory, each in zip(self._memory, self._compliances, strict=True)])
+            self.mesh.nodes, state.displacement, np.moveaxis(np.asarray(each), 0, -1)).T
+            for state, each in zip(self.states(), self._compliances, strict=True)])
         grasps = np.einsum("fk,kci->fikc", self.spread, at_keys)
         return replace(found, grasps=grasps.reshape(*grasps.shape[:2], -1))
 
@@ -146,3 +151,9 @@ class WatchedForward(QuasiStaticForward):
         axis = np.linalg.svd(placed - placed.mean(axis=0), full_matrices=False)[2][0]
         outward = placed.mean(axis=0) - nodes[self._model.fixed].mean(axis=0)
         return axis * np.sign(axis @ outward or 1.0)
+
+
+def is_watched(forward: Forward) -> TypeGuard[WatchedForward]:
+    """Whether the force of a pull is an unknown at present, and its gripper's path an observation.
+    """
+    return isinstance(forward, WatchedForward) and forward.watches_pose

@@ -19,8 +19,10 @@ from scipy import stats
 
 from limber.estimation.online.exact import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
+from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.points import point_operator
 from limber.mechanics.reduced.model import ReducedModel, ReducedState, ReducedStaticSettings
+from limber.present import present
 from limber.recordings.grasping import pose_on
 from limber.recordings.recording import GraspEntry
 
@@ -140,7 +142,7 @@ class OnlineEstimator:
         exact: The full model; None: the reduced model is taken at its word.
     """
 
-    def __init__(self, reduced: ReducedModel, entry: GraspEntry, mesh: object,
+    def __init__(self, reduced: ReducedModel, entry: GraspEntry, mesh: TetMesh,
                  rest_points: np.ndarray, *, position_sigma: float, force_sigma: float,
                  prior_deviation: float = 2.0, kept_count: int = 64,
                  exact: Beside | Here | None = None):
@@ -208,20 +210,21 @@ class OnlineEstimator:
             if self._kept:
                 self._ask()
             return self._state(frame.time, np.nan, False)
-        self._untrusted += not kept.state.trusted
-        self._last = kept.state
+        state = present(kept.state, "state of the frame")
+        self._untrusted += not state.trusted
+        self._last = state
         self._keep(kept)
         self._step()
         self._ask()
         # A second one takes as long as this very frame's, but for the iterations.
-        left = BUDGET_SECONDS - (time.perf_counter() - began) - (own - kept.state.seconds)
-        fitting = int(min(left / kept.state.seconds * kept.state.iterations, FRAME_ITERATIONS))
+        left = BUDGET_SECONDS - (time.perf_counter() - began) - (own - state.seconds)
+        fitting = int(min(left / state.seconds * state.iterations, FRAME_ITERATIONS))
         if self._retry and fitting >= 2 * NEAR_ITERATIONS:
             self._try_again(_within(fitting))
         elif len(self._kept) > 1 and fitting >= NEAR_ITERATIONS:
             self._relinearise(_within(fitting))
             self._step()
-        return self._state(frame.time, kept.residual, kept.state.trusted)
+        return self._state(frame.time, kept.residual, state.trusted)
 
     def settle(self) -> OnlineState | None:
         """Wait for the full model, linearise all frames again; None before any frame."""
@@ -245,7 +248,8 @@ class OnlineEstimator:
                 self._await()
         self._linearise_all()
         last = self._kept[-1]
-        return self._state(last.frame.time, last.residual, last.state.trusted)
+        return self._state(last.frame.time, last.residual,
+                           present(last.state, "state of the last frame").trusted)
 
     def _try_again(self, settings: ReducedStaticSettings) -> None:
         """Take up a frame that the basis before did not know."""
@@ -314,9 +318,10 @@ class OnlineEstimator:
             return
         (kept, future), self._asked = self._asked, None
         found = None if future.exception() is not None else future.result()
+        if found is None:
+            return
         # Compared at the moduli that the full model was solved with.
-        reduced = None if found is None else self._answer(
-            kept.frame, kept.state, found.log_young, _within(FRAME_ITERATIONS))
+        reduced = self._answer(kept.frame, kept.state, found.log_young, _within(FRAME_ITERATIONS))
         if reduced is None:
             return
         rows, slopes = _stacked(found)
@@ -346,7 +351,7 @@ class OnlineEstimator:
         if far[index] < COVERED * np.linalg.norm(np.ptp(poses, axis=0)):
             return False
         chosen = self._kept[index]
-        start = self.reduced.displacement(chosen.state)
+        start = self.reduced.displacement(present(chosen.state, "state of the frame"))
         self._asked = chosen, self._exact.frame(chosen.frame.pose, self.log_young.copy(), start)
         return True
 

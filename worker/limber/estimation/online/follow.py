@@ -235,8 +235,9 @@ def paced(where: Callable[[], Path], pace: float) -> Iterator[tuple[OnlineFrame,
 
 def online_frames(pull: Pull) -> Iterator[OnlineFrame]:
     """Return the aligned frames of what has been recorded so far."""
-    frames = frames_of(replace(pull, observations=Observations(
-        pull.observations.times, pull.observations.positions)))
+    seen = pull.observations
+    frames = frames_of(pull if seen is None else replace(
+        pull, observations=Observations(seen.times, seen.positions)))
     for index in range(len(frames)):
         yield OnlineFrame(float(frames.times[index]), frames.poses[index],
                           frames.wrenches[index, :3], frames.positions[index])
