@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from limber.planning.settings import EnergySettings
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.stages.inputs import BranchInputs, ParallelOptions
 from limber.stages.registry import StageDescription
@@ -64,7 +65,8 @@ def sample_energy_field(folder: Path, settings: EnergySettings, *, workers: int 
             sample_count=len(samples.poses), rejected_count=rejected, rejected_reasons=reasons,
             taut_count=sampled.taut_count,
             energy_error=field.errors["energy_error"], force_error=field.errors["force_error"],
-            forward=settings.forward, reduced_count=int(samples.reduced.sum()),
+            forward=settings.forward,
+            reduced_count=int(present(samples.reduced, "mark of reduced samples").sum()),
             errors=field.errors, kernel=field.energy_fit.kernel, shape=field.energy_fit.shape,
             chart_stretch=field.chart.stretch,
             chart_depth_m=field.chart.depth if np.isfinite(field.chart.depth) else None,

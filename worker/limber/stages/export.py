@@ -76,6 +76,8 @@ def export(folder: Path, output: Path, settings: ExportSettings, *, progress: Pr
             mesh or skeleton. MissingDependencyError: USD is not installed.
     """
     branch, suffix = Branch.read(folder), output.suffix.lower()
+    branch, suffix = Branch.open(folder), output.suffix.lower()
+    text: str | bytes | None
     if suffix in _RODS:
         text, told = _rods(branch, suffix, settings, progress)
     elif suffix in _ELEMENTS:

@@ -6,8 +6,9 @@ computation comes through here.
 
 import hashlib
 import math
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -22,7 +23,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.mechanics.added import HungTwig, PointMass
 from limber.mechanics.loaded import LoadedBranch, NamedTarget, hang, target_masses
-from limber.mechanics.materials import RayleighDamping
+from limber.mechanics.materials import Material, RayleighDamping
 from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.planning.field.grasp_model import GraspModel, grasp_model_of
 from limber.progress import SILENT, Progress
@@ -114,9 +115,9 @@ def load_point_masses(branch: Branch) -> tuple[PointMass, ...]:
 def _hung(mass: dict[str, Any]) -> PointMass:
     if mass.get("kind") == "table":
         return PointMass(tuple(mass["attached_m"]), mass["mass_kg"])
+    x, y, z = map(tuple, mass.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))
     return HungTwig(tuple(mass.get("centre_m", mass["attached_m"])), mass["mass_kg"],
-                    tuple(mass["attached_m"]),
-                    tuple(map(tuple, mass.get("inertia_kg_m2", np.zeros((3, 3)).tolist()))))
+                    tuple(mass["attached_m"]), (x, y, z))
 
 
 def load_targets(branch: Branch) -> tuple[NamedTarget, ...]:
@@ -141,22 +142,40 @@ def load_grasp_point(branch: Branch) -> tuple[float, float, float] | None:
     fraction = made.settings.get("grasp_fraction") if made else None
     if fraction is None or not branch.has("skeleton.swc"):
         return None
-    return tuple(map(float, load_skeleton(branch).point_at(float(fraction))))
+    x, y, z = map(float, load_skeleton(branch).point_at(float(fraction)))
+    return x, y, z
+
+
+class ModelOptions(TypedDict, total=False):
+    """Options of a branch's model, as of BranchModel."""
+
+    material: str | Material
+    damping: RayleighDamping
+    lumped_mass: bool
+
+
+class Overrides(ModelOptions, total=False):
+    """What of a branch's model may be asked for instead of what its folder says."""
+
+    young: float | np.ndarray | None
+    poisson: float | np.ndarray | None
+    density: float | np.ndarray | None
+    point_masses: Iterable[PointMass] | None
 
 
 def load_branch(branch: Branch, *, gravity: bool = True, progress: Progress = SILENT,
-                **overrides: object) -> LoadedBranch:
+                **overrides: Unpack[Overrides]) -> LoadedBranch:
     """Return the branch as everything computes on it: as it hangs, with targets and grasp.
 
     Args:
         gravity: Whether it has any weight.
         progress: Is told where it cannot carry itself and its weight is left out.
-        overrides: As for BranchModel.
+        overrides: As for :func:`load_model`.
 
     Raises:
         BranchFolderError: there is no mesh. InputError: it lacks material data.
     """
-    model = load_model(branch, gravity=branch.gravity if gravity else None, **overrides)
+    model = load_model(branch, gravity=gravity, **overrides)
     loaded = hang(model, load_targets(branch), progress=progress)
     return replace(loaded, grasp_point=load_grasp_point(branch))
 
@@ -166,9 +185,10 @@ def known_damping(branch: Branch, progress: Progress = SILENT) -> RayleighDampin
     swings = [branch.manifest.stages[key] for key in ("swing", "vibration")
               if key in branch.manifest.stages]
     known = max(swings, key=lambda entry: entry.finished).result if swings else {}
-    values = [known.get(name) for name in ("damping_mass_per_s", "damping_stiffness_s")]
-    if all(isinstance(value, int | float) and value >= 0 for value in values):
-        return RayleighDamping(*map(float, values))
+    mass, stiffness = known.get("damping_mass_per_s"), known.get("damping_stiffness_s")
+    if (isinstance(mass, int | float) and isinstance(stiffness, int | float)
+            and mass >= 0 and stiffness >= 0):
+        return RayleighDamping(float(mass), float(stiffness))
     progress.warn("No swing has told the damping; that of simulations is taken.")
     return DEFAULT_DAMPING
 
@@ -198,25 +218,39 @@ def young_deviation(branch: Branch) -> float | None:
     return float(np.mean(total)) if total else None
 
 
-def load_model(branch: Branch, **overrides: object) -> BranchModel:
-    """Return the model of a branch folder's ``mesh.vtu``; ``overrides`` as for BranchModel.
+def load_model(branch: Branch, *, gravity: bool = True, young: float | np.ndarray | None = None,
+               poisson: float | np.ndarray | None = None,
+               density: float | np.ndarray | None = None,
+               point_masses: Iterable[PointMass] | None = None,
+               **options: Unpack[ModelOptions]) -> BranchModel:
+    """Return the model of a branch folder's ``mesh.vtu``.
 
     The mesh is taken as the shape without load: see :func:`load_branch`. Gravity is that of the
     scan, which the upright turn has turned with the branch; what its mesh leaves out hangs on it.
+
+    Args:
+        gravity: Whether the branch has any weight.
+        young, poisson, density, point_masses: Instead of those of the folder.
+        options: As for BranchModel.
 
     Raises:
         BranchFolderError: there is no mesh. InputError: it lacks material data.
     """
     mesh = load_mesh(branch)
-    values = {}
-    for name in ("young", "poisson", "density"):
-        value = overrides.pop(name, None)
-        if value is None and name not in mesh.cell_data:
+
+    def known(name: str, value: float | np.ndarray | None) -> float | np.ndarray:
+        if value is not None:
+            return value
+        if name not in mesh.cell_data:
             raise InputError(f"{branch.folder}/mesh.vtu has no cell data {name!r}.",
                              "The material is not known.", "Reconstruct again.")
-        values[name] = mesh.cell_data[name] if value is None else value
-    known = {"gravity": branch.gravity, "point_masses": load_point_masses(branch)}
-    return BranchModel(mesh, **values, **{**known, **overrides})
+        return mesh.cell_data[name]
+
+    return BranchModel(
+        mesh, young=known("young", young), poisson=known("poisson", poisson),
+        density=known("density", density), gravity=branch.gravity if gravity else None,
+        point_masses=load_point_masses(branch) if point_masses is None else point_masses,
+        **options)
 
 
 def load_grasp_model(branch: Branch, *, gravity: bool, progress: Progress = SILENT) -> GraspModel:

@@ -55,7 +55,8 @@ def mesh_surface(path: Path, folder: Path, settings: MeshSurfaceSettings | None 
     from limber.geometry.skeleton.files import write_cylinders
 
     settings = settings or MeshSurfaceSettings()
-    path, warnings, drawn = require_file(path, "A surface"), [], None
+    path, drawn = require_file(path, "A surface"), None
+    warnings: list[str] = []
     has_cylinders = is_model(path)
     if has_cylinders:
         progress = progress.keeping(warnings)

@@ -21,6 +21,7 @@ from limber.errors import BranchFolderError, Cancelled, InputError, NoPathError
 from limber.files import file_digest
 from limber.plain import plain
 from limber.planning.settings import PlanSettings
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.settings import Groups
 from limber.stages.inputs import BranchInputs, ParallelOptions
@@ -104,27 +105,28 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     digests = digests | {"stiffer": f"{stiffer:.6f}"}
     asked = Limits.of(settings, stiffer)
     doubt = None if settings.confidence is None else young_doubt(branch, grasp_model, asked)
-    in_cell = None if cell_file is None else _InCell.of(branch, cell_file, settings, asked,
-                                                              progress)
-    if in_cell is not None:
+    in_cell = None
+    if cell_file is not None:
+        in_cell = _InCell.of(branch, cell_file, settings, asked, progress)
         digests = digests | {"cell": file_digest(cell_file)}
     key = f"plan:{name}"
-    inputs = {"reads": ["energy.npz"], "digests": digests}
+    reads = ["energy.npz"]
     earlier = branch.manifest.stages.get(key)
     finished = earlier is not None and not earlier.result.get("stopped")
-    if not force and finished and branch.is_current(key, settings, **inputs):
+    if not force and earlier is not None and finished and branch.is_current(
+            key, settings, reads=reads, digests=digests):
         return earlier.result
     if in_cell is not None:
         in_cell.check_goal(settings)
-    with branch.stage(key, settings, **inputs) as stage:
+    with branch.stage(key, settings, reads=reads, digests=digests) as stage:
         field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:
             pace = in_cell.slowed(pace)
         found = plan_motion(field, grasp_model, settings, limits=limits,
-                            region=in_cell and in_cell.region, doubt=doubt, pace=pace,
-                            workers=workers, progress=progress)
+                            region=None if in_cell is None else in_cell.region, doubt=doubt,
+                            pace=pace, workers=workers, progress=progress)
         if found.summary["stopped"]:
             progress = progress.to_the_end()
         if found.summary["stopped"] and finished:
@@ -254,7 +256,10 @@ def _table(way: Way) -> str:
 
 def _motion_table(motion: Way) -> str:
     targets = [f"{name}_{axis}_m" for name in motion.targets for axis in "xyz"]
-    rows = np.column_stack([motion.times, motion.poses, motion.forces, motion.torques,
+    times = present(motion.times, "time of the motion")
+    forces = present(motion.forces, "force of the motion")
+    torques = present(motion.torques, "torque of the motion")
+    rows = np.column_stack([times, motion.poses, forces, torques,
                             motion.energies, motion.strains, *motion.targets.values()])
     return _csv((*_MOTION_COLUMNS, *targets), rows, motion.phases)
 
@@ -263,7 +268,8 @@ def _setpoints(motion: Way, pace: Pace, rate: float) -> str:
     """Return the grasp's poses every 1 / ``rate`` [s], and last at the motion's end."""
     from limber.planning.timing import poses_at, time_law
 
-    end = motion.phases.count("approach") + motion.phases.count("path") - 1
+    phases = present(motion.phases, "phase of the motion")
+    end = phases.count("approach") + phases.count("path") - 1
     law = time_law(motion.poses[:, :3], pace, (end,))
     instants = np.arange(int(np.ceil(law.duration * rate)) + 1) / rate
     return _csv(_MOTION_COLUMNS[:7], np.column_stack(

@@ -14,6 +14,7 @@ from limber.planning.obstacles import Box, Obstacle, Solid, closest
 from limber.planning.plan_file import Way
 from limber.planning.regions import Ball, Region, View
 from limber.planning.settings import PlanSettings
+from limber.present import present
 from limber.progress import Progress
 from limber.robot.arm_shape import rods_of
 from limber.robot.arms import arm_named
@@ -76,7 +77,8 @@ def region_of(cell: Cell, settings: PlanSettings) -> Region | None:
         return None
     arm = arm_named(cell.second_arm.model)
     shoulder = (matrices(np.array(cell.second_arm.base_pose)) @ [0.0, 0.0, arm.d[0], 1.0])[:3]
-    return Ball(tuple(map(float, shoulder)), arm.reach)
+    x, y, z = map(float, shoulder)
+    return Ball((x, y, z), arm.reach)
 
 
 def require_taken(cell: Cell, place: np.ndarray) -> None:
@@ -128,7 +130,8 @@ def reached_by(cell: Cell, motion: Way, axis: np.ndarray, obstacles: tuple[Obsta
             meets an obstacle; says where.
     """
     there = np.array(motion.phases) != "return"
-    predicted = Predicted.of_forces(motion.poses[there], motion.forces[there])
+    forces = present(motion.forces, "force of the motion")
+    predicted = Predicted.of_forces(motion.poses[there], forces[there])
     found = robot_motion(cell, predicted, axis, speed=speed, blocked=blocked_by(cell, obstacles))
     return {"model": cell.arm.name, "base_pose": cell.base.pose, "branch": cell.branch,
             "gripper_rotation": found.rotation,

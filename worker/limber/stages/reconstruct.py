@@ -22,6 +22,8 @@ from limber.stages.registry import StageDescription
 from limber.store import Branch, Stage
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from limber.geometry.cloud.cloud import Cloud
     from limber.geometry.reconstruct import MeshedBranch
     from limber.geometry.skeleton.edits import Edit
@@ -251,7 +253,7 @@ def load_edits(branch: Branch) -> list[Edit]:
     return read_edits(branch.path(EDITS)) if branch.has(EDITS) else []
 
 
-def edits_digest(edits: list[Edit]) -> dict[str, str]:
+def edits_digest(edits: Sequence[Edit]) -> dict[str, str]:
     """Return what a manifest remembers of edits: nothing of none."""
     from limber.geometry.skeleton.edits import edits_text
 

@@ -49,7 +49,8 @@ class StageDescription:
     key: str = ""
     reads: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
-    tables: "Callable[[dict[str, Any]], list[tuple[str, Sequence[Sequence[str]]]]] | None" = None
+    tables: ("Callable[[dict[str, Any]], Sequence[tuple[str, Sequence[Sequence[str]]]]]"
+             " | None") = None
 
 
 @cache

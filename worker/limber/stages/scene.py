@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from limber.errors import InputError, WorkError
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.settings import Groups, Settings
 from limber.stages.inputs import BranchInputs, NoOptions
@@ -94,9 +95,10 @@ def scene(branch_folder: Path, *, output: Path | None = None, picture: Path | No
         raise InputError(f"The branch has no {color} to show.",
                          f"It has: {', '.join(data.info['scalars'])}.",
                          "Run `limber plan` or `limber simulate` first.")
-    if data_path is not None:
-        data.write(_writable(data_path))
-        return {"data": data_path, "vertex_count": len(data.arrays["vertices"])}
+    if output is None:
+        target = present(data_path, "file for the data")
+        data.write(_writable(target))
+        return {"data": target, "vertex_count": len(data.arrays["vertices"])}
     if turntable is not None and turntable.suffix.lower() not in _MOVING:
         raise InputError(f"{turntable.name} is no moving picture.", "",
                          f"Name it {' or '.join(_MOVING)}.")

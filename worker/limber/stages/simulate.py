@@ -103,14 +103,15 @@ def simulate(branch_folder: str | Path, settings: SimulateSettings, *,
 
 def _model(branch: Branch, settings: SimulateSettings, progress: Progress) -> BranchModel:
     from limber.mechanics.materials import RayleighDamping
-    from limber.stages.loading import load_branch, load_model
+    from limber.stages.loading import Overrides, load_branch, load_model
 
-    values = {"young": settings.young, "material": settings.material,
-              "lumped_mass": settings.lumped_mass,
-              "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
+    values: Overrides = {
+        "young": settings.young, "material": settings.material,
+        "lumped_mass": settings.lumped_mass,
+        "damping": RayleighDamping(settings.damping_mass, settings.damping_stiffness)}
     if settings.rest_shape:
         return load_branch(branch, gravity=settings.gravity, progress=progress, **values).model
-    return load_model(branch, gravity=branch.gravity if settings.gravity else None, **values)
+    return load_model(branch, gravity=settings.gravity, **values)
 
 
 def _write(stage: Stage, model: BranchModel, settings: SimulateSettings,
@@ -159,8 +160,8 @@ def run(inputs: SimulateInputs, settings: SimulateSettings, options: RunOptions,
         progress: Progress) -> dict[str, Any]:
     """Run the stage."""
     if inputs.pull is not None:
-        settings, along = _replay(Branch.open(inputs.branch_folder), inputs, settings)
-        return simulate(inputs.branch_folder, settings, along=along,
+        settings, replayed = _replay(Branch.open(inputs.branch_folder), inputs, settings)
+        return simulate(inputs.branch_folder, settings, along=replayed,
                         key=f"replay:{inputs.pull}", force=options.force, progress=progress)
     along = _poses(inputs.along, settings.duration, progress) if inputs.along else None
     return simulate(inputs.branch_folder, settings, along=along, force=options.force,

@@ -11,6 +11,7 @@ import numpy as np
 from limber.errors import InputError, WorkError
 from limber.estimation.settings import EstimateSettings, SwingSettings
 from limber.plain import plain
+from limber.present import present
 from limber.progress import SILENT, Progress
 from limber.stages.inputs import BranchInputs, RunOptions
 from limber.stages.registry import StageDescription
@@ -45,13 +46,15 @@ def swing(branch_folder: Path, settings: SwingSettings, *, force: bool = False,
                    "pulls": pulls_digest(branch, [pull.name])}
         if not force and branch.is_current("swing", settings, digests=digests):
             return branch.manifest.stages["swing"].result
-        about, rest = pull.entry.swing, np.array(pull.entry.rest_points_m)
+        about = present(pull.entry.swing, "record of how the branch was let go")
+        seen = present(pull.observations, "observation of the swing")
+        rest = np.array(pull.entry.rest_points_m)
         warnings: list[str] = []
         model = under_its_weight(subject.model, pull.entry).with_young(
             subject.mesh.cell_data["young"])
         found = fit_swing(
             model, grasp_on(subject.mesh, pull.entry.grasp),
-            SwingSeen(pull.observations.times, pull.observations.positions - rest, rest,
+            SwingSeen(seen.times, seen.positions - rest, rest,
                       about.start, pull.wrenches[0, :3], about.load_mass_kg, about.noise_m,
                       about.registration_m),
             periods=settings.periods, density_sigma=settings.density_sigma,

@@ -80,7 +80,8 @@ def set_target(branch_folder: Path, name: str, settings: TargetSettings, *, forc
                 f"{branch.folder} has no target {name}.",
                 f"It has {', '.join(target.name for target in others) or 'none'}.",
                 "Nothing was removed.")
-        found = {} if settings.at is None else _placed(load_mesh(branch), name, settings)
+        found = {} if settings.at is None else _placed(
+            load_mesh(branch), name, settings.at, settings)
         targets = others if settings.at is None else [*others, found.pop("target")]
         stage.path(FILE).write_text(_text(targets), encoding="utf-8")
         stage.result.update(
@@ -104,12 +105,13 @@ def _check_wishes(name: str, settings: TargetSettings) -> None:
                          "Give --at X Y Z in metres.")
 
 
-def _placed(mesh: Any, name: str, settings: TargetSettings) -> dict[str, Any]:
+def _placed(mesh: Any, name: str, at: tuple[float, float, float], settings: TargetSettings,
+            ) -> dict[str, Any]:
     """Return the target and how it hangs on the branch."""
     from limber.mechanics.loaded import NamedTarget
     from limber.mechanics.points import nearest_inside
 
-    place = np.array(settings.at)
+    place = np.array(at)
     foot = nearest_inside(mesh, place[None])[0]
     distance = float(np.linalg.norm(place - foot))
     if not distance <= settings.farthest:
@@ -119,7 +121,7 @@ def _placed(mesh: Any, name: str, settings: TargetSettings) -> dict[str, Any]:
             f"The branch reaches from ({_numbers(low)}) to ({_numbers(high)}) m; its nearest place "
             f"is ({_numbers(foot)}) m, and {settings.farthest:g} m are allowed.",
             "Check the frame and the unit (metres, branch frame), or widen --farthest.")
-    return {"target": NamedTarget(name, settings.at, settings.mass), "position_m": place,
+    return {"target": NamedTarget(name, at, settings.mass), "position_m": place,
             "mass_kg": settings.mass, "branch_point_m": foot, "distance_m": distance}
 
 

@@ -147,12 +147,12 @@ def _with_sensor(model: BranchModel, settings: VibrationSettings) -> BranchModel
 
     if settings.sensor is None:
         return model
-    *place, mass = settings.sensor
-    away = float(np.linalg.norm(model.mesh.nodes - np.array(place), axis=1).min())
+    x, y, z, mass = settings.sensor
+    away = float(np.linalg.norm(model.mesh.nodes - np.array([x, y, z]), axis=1).min())
     if not (mass > 0 and away < 0.1):
         raise InputError(f"A sensor of {mass:g} kg, {1e3 * away:.0f} mm off the branch.",
                          "It has a mass and sits on the branch.", "Check --sensor X Y Z KG.")
-    return model.with_point_masses([*model.point_masses, PointMass(tuple(place), mass)])
+    return model.with_point_masses([*model.point_masses, PointMass((x, y, z), mass)])
 
 
 def _summary(seen: Ringing, told: dict[str, Any], level: float) -> dict[str, Any]:
