@@ -87,7 +87,10 @@ def _remove(path: Path) -> None:
 
 
 def _is_abandoned(path: Path) -> bool:
-    host, process_id, start = _OWNED.match(path.name).groups()
+    owned = _OWNED.match(path.name)
+    if owned is None:
+        return False
+    host, process_id, start = owned.groups()
     if host == _host():
         return not is_alive(int(process_id), int(start))
     try:

@@ -16,7 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn, TypeVar
+from typing import IO, Any, NoReturn, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -173,10 +173,10 @@ def require_shapes(path: str | os.PathLike, arrays: Mapping[str, np.ndarray],
     lengths: dict[int | str, int] = {}
     for name, shape in shapes.items():
         array = arrays.get(name)
-        is_table = array is not None and array.dtype.kind in "iufb" and array.ndim == len(shape)
-        fits = is_table and all(
-            found == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, found))
-            for wanted, found in zip(shape, array.shape, strict=True))
+        fits = array is not None and array.dtype.kind in "iufb" and (
+            array.ndim == len(shape)) and all(
+            length == (wanted if isinstance(wanted, int) else lengths.setdefault(wanted, length))
+            for wanted, length in zip(shape, array.shape, strict=True))
         if not fits:
             found = "is missing" if array is None else (
                 f"has shape {list(array.shape)} of {array.dtype}")
@@ -203,7 +203,7 @@ def require_size(path: str | os.PathLike, announced: float, held: float, what: s
                          "It is cut short, or its header is damaged.", "Export it again.")
 
 
-def _array(stream: BinaryIO, size: int) -> np.ndarray:
+def _array(stream: IO[bytes], size: int) -> np.ndarray:
     """Read one array whose header has been compared with the bytes that there are."""
     version = np.lib.format.read_magic(stream)
     reader = {(1, 0): np.lib.format.read_array_header_1_0,

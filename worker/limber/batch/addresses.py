@@ -54,7 +54,7 @@ def checked_address(address: str) -> str:
     if "::" in address:
         raise InputError(f"{address!r} is a chain of addresses.",
                          "Each file is fetched from one place.", "Name that place alone.")
-    _, rest = _ADDRESS.match(address).groups()
+    _, _, rest = address.partition("://")
     if ".." in PurePosixPath(rest).parts:
         raise InputError(f"{address!r} leads upwards.", "", "Write where it leads to.")
     return address.rstrip("/")

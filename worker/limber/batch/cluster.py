@@ -20,6 +20,7 @@ from limber.errors import Cancelled, InputError, WorkError
 from limber.jobs import worker_count
 from limber.jobs.budget import CORES, core_budget
 from limber.optional import require_extra
+from limber.present import present
 from limber.progress import Progress
 from limber.version import VERSION
 
@@ -29,7 +30,8 @@ _QUEUES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "lsf": "LSFCluster", "s
 _LOOPBACK = "127.0.0.1"
 _NO_DAEMON = {"distributed.worker.daemon": False}
 """A worker's processes are its own: those of Dask are not allowed any otherwise."""
-_UNSERVED = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+_UNSERVED: dict[str, list[str]] = {
+    "distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
 """Dask's pages are not asked for."""
 _UNWATCHED = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s",
               "distributed.admin.system-monitor.interval": "2s"}
@@ -69,7 +71,7 @@ class Cluster:
         self._is_cancelled = False
         with ExitStack() as stack:
             self._client = stack.enter_context(self._connected(stack, jobs, kind, address))
-            self._wait(kind or address, progress)
+            self._wait(kind or present(address, "kind of cluster"), progress)
             self._closing = stack.pop_all()
 
     @property
@@ -140,7 +142,8 @@ class Cluster:
         # As long as the cluster is there: it may start a lost worker anew.
         stack.enter_context(dask.config.set(_NO_DAEMON | _UNSERVED | _UNWATCHED))
         cluster = stack.enter_context(
-            self._local(jobs) if kind == "local" else self._queue(kind, jobs))
+            self._local(jobs) if kind == "local"
+            else self._queue(present(kind, "kind of cluster"), jobs))
         return Client(cluster, security=cluster.security, set_as_default=False)
 
     def _local(self, jobs: JobFile) -> Any:

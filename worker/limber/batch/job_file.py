@@ -295,7 +295,7 @@ class _Reader:
     def folders(self, pattern: str, place: Place) -> list[Path] | None:
         if is_address(pattern):
             return self.addresses.folders(pattern, self.out, place)
-        return [path for path in self.matches(pattern, place) if (path / MANIFEST).is_file()]
+        return [path for path in self.matches(pattern, place) or () if (path / MANIFEST).is_file()]
 
     def fetched(self, tasks: list[StageTask], folder: Path) -> tuple[tuple[str, Path], ...]:
         """Return the addresses of what tasks read beside the branch, and where each goes."""

@@ -4,6 +4,7 @@ import click
 
 from limber.batch.job_file import StageTask
 from limber.options import command_line, settings_options
+from limber.settings import Settings
 from limber.stages.registry import stage_description
 
 
@@ -25,7 +26,7 @@ def task_of_line(line: list[str]) -> StageTask:
     @settings_options(stage.inputs, "inputs")
     @settings_options(stage.settings, "settings")
     @settings_options(stage.options, "options")
-    def command(**models: object) -> StageTask:
+    def command(**models: Settings) -> StageTask:
         return StageTask(stage.name, **models)
 
     return command.main(line[1:], prog_name=f"limber {stage.name}", standalone_mode=False)

@@ -10,6 +10,7 @@ from typing import Any
 
 from limber.batch.job_file import BranchJob, JobFile, StageTask
 from limber.owner import is_alive
+from limber.present import present
 from limber.store.streams import Stream, stream_lines
 
 _LEAST_LINES, _MOST_TIMES = 2000, 4
@@ -70,7 +71,7 @@ class Records:
     def _append(self, branch: BranchJob, task: StageTask, told: dict[str, Any]) -> None:
         line = json.dumps({"branch": branch.name, "stage": task.label,
                            "task": task.fingerprint, **told})
-        self._stream.append(line)
+        present(self._stream, "right to append to the records").append(line)
         self._take(line)
 
     def _take(self, line: str) -> None:

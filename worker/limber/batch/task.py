@@ -103,7 +103,7 @@ def _finished(task: StageTask, folder: Path) -> str | None:
 class _Memory:
     """Watches the memory of this process and of what it starts."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.most_mb = 0.0
         self._closing = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="memory watch", daemon=True)

@@ -135,7 +135,7 @@ class ClosedLoop:
         file.write_text(json.dumps({**setting.__dict__, "mesh": str(setting.mesh)}),
                         encoding="utf-8")
         with VirtualRobot(self.model, self.address,
-                          ["--branch", file, "--seed", self.seed]) as robot:
+                          ["--branch", str(file), "--seed", str(self.seed)]) as robot:
             try:
                 moved = self._reconstructed(truth, cell)
                 told = self._told(robot)

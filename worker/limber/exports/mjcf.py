@@ -36,7 +36,7 @@ def mjcf_text(tree: RodTree, damping: RayleighDamping, name: str,
     ElementTree.SubElement(default, "geom", contype="0", conaffinity="1", mass="0",
                            rgba="0.45 0.33 0.22 1")
     world = ElementTree.SubElement(root, "worldbody")
-    bodies = {}
+    bodies: dict[int, ElementTree.Element] = {}
     slack = tree.carried
     for link in range(tree.count):
         parent = int(tree.parent[link])

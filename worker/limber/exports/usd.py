@@ -7,12 +7,16 @@ to USD itself, and are written as applied schemas and attributes of those names.
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
 from limber.mechanics.rods import tip_compliance
+
+if TYPE_CHECKING:
+    from pxr import Usd, Vt
 
 _PARTS = np.array([[0, 4, 6, 7], [4, 1, 5, 8], [6, 5, 2, 9], [7, 8, 9, 3],
                    [4, 9, 5, 6], [4, 9, 6, 7], [4, 9, 7, 8], [4, 9, 8, 5]])
@@ -113,7 +117,7 @@ def write_usd(branch: Deformable, damping: RayleighDamping, name: str, path: Pat
     stage.GetRootLayer().Export(str(path))
 
 
-def _hold(stage: object, fixed: np.ndarray, points: object) -> None:
+def _hold(stage: "Usd.Stage", fixed: np.ndarray, points: "Vt.Vec3fArray") -> None:
     """Tie the vertices of the base to a frame that stays where it is."""
     from pxr import Sdf, UsdGeom, Vt
 
@@ -127,10 +131,10 @@ def _hold(stage: object, fixed: np.ndarray, points: object) -> None:
          Vt.Vec3fArray([points[int(node)] for node in fixed]))
 
 
-def _apply(prim: object, *schemas: str) -> None:
+def _apply(prim: "Usd.Prim", *schemas: str) -> None:
     for schema in schemas:
         prim.AddAppliedSchema(schema)
 
 
-def _set(prim: object, kind: object, name: str, value: object) -> None:
+def _set(prim: "Usd.Prim", kind: object, name: str, value: object) -> None:
     prim.CreateAttribute(name, kind, custom=name.startswith("limber:")).Set(value)

@@ -118,12 +118,13 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
     corners = corners.reshape(-1, 3)
     positions, _, _ = read_pc2(frames)
     values = read_arrays(frames.with_suffix(".npz"), "fields of a motion")
-    arrays = {"positions": positions, "principal_strain": values.get("principal_strain", nodes)}
+    arrays = {**values, "positions": positions}
     require_shapes(frames, arrays, {"positions": (2, len(nodes), 3),
                                     "principal_strain": (2, len(nodes))}, "a load's frames")
     strain = 100 * arrays["principal_strain"][1][corners].mean(axis=1)
     shades = plt.get_cmap("inferno")
-    norm = plt.Normalize(0.0, max(float(strain.max()), 1e-9))
+    largest = max(float(strain.max()), 1e-9)
+    norm = plt.Normalize(0.0, largest)
     both = positions.reshape(-1, 3)
     extent = np.ptp(both, axis=0)
     widths = np.clip(7.0 * extent[:2] / max(extent[2], 1e-9), 2.0, 6.0)
@@ -141,7 +142,7 @@ def bent_branch(mesh: TetMesh, frames: Path) -> "Figure":
         axis.set(xlabel=f"{label} [m]", ylabel="z [m]", aspect="equal")
         axis.autoscale_view()
         axis.grid(alpha=0.25)
-    scale = plt.cm.ScalarMappable(plt.Normalize(0.0, norm.vmax / 0.9), shades)
+    scale = plt.cm.ScalarMappable(plt.Normalize(0.0, largest / 0.9), shades)
     bar = figure.colorbar(scale, ax=axes, label="largest principal strain [%]", shrink=0.7)
-    bar.ax.set_ylim(0.0, norm.vmax)
+    bar.ax.set_ylim(0.0, largest)
     return figure

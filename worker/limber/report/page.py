@@ -226,7 +226,7 @@ def _pulls(branch: Branch) -> list[Callable[[Branch], Section]]:
     names = branch.names("pulls")
     if not names:
         return [lambda _branch: Section("Pulls", missing="limber import-pull or virtual-pull")]
-    return [lambda opened, name=name: _pull(opened, name) for name in names]
+    return [partial(_pull, name=name) for name in names]
 
 
 def _pull(branch: Branch, name: str) -> Section:
@@ -288,7 +288,7 @@ def _simulations(branch: Branch) -> list[Callable[[Branch], Section]]:
     if not keys:
         return [lambda _branch: Section("Simulated motion",
                                         missing="limber simulate NAME.branch")]
-    return [lambda opened, key=key: _simulation(opened, key) for key in keys]
+    return [partial(_simulation, key=key) for key in keys]
 
 
 def _simulation(branch: Branch, key: str) -> Section:
@@ -310,7 +310,7 @@ def _simulation(branch: Branch, key: str) -> Section:
 
 def _loads(branch: Branch) -> list[Callable[[Branch], Section]]:
     names = [name.removesuffix(".json") for name in branch.names("loads") if name.endswith(".json")]
-    return [lambda opened, name=name: _load(opened, name) for name in names]
+    return [partial(_load, name=name) for name in names]
 
 
 def _load(branch: Branch, name: str) -> Section:
@@ -351,7 +351,7 @@ def _plans(branch: Branch) -> list[Callable[[Branch], Section]]:
                    if key.startswith("plan:"))
     if not names:
         return [lambda _branch: Section("Paths", missing="limber plan NAME.branch")]
-    return [lambda opened, name=name: _plan(opened, name) for name in names]
+    return [partial(_plan, name=name) for name in names]
 
 
 def _plan(branch: Branch, name: str) -> Section:
@@ -388,7 +388,7 @@ def _plan(branch: Branch, name: str) -> Section:
 def _executions(branch: Branch) -> list[Callable[[Branch], Section]]:
     names = sorted(key.split(":", 1)[1] for key in branch.manifest.stages
                    if key.startswith("execute:"))
-    return [lambda opened, name=name: _execution(opened, name) for name in names]
+    return [partial(_execution, name=name) for name in names]
 
 
 def _execution(branch: Branch, name: str) -> Section:

@@ -47,7 +47,7 @@ class Axis:
         low = min(low, 0.0)
         return cls(title, unit, low, low + 1.06 * (high - low) if high > low else low + 1.0)
 
-    def place(self, values: np.ndarray) -> np.ndarray:
+    def place(self, values: float | np.ndarray) -> np.ndarray:
         """Return where values stand, as shares of the axis."""
         values = np.asarray(values, float)
         if self.log:

@@ -4,7 +4,7 @@ import numpy as np
 
 from limber.errors import InputError
 from limber.mechanics.frames import read_pc2
-from limber.recordings.recording import Pull, read_pull
+from limber.recordings.recording import Pull, PullEntry, read_pull
 from limber.scene.arrays import SceneData
 from limber.scene.graphs import force_graph
 from limber.scene.motion import add_frame_scalar, carried
@@ -50,7 +50,7 @@ def add_observation(data: SceneData, branch: Branch) -> None:
         data.arrays["observation_visible"] = seen.visible
         data.arrays["observation_times"] = seen.times + pull.entry.time_offset_s
     if is_shown:
-        _add_frames(data, branch, pull)
+        _add_frames(data, branch, pull, seen.point_count if seen is not None else 0)
 
 
 def times_of_frames(data: SceneData, pull: str) -> np.ndarray:
@@ -64,13 +64,13 @@ def times_of_frames(data: SceneData, pull: str) -> np.ndarray:
     return times - times[0] + data.arrays["observation_grasp_times"][0]
 
 
-def _add_frames(data: SceneData, branch: Branch, pull: Pull) -> None:
+def _add_frames(data: SceneData, branch: Branch, pull: Pull, count: int) -> None:
     """Say where each point was in each frame, and how far it then is from the simulation."""
     if "observation" not in data.arrays:
         return
     places, seen = _in_frames(data, times_of_frames(data, pull.name))
     data.arrays |= {"observation_motion": places, "observation_seen": seen}
-    rest = _rest_points(data, pull)
+    rest = _rest_points(data, pull.entry, count)
     if rest is None or not seen.any():
         return
     vertices = data.arrays["vertices"]
@@ -80,10 +80,10 @@ def _add_frames(data: SceneData, branch: Branch, pull: Pull) -> None:
                      f"{RESIDUAL}, pull {pull.name}", "m", "inferno", is_from_zero=True)
 
 
-def _rest_points(data: SceneData, pull: Pull) -> np.ndarray | None:
-    """Return where the observed points are at rest [m], shape [m, 3]; None where that is open."""
-    count = pull.observations.point_count
-    rest = pull.entry.rest_points_m
+def _rest_points(data: SceneData, entry: PullEntry, count: int) -> np.ndarray | None:
+    """Return where the observed points are at rest [m], shape [count, 3]; None where that is open.
+    """
+    rest = entry.rest_points_m
     found = np.array(rest, float) if rest is not None else data.arrays.get("control_points")
     return found if found is not None and found.shape == (count, 3) else None
 

@@ -276,7 +276,10 @@ class Answering:
             start = reduced.solve_static(pose, nodal_forces=self.held.loads)
             self._stepper = ReducedStepper(reduced, start, nodal_forces=self.held.loads,
                                            settings=_LIVE)
-        displacement = reduced.displacement_of(self._stepper.state.coordinates)
+            coordinates = self._stepper.state.coordinates
+        else:
+            coordinates = stepper.state.coordinates
+        displacement = reduced.displacement_of(coordinates)
         self.held.put(number, pose, displacement)
         return Answer(displacement, (HeldAt(number, pose, *stepper.reaction(pose)),),
                       stepper.energy, stepper.kinetic_energy, stepper.state.time,

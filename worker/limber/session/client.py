@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from limber.errors import InputError, WorkError
+from limber.present import present
 from limber.session.frames import Frame, FrameReader
 from limber.session.protocol import PROTOCOL
 from limber.session.settings import SessionSettings
@@ -64,10 +65,10 @@ class InteractiveSession:
         self._is_closed = False
         hello = self.wait_for("hello", start_seconds)
         trouble = self._trouble() if hello is None else other_protocol(hello)
-        if trouble:
+        if hello is None or trouble:
             self.close()
             raise WorkError(f"The session did not start: {trouble}")
-        self.hello = hello
+        self.hello: dict[str, Any] = hello
         self._frames = FrameReader(Path(hello["positions"]))
         self.faces = self._frames.faces
 
@@ -192,7 +193,7 @@ class InteractiveSession:
             WorkError: the session has ended by itself.
         """
         self._check()
-        return self._frames.read()
+        return present(self._frames, "frame of the session").read()
 
     def wait(self, move_id: int, seconds: float = 10.0) -> Frame | None:
         """Return the first frame seen that answers ``move_id`` or a later one; None if too late."""
@@ -222,7 +223,7 @@ class InteractiveSession:
         if self.alive:
             try:
                 self._send(command="close")
-                self._process.stdin.close()
+                present(self._process.stdin, "standard input").close()
                 self._process.wait(_GRACE_SECONDS)
             except (WorkError, OSError, subprocess.TimeoutExpired):
                 self._process.kill()
@@ -260,8 +261,9 @@ class InteractiveSession:
         line = {"id": self._ids} | {name: value for name, value in command.items()
                                     if value is not None}
         try:
-            self._process.stdin.write(json.dumps(line) + "\n")
-            self._process.stdin.flush()
+            stdin = present(self._process.stdin, "standard input")
+            stdin.write(json.dumps(line) + "\n")
+            stdin.flush()
         except (OSError, ValueError) as error:
             raise WorkError(f"The session has ended: {self._trouble()}") from error
         return self._ids

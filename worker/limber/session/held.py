@@ -231,7 +231,7 @@ class HeldBranch:
         acting = [forces for forces in (self._hung, self._weather) if forces is not None]
         if not self.gravity_on and self.model.hanging is not None:
             acting.append(-self.model.mass_load[:, None] * self.model.gravity)
-        return sum(acting) if acting else None
+        return sum(acting, np.zeros(3)) if acting else None
 
     def sag(self, answer: Answer) -> float:
         """Return how far what moved most along gravity has come down [m], of what is left."""

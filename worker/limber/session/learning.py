@@ -16,6 +16,7 @@ from limber.errors import LimberError
 from limber.mechanics.grasp import Grasp
 from limber.mechanics.reduced.model import ReducedModel
 from limber.mechanics.reduced.state import ReducedState
+from limber.present import present
 from limber.session.settings import SessionSettings
 
 _CHECK_INTERVAL = 1.0
@@ -91,14 +92,16 @@ class Learning:
         self._listener.join(1.0)
         for stream in (self._process.stdin, self._process.stdout):
             try:
-                stream.close()
+                if stream is not None:
+                    stream.close()
             except (OSError, ValueError):
                 continue  # what was not sent has nobody to read it
 
     def _write(self, line: dict[str, Any]) -> None:
         try:
-            self._process.stdin.write(json.dumps(line) + "\n")
-            self._process.stdin.flush()
+            stdin = present(self._process.stdin, "standard input")
+            stdin.write(json.dumps(line) + "\n")
+            stdin.flush()
         except (OSError, ValueError):
             self._checked = None  # it has ended; its listener says so
 

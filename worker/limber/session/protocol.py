@@ -217,8 +217,9 @@ def _id_of(line: bytes) -> int:
     except (ValueError, RecursionError):
         return 0
     found = content.get("id") if isinstance(content, dict) else None
-    good = isinstance(found, int) and not isinstance(found, bool) and 0 <= found <= _LARGEST_ID
-    return found if good else 0
+    if isinstance(found, int) and not isinstance(found, bool) and 0 <= found <= _LARGEST_ID:
+        return found
+    return 0
 
 
 class Lines:
