@@ -4,8 +4,10 @@ import importlib
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from tests.addon.test_panels import Layout
 
 from limber.cli import call
 
@@ -90,6 +92,9 @@ def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
     shutil.copytree(folders[0], third)
     scene.limber.branch_folder = str(third)
     assert branches.find_surface(scene) is None and layer.objects.active is None
+    drawn = Layout()
+    bpy.types.LIMBER_PT_result.draw(SimpleNamespace(layout=drawn), bpy.context)
+    assert "Not shown: press Open Result" in drawn.names("label")
     assert bpy.ops.limber.target(name="bud", at=(0.0, 0.0, 0.3)) == {"FINISHED"}
     assert [_targets(folder) for folder in (*folders, third)] == [[], ["fruit"], ["bud"]]
 

@@ -129,15 +129,18 @@ def test_the_live_force_is_in_the_panel(bpy, checked):
     assert live_force.read(folder) is None
 
 
-def test_while_it_moves_there_is_a_stop(bpy, checked):
-    """One large button, and that it is no emergency stop."""
+def test_while_it_moves_there_is_a_stop(bpy, checked, tmp_path):
+    """One large button, and that it is no emergency stop; its force, whichever branch is chosen."""
     from tests.addon.test_panels import _draw_step
 
-    jobs = part("jobs")
+    jobs, (folder, _) = part("jobs"), checked
     jobs.start(part("operators.arming").LIMBER_OT_arm.title,
-               [sys.executable, "-c", "import time; time.sleep(30)"])
+               [sys.executable, "-c", "import time; time.sleep(30)"], str(folder))
+    _write_live(folder)
+    bpy.context.scene.limber.branch_folder = str(tmp_path / "another.branch")
     drawn = _draw_step(bpy, "robot")
     assert ("operator", "limber.cancel_job", "Stop Robot") in drawn.calls
+    assert ("progress", 0.325, "3.25 N of 10 N") in drawn.calls
     assert "limber.arm" not in drawn.names("operator")
     assert any("No emergency stop" in text for text in drawn.names("label"))
     jobs.forget()
