@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +69,18 @@ def _read_text(path: Path) -> np.ndarray:
                                [second] if second else [], lines)
         if delimiter != ",":
             rows = (line.replace(",", ".") for line in rows)
-        return _rows(rows, delimiter=delimiter, usecols=columns)
+        return _rows(_even(rows, delimiter), delimiter=delimiter, usecols=columns)
+
+
+def _even(lines: Iterable[str], delimiter: str | None) -> Iterator[str]:
+    """Pass lines on while they have as many columns as the first: others are no table of points."""
+    width = 0
+    for line in lines:
+        found = len(line.split(delimiter))
+        width = width or found
+        if found != width:
+            raise ValueError(f"a line has {found} values, the first has {width}")
+        yield line
 
 
 def _columns(first: str, delimiter: str | None) -> tuple[tuple[int, ...], bool]:

@@ -76,6 +76,14 @@ def test_columns_are_read_as_the_worker_reads_them(bpy, registered, tmp_path, te
     assert bpy.context.scene.limber.reconstruct.unit == "m"
 
 
+def test_lines_of_different_length_are_refused(bpy, registered, tmp_path):
+    """COLMAP's points have a track behind them, and their number first: no x."""
+    path = tmp_path / "points3D.txt"
+    path.write_text("# POINT3D_ID, X, Y, Z, TRACK[]\n7 0.1 0.2 0.3 1 5\n900 0.4 0.5 0.6 1\n")
+    with pytest.raises(RuntimeError, match="a line has 5 values, the first has 6"):
+        bpy.ops.limber.import_cloud(filepath=str(path))
+
+
 def test_a_header_without_coordinates_is_refused(bpy, registered, tmp_path):
     """No other column is taken for one."""
     path = tmp_path / "scan.csv"
