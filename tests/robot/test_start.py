@@ -109,6 +109,19 @@ def test_the_way_back_leads_straight_to_where_it_began():
         assert back.greatest_speeds[0] <= 0.015 * (1 + 1e-6)
 
 
+def test_a_way_of_a_fraction_of_a_millimetre_is_gone_back():
+    """Against something stiff it is tens of newtons; where nothing moved there is no way."""
+    for length in (0.0003, 0.0015, 0.003):
+        out = line(length)
+        way = WayBack()
+        way.begin(sample_at(POSE), Trajectory(along(out, 0.005, 0.3), out))
+        back = way.from_here(led(way, out), 0.3)
+        assert back.poses[0] == pytest.approx(out[-1]) and back.poses[-1] == pytest.approx(POSE)
+        assert np.all(np.diff(back.poses[:, 1]) < 0)
+    with pytest.raises(SafetyStop, match="stands where it began"):
+        way.from_here(sample_at(POSE), 0.3)
+
+
 def test_legs_with_the_same_branch_held_are_one_way():
     """Stopped while the branch is let back, it goes on back; not out again."""
     out = line(0.05)

@@ -10,6 +10,7 @@ from limber.robot.trajectory import Trajectory, along
 
 _APART_M, _APART_RAD = 1e-3, 0.005  # between the places that are kept
 _SAME = 0.3  # of what is bridged at a start: so near, two places of the way are one
+_STANDS = 1e-5  # m and rad, of an arm that has not moved
 _SLOWER = 0.5
 _LEAST_SPEEDS = np.array([1e-3, 1e-2])  # m/s, rad/s
 
@@ -76,9 +77,18 @@ class WayBack:
         if told := different_joints(sample.joints, self._joints[nearest]):
             raise SafetyStop(f"The arm does not stand as it came: {'; '.join(told)}.",
                              "Something has moved it since.", "Free the branch by hand.")
-        first = int(np.flatnonzero(off <= off[nearest] + _SAME)[0])
-        if first == 0:
+        if length(sample.pose - poses[0]) < _STANDS:
             raise SafetyStop("There is no way back.", "The arm stands where it began.", "")
-        back = np.vstack([sample.pose, poses[:first][::-1]])
+        # At least to the start: against something stiff a fraction of a millimetre is a way.
+        back = np.vstack([sample.pose, poses[:max(_first_time(off), 1)][::-1]])
         speed, turn_speed = _SLOWER * self._speeds
         return Trajectory(along(back, speed, acceleration, turn_speed=turn_speed), back)
+
+
+def _first_time(off: np.ndarray) -> int:
+    """Return the nearest place of a way when it first passed here, from its distances [n]."""
+    near = off <= off.min() + _SAME
+    begin = int(near.argmax())
+    gone = np.flatnonzero(~near[begin:])
+    end = begin + int(gone[0]) if len(gone) else len(off)
+    return begin + int(off[begin:end].argmin())
