@@ -516,10 +516,10 @@ PARTS = {
     "field": Part(_field_rows, 120, (
         *(_error_asked(what, asked, unit) for _, what, _, asked, unit in _ERRORS), _FIELD_COST,
         _REST_INSIDE, _WITHOUT_FIELD, _NOT_TRUSTED), grows=True),
-    "detours": Part(_detour_table, 30, DETOUR_ROWS, grows=True),
-    "trials": Part(_trial_rows, 90, (*_BOUND_ROWS, *_TIME_ROWS, *_FULL_ROWS, *map(
+    "detours": Part(_detour_table, 100, DETOUR_ROWS, grows=True),
+    "trials": Part(_trial_rows, 150, (*_BOUND_ROWS, *_TIME_ROWS, *_FULL_ROWS, *map(
         _saved_asked, _AGAINST), _FROM_REST), grows=True),
-    "no-path": Part(_no_path_rows, 20, (_NO_PATH,)),
+    "no-path": Part(_no_path_rows, 80, (_NO_PATH,), grows=True),
     "sure": Part(_sure_table, 120, (SURE_ROW,), grows=True),
     "reduced": Part(_reduced_time, 200, (_REDUCED_COST, *(
         _error_asked(f"{what}, field on the reduced model", asked, unit)

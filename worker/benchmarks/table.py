@@ -24,6 +24,8 @@ NAMES = ("geometry", "mechanics", "estimation", "truth", "planning", "robot", "s
          "worker")
 NOT_SHOWN = "not shown"
 """What a row says for which there was no time, or nothing to measure it with."""
+_FEW = 20
+"""So many intervals at least are judged: of fewer, one that misses is more than 5 %."""
 
 
 @dataclass(frozen=True)
@@ -199,15 +201,11 @@ def allowance(part: Part, later: Sequence[Part], remaining: float) -> float | No
 def share_met(share: float, count: int, low: float, high: float) -> bool | None:
     """Whether a share of ``count`` intervals lies in an asked range, or None: they are too few.
 
-    Of fewer than 20, one that misses is more than the 5 % that 95 % intervals may miss; a share
-    above ``high`` says nothing where a single miss would bring it below.
+    A share above ``high`` says nothing where a single miss would bring it below.
     """
     if count < _FEW or (share > high and count * (1 - high) < 1):
         return None
     return bool(low <= share <= high)
-
-
-_FEW = 20
 
 
 def _tried(name: str, part: Part, setting: Setting) -> list[Row]:
