@@ -222,7 +222,7 @@ PARTS = {
         list(done.values()))), 30, (ROOT_ROW,), grows=True),
     "leafy": _part("leafy", _leafy_rows, (LEAFY_ROW,), 60),
     "crowns": _part("crowns", _crown_rows, (CROWN_ROW,), 90),
-    "probabilities": Part(partial(_told, kinds=tuple(_COUNTS), rows=_probabilities), 90, (
+    "probabilities": Part(partial(_told, kinds=tuple(_COUNTS), rows=_probabilities), 30, (
         *probability_asked(""), *probability_asked(LEAFY)), grows=True),
     "single-view": _part("single-view", partial(_view_rows, view=SINGLE_VIEW), SINGLE_VIEW.rows)}
 """The table, in order of importance; ``--only`` also knows one scan of the same tree's row."""
