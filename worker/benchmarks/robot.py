@@ -11,7 +11,9 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks import robot_faults
 from benchmarks.held_up import Voided, Witness
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.robot_branches import FOLLOWED_ROWS, LOST_ROW, followed_paths, lost_branches
 from benchmarks.robot_faults import (
     ENDS_ROBOT,
@@ -190,21 +192,22 @@ def _path(setting: Setting, _voided: Voided) -> list[Row]:
 
 def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(FAULTS),
             ) -> list[Row]:
-    failed, slowest, runs = [], 0.0, {}
+    runs: dict[str, list[dict]] = {}
     for name, budget in setting.budget.shares(list(names)):
         setting.progress(len(runs) / len(names), name)
-        some, outcomes = _fault_runs(name, replace(setting, budget=budget), voided)
-        failed += some
-        runs[name] = len(some) + len(outcomes)
-        if name not in ENDS_ROBOT:
-            slowest = max([slowest, *(outcome.standstill_s for outcome in outcomes)])
-        print(f"{name}: {runs[name]} runs, {len(failed)} failed so far", flush=True)
-    total = sum(runs.values())
-    each = (f"{min(runs.values())} to {max(runs.values())} runs of {len(runs)} of {len(names)} "
-            "faults; " if len(names) > 1 else "")
+        runs[name] = _fault_runs(name, replace(setting, budget=budget), voided)
+        print(f"{name}: {len(runs[name])} runs, {sum(map(_is_failed, runs[name]))} failed",
+              flush=True)
+    every = [run for some in runs.values() for run in some]
+    failed, total = sum(map(_is_failed, every)), len(every)
+    slowest = max((run["standstill_s"] for name, some in runs.items() if name not in ENDS_ROBOT
+                   for run in some if not _is_failed(run)), default=np.nan)
+    least, most = (size(map(len, runs.values())) for size in (min, max))
+    each = f"{least} to {most} runs of {len(runs)} of {len(names)} faults; " if len(
+        names) > 1 else ""
     # What did not come to its turn is not known to be good.
     is_met = False if failed else True if len(runs) == len(names) else None
-    return [Row(*_faults_asked(_faults_told(names)), f"{total - len(failed)} of {total}; {each}"
+    return [Row(*_faults_asked(_faults_told(names)), f"{total - failed} of {total}; {each}"
                 f"slowest standstill {slowest:.2f} s{voided}", is_met, total)]
 
 
@@ -212,29 +215,40 @@ def _faults_told(names: tuple[str, ...]) -> str:
     return f"{len(names)} faults" if len(names) > 1 else names[0]
 
 
-def _fault_runs(name: str, setting: Setting, voided: Voided) -> tuple[list[str], list[Outcome]]:
-    """Provoke a fault as often as there is time for: what failed, and the other runs' outcomes."""
-    failed, outcomes = [], []
-    seed = setting.seed + list(FAULTS).index(name)
-    robot = new_robot(_ADDRESS, "ur5e", seed)
+def _is_failed(run: dict) -> bool:
+    return "failed" in run
+
+
+def _fault_runs(name: str, setting: Setting, voided: Voided) -> list[dict]:
+    """Provoke a fault as often as there is time for: its standstill [s], or how it failed."""
+    seed, source = setting.seed + list(FAULTS).index(name), source_digest(
+        ("robot",), __file__, robot_faults.__file__)
+    robot: VirtualRobot | None = None
 
     def run() -> Outcome:
         nonlocal robot
-        if robot.process.poll() is not None:
-            robot.close()
+        if robot is None or robot.process.poll() is not None:
+            if robot is not None:
+                robot.close()
             robot = new_robot(_ADDRESS, "ur5e", seed)
         restored(robot)
         return provoke(name, robot, cell_for(_ADDRESS))
+
+    def trial(number: int) -> Numbers:
+        try:
+            outcome = voided.again(run, name)
+        except (AssertionError, LimberError) as error:
+            print(f"{name}: {error}", flush=True)
+            return Numbers(name, number, source, {"failed": str(error)})
+        return Numbers(name, number, source, {"standstill_s": outcome.standstill_s})
+    first = 1000 * setting.seed
     try:
-        for _ in setting.budget.seeds(0, setting.at_most(20, 1)):
-            try:
-                outcomes.append(voided.again(run, name))
-            except (AssertionError, LimberError) as error:
-                failed.append(f"{name}: {error}")
-                print(failed[-1], flush=True)
+        return [each.values for each in numbers_of(
+            name, range(first, first + setting.at_most(20, 1)), trial, source,
+            setting.kept / "robot.jsonl", setting.budget)]
     finally:
-        robot.close()
-    return failed, outcomes
+        if robot is not None:
+            robot.close()
 
 
 def _watched(run: Callable[[Setting, Voided], list[Row]]) -> Callable[[Setting], list[Row]]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.held_up import Voided
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
 from benchmarks.table import Asked, Row, Setting
 from limber.errors import LimberError, SafetyStop
@@ -37,6 +38,7 @@ FRACTION = 0.85
 _LENGTH_M = 0.4
 _PEAK_N, _TRAVEL_M = 6.0, 0.04
 _WITHIN = 0.95
+_PACKAGES = ("robot", "mechanics", "stages", "geometry")
 _OFF_N = 0.5
 """From here on the virtual branch itself was off, by its own word: chosen."""
 
@@ -99,28 +101,37 @@ def _plan_sideways(branch: Branch, push: np.ndarray) -> None:
 
 def followed_paths(setting: Setting, voided: Voided, address: str) -> list[Row]:
     """Follow a path with random branches: force as predicted, where the arm went."""
-    within, errors, ways, stopped = [], [], [], []
-    for seed in setting.budget.seeds(setting.seed, setting.at_most(10, 1)):
-        try:
-            result, state = voided.again(partial(_followed, seed, address), f"seed {seed}")
-        except (AssertionError, LimberError) as error:
-            stopped.append(f"seed {seed}: {error}")
-            print(stopped[-1], flush=True)
-            continue
-        within.append(result["force_within_share"])
-        errors.append(result["force_error_of_peak"])
-        ways.append(result["path_error_m"])
-        print(f"seed {seed}: within {within[-1]:.3f}, 95 % of the path below "
-              f"{100 * errors[-1]:.1f} % of {result['predicted_peak_force_n']:.1f} N, the virtual "
-              f"branch's extrapolation off by {state:.2f} N at most", flush=True)
-    count = len(within) + len(stopped)
-    if not within:
+    source = source_digest(_PACKAGES, __file__)
+    seeds = range(setting.seed, setting.seed + setting.at_most(10, 1))
+    trials = [each.values for each in numbers_of("branches", seeds, partial(
+        _follow_trial, source=source, voided=voided, address=address), source,
+        setting.kept / "robot.jsonl", setting.budget, progress=setting.progress)]
+    ended = [each for each in trials if "stopped" not in each]
+    stopped, count = len(trials) - len(ended), len(trials)
+    if not ended:
         return [Row(*asked, "no run reached its end", False, count) for asked in FOLLOWED_ROWS]
+    within, errors, ways = (np.array([each[name] for each in ended])
+                            for name in ("within", "error", "way"))
     return [
-        Row(*FOLLOWED_ROWS[0], f"{100 * min(within):.1f} % (median {100 * np.median(within):.1f}); "
-            f"{len(stopped)} failed{voided}", min(within) >= _WITHIN and not stopped, count),
-        Row(*FOLLOWED_ROWS[1], f"{1000 * max(ways):.2f} mm", max(ways) < 1e-3, len(ways)),
-        Row(*FOLLOWED_ROWS[2], f"{100 * max(errors):.1f} % of the peak", None, len(errors))]
+        Row(*FOLLOWED_ROWS[0], f"{100 * within.min():.1f} % (median {100 * np.median(within):.1f});"
+            f" {stopped} failed{voided}", bool(within.min() >= _WITHIN) and not stopped, count),
+        Row(*FOLLOWED_ROWS[1], f"{1000 * ways.max():.2f} mm", bool(ways.max() < 1e-3), len(ways)),
+        Row(*FOLLOWED_ROWS[2], f"{100 * errors.max():.1f} % of the peak", None, len(errors))]
+
+
+def _follow_trial(seed: int, source: str, voided: Voided, address: str) -> Numbers:
+    """One branch's path: how well the force was predicted, or why it did not end."""
+    try:
+        result, off = voided.again(partial(_followed, seed, address), f"seed {seed}")
+    except (AssertionError, LimberError) as error:
+        print(f"seed {seed}: {error}", flush=True)
+        return Numbers("branches", seed, source, {"stopped": str(error)})
+    within, error = result["force_within_share"], result["force_error_of_peak"]
+    print(f"seed {seed}: within {within:.3f}, 95 % of the path below {100 * error:.1f} % of "
+          f"{result['predicted_peak_force_n']:.1f} N, the virtual branch's extrapolation off by "
+          f"{off:.2f} N at most", flush=True)
+    return Numbers("branches", seed, source, {"within": float(within), "error": float(error),
+                                              "way": float(result["path_error_m"])})
 
 
 def _followed(seed: int, address: str) -> tuple[dict, float]:
@@ -187,22 +198,30 @@ LOST_ROW = Asked("branch slips, branch breaks while it is led: stop for the lost
 
 def lost_branches(setting: Setting, voided: Voided, address: str) -> list[Row]:
     """The branch slips in the grip, or breaks, while it is led: the arm stands and says so."""
-    told, failed, runs = [], [], 0
-    tasks = [(setting.seed + number, *fault) for number in range(setting.at_most(20, 1))
-             for fault in FAULTS_OF_BRANCHES]
-    # One run at least of each fault.
-    for seed, name, fault in setting.budget.items(tasks, at_least=len(FAULTS_OF_BRANCHES)):
-        began = time.monotonic()
-        runs += 1
-        try:
-            told.append(voided.again(partial(_stop_for_loss, seed, address, fault),
-                                     f"{name}, seed {seed}"))
-        except (AssertionError, LimberError) as error:
-            failed.append(f"{name}, seed {seed}: {error}")
-        print(f"branch {name}: {time.monotonic() - began:.0f} s in all", flush=True)
-    for line in (*failed, *told[:2]):
-        print(line)
-    return [Row(*LOST_ROW, f"{len(told)} of {runs}{voided}", not failed, runs)]
+    source, kinds = source_digest(_PACKAGES, __file__), len(FAULTS_OF_BRANCHES)
+    tasks = range(kinds * setting.seed, kinds * (setting.seed + setting.at_most(20, 1)))
+    trials = numbers_of("lost", tasks, partial(
+        _loss_trial, source=source, voided=voided, address=address), source,
+        setting.kept / "robot.jsonl", setting.budget, progress=setting.progress)
+    failed = [each.values["failed"] for each in trials if each.values["failed"]]
+    names = {FAULTS_OF_BRANCHES[each.seed % kinds][0] for each in trials}
+    # A fault that did not come to its turn is not known to be noticed.
+    is_met = False if failed else True if len(names) == kinds else None
+    return [Row(*LOST_ROW, f"{len(trials) - len(failed)} of {len(trials)} ("
+                f"{', '.join(sorted(names))}){voided}", is_met, len(trials))]
+
+
+def _loss_trial(task: int, source: str, voided: Voided, address: str) -> Numbers:
+    """One fault with one branch; faults take turns."""
+    seed, kind = divmod(task, len(FAULTS_OF_BRANCHES))
+    name, fault = FAULTS_OF_BRANCHES[kind]
+    failed, began = "", time.monotonic()
+    try:
+        told = voided.again(partial(_stop_for_loss, seed, address, fault), f"{name}, seed {seed}")
+    except (AssertionError, LimberError) as error:
+        failed = told = f"{name}, seed {seed}: {error}"
+    print(f"branch {name}: {time.monotonic() - began:.0f} s in all: {told}", flush=True)
+    return Numbers("lost", task, source, {"failed": failed})
 
 
 def _stop_for_loss(seed: int, address: str, fault: Callable[[VirtualRobot], None]) -> str:

@@ -60,18 +60,21 @@ class Rig:
 
 def bad_recordings_row(setting: Setting) -> list[Row]:
     """Every bad recording that the issue names, and a good one that must pass."""
+    count = 1
     with tempfile.TemporaryDirectory() as folder:
         rig = made_rig(Path(folder), setting.generator(31))
         good = _imported(rig)
         wrong = [] if good[0] == 0 else [f"a good one: exit {good[0]}"]
-        for number, (name, words, run) in enumerate(CASES):
-            setting.progress(number / len(CASES), name)
+        for name, words, run in setting.budget.items(CASES):
+            setting.progress(count / len(CASES), name)
+            count += 1
             code, told = run(rig)
             if code not in (2, 3) or not all(word in told for word in words):
                 wrong.append(f"{name}: exit {code}, {told[:60]!r}")
-    count = len(CASES) + 1
+    # What did not come to its turn is not known to be refused.
+    is_met = False if wrong else True if count == len(CASES) + 1 else None
     return [Row(*BAD_RECORDINGS, f"{count - len(wrong)} of {count} as asked"
-                + "".join(f"; {each}" for each in wrong), not wrong, count)]
+                + "".join(f"; {each}" for each in wrong), is_met, count)]
 
 
 def made_rig(folder: Path, rng: np.random.Generator) -> Rig:

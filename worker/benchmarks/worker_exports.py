@@ -4,11 +4,13 @@ import shutil
 import subprocess
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.linalg import eigh
 
+from benchmarks.kept_trials import Numbers, numbers_of, source_digest
 from benchmarks.table import Asked, Row, Setting
 from limber.exports.abaqus import inp_text
 from limber.exports.mjcf import mjcf_text
@@ -21,7 +23,7 @@ from limber.mechanics.model import DEFAULT_DAMPING, BranchModel
 from limber.mechanics.rods import matched, rod_tree
 from limber.mechanics.statics.solve import solve_static
 from limber.mechanics.vibration import lowest_modes
-from limber.progress import Progress
+from limber.progress import SILENT
 
 _LINKS = 30
 _SHARE = 0.01
@@ -44,22 +46,22 @@ EXPORT_ROWS = tuple(Asked(f"export in {label}, worst: static tip; first frequenc
 
 def exported(setting: Setting) -> list[Row]:
     """Generated branches, weightless and hanging, in MuJoCo; weightless in CalculiX."""
-    found: dict[str, list[tuple[float, float]]] = {}
-    seeds = setting.seeds(20, 2)
-    for number, seed in enumerate(setting.budget.items(seeds)):
-        setting.progress(number / len(seeds), f"exports, seed {seed}")
-        for label, apart in _bent(seed, setting.progress).items():
-            found.setdefault(label, []).append(apart)
-    return [_row(asked, found[label]) if label in found else
+    source = source_digest(("exports", "mechanics", "geometry"), __file__)
+    trials = numbers_of("exports", setting.seeds(20, 2), partial(_bent, source=source), source,
+                        setting.kept / "worker-exports.jsonl", setting.budget,
+                        progress=setting.progress)
+    found = {label: [each.values[label] for each in trials if label in each.values]
+             for label in _PROGRAMS}
+    return [_row(asked, found[label]) if found[label] else
             Row(*asked, "the program is not installed", None, 0)
             for asked, label in zip(EXPORT_ROWS, _PROGRAMS, strict=True)]
 
 
-def _bent(seed: int, progress: Progress) -> dict[str, tuple[float, float]]:
+def _bent(seed: int, source: str) -> Numbers:
     """How far each program is apart from our elements, for one generated branch."""
     found = {}
     branch = generate_branch(seed)
-    mesh = mesh_skeleton(branch.skeleton, ReconstructSettings(), progress).mesh
+    mesh = mesh_skeleton(branch.skeleton, ReconstructSettings(), SILENT).mesh
     mujoco_still, mujoco_hanging, usd, calculix = _PROGRAMS
     for label, gravity in ((mujoco_still, None), (mujoco_hanging, (0, 0, -9.81))):
         model = BranchModel(mesh, young=1e9, poisson=0.35, density=800.0, gravity=gravity)
@@ -73,11 +75,11 @@ def _bent(seed: int, progress: Progress) -> dict[str, tuple[float, float]]:
             found[usd] = _apart(ours, bent_as_usd(model, node, load))
             if (theirs := bent_in_calculix(model, node, load)) is not None:
                 found[calculix] = _apart(ours, theirs)
-    return found
+    return Numbers("exports", seed, source, found)
 
 
 def _row(asked: Asked, errors: list[tuple[float, float]]) -> Row:
-    tip, frequency = np.max(errors, axis=0)
+    tip, frequency = np.max(np.array(errors, float), axis=0)
     return Row(*asked, f"{100 * tip:.2f} %; {100 * frequency:.2f} %",
                bool(tip <= 0.02 and frequency <= 0.02), len(errors))
 
