@@ -66,12 +66,12 @@ def test_a_part_of_a_budget_ends_no_later(clock):
 
 
 def test_items_share_what_is_left(clock):
-    """What the first does not use goes to the others; none begins after the deadline."""
+    """What the first does not use goes to the others; after the end there is nothing."""
     budget, seen = Budget(12, clock), []
     for item, own in budget.shares(list("abcd")):
         seen.append((item, own.remaining))
         clock.now += {"a": 0, "b": 10}.get(item, 5)
-    assert seen == [("a", 3), ("b", 4), ("c", 1)]
+    assert seen == [("a", 3), ("b", 4), ("c", 1), ("d", -3)]
 
 
 def test_tasks_of_one_worker_stop_as_trials_do(clock):
@@ -109,6 +109,8 @@ def test_a_run_goes_on_with_kept_trials(clock, tmp_path):
     assert trials(0) == [4, 5, 6, 7] == made
     assert trials(0, source="later") == [4] and trials(0, part="q") == [4]
     assert json.loads(kept.read_text().splitlines()[0])["values"] == {"error": None}
+    assert len(made) == 6
+    assert numbers_of("r", range(3), made.append, "now", kept, Budget(0, clock), at_least=0) == []
     assert len(made) == 6
 
 

@@ -54,10 +54,8 @@ class Budget:
         return self.items(range(first, first + at_most), at_least)
 
     def shares(self, items: list[Task]) -> Iterator[tuple[Task, "Budget"]]:
-        """Yield each item with an even share of what is left then; stop at the deadline."""
+        """Yield each item with an even share of what is left then: of nothing after the end."""
         for number, item in enumerate(items):
-            if number > 0 and self.remaining <= 0:
-                return
             yield item, self.part(self.remaining / (len(items) - number))
 
 

@@ -41,17 +41,17 @@ class Numbers:
 
 def numbers_of(part: str, seeds: Iterable[int], work: Callable[[int], Numbers], source: str,
                kept: Path | None, budget: Budget, workers: int | None = 1,
-               progress: Progress = SILENT) -> list[Numbers]:
+               progress: Progress = SILENT, at_least: int = 1) -> list[Numbers]:
     """Return the trials of a part by seed; :func:`go_on` says what is made and what is kept."""
     own = [each for each in read_trials(Numbers, kept) if each.part == part]
     return go_on(own, list(seeds), lambda trial: trial.seed, work, source, kept, budget, workers,
-                 progress)
+                 progress, at_least=at_least)
 
 
 def go_on(kept_trials: list[Trial], tasks: list[Task], key: Callable[[Trial], Task],
           work: Callable[[Any], Trial], source: str, kept: Path | None, budget: Budget,
           workers: int | None = 1, progress: Progress = SILENT,
-          given: Callable[[list[Task]], list] = list) -> list[Trial]:
+          given: Callable[[list[Task]], list] = list, at_least: int = 1) -> list[Trial]:
     """Return the trials of ``tasks``, in their order: those kept, and as many new ones as fit.
 
     Args:
@@ -61,16 +61,17 @@ def go_on(kept_trials: list[Trial], tasks: list[Task], key: Callable[[Trial], Ta
         work: Makes the trial of a task, from what ``given`` made of it.
         source: Digest of the sources.
         kept: File to which new trials are appended, or None.
-        budget: For the new ones; one at least is made where there is none yet.
+        budget: For the new ones.
         workers: How many at once; None: as many as there are cores.
         progress: Called after each.
         given: Turns the tasks that are left into what ``work`` takes.
+        at_least: So many are there in the end, whatever time is left.
     """
     wanted = set(tasks)
     known = {key(trial): trial for trial in kept_trials
              if trial.source == source and key(trial) in wanted}
     missing = given([task for task in tasks if task not in known])
-    for _, trial in side_by_side(work, missing, budget, workers, at_least=0 if known else 1):
+    for _, trial in side_by_side(work, missing, budget, workers, max(at_least - len(known), 0)):
         known[key(trial)] = trial
         keep(trial, kept)
         progress(len(known) / len(tasks), f"trial {len(known)} of at most {len(tasks)}")

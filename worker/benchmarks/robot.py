@@ -195,7 +195,10 @@ def _faults(setting: Setting, voided: Voided, names: tuple[str, ...] = tuple(FAU
     runs: dict[str, list[dict]] = {}
     for name, budget in setting.budget.shares(list(names)):
         setting.progress(len(runs) / len(names), name)
-        runs[name] = _fault_runs(name, replace(setting, budget=budget), voided)
+        some = _fault_runs(name, replace(setting, budget=budget), voided, 0 if runs else 1)
+        if not some:
+            continue
+        runs[name] = some
         print(f"{name}: {len(runs[name])} runs, {sum(map(_is_failed, runs[name]))} failed",
               flush=True)
     every = [run for some in runs.values() for run in some]
@@ -219,7 +222,7 @@ def _is_failed(run: dict) -> bool:
     return "failed" in run
 
 
-def _fault_runs(name: str, setting: Setting, voided: Voided) -> list[dict]:
+def _fault_runs(name: str, setting: Setting, voided: Voided, at_least: int) -> list[dict]:
     """Provoke a fault as often as there is time for: its standstill [s], or how it failed."""
     seed, source = setting.seed + list(FAULTS).index(name), source_digest(
         ("robot",), __file__, robot_faults.__file__)
@@ -245,7 +248,7 @@ def _fault_runs(name: str, setting: Setting, voided: Voided) -> list[dict]:
     try:
         return [each.values for each in numbers_of(
             name, range(first, first + setting.at_most(20, 1)), trial, source,
-            setting.kept / "robot.jsonl", setting.budget)]
+            setting.kept / "robot.jsonl", setting.budget, at_least=at_least)]
     finally:
         if robot is not None:
             robot.close()

@@ -63,6 +63,8 @@ def fuzz(names: list[str], setting: Setting, template: Path, keep: Path) -> dict
         child = _Child(template)
         try:
             for name, budget in setting.budget.shares(names):
+                if found and budget.remaining <= 0:
+                    break
                 setting.progress(len(found) / len(names), name)
                 found[name] = _fuzzed(name, child, replace(setting, budget=budget), template,
                                       Path(place), keep)
