@@ -127,6 +127,27 @@ def test_text_as_programs_write_it(tmp_path, name, content):
             read_points(tmp_path / name).points, [[1.5, 2, 3.25], [4, 5, 6.5]])
 
 
+@pytest.mark.parametrize("end", ["\n", " \n", "\r\n"])
+@pytest.mark.parametrize("version", [".5", "0.6", ".7"])
+def test_pcd_of_older_versions_and_with_blanks(tmp_path, version, end):
+    """Without COUNT, VIEWPOINT and POINTS, with blanks at the ends of lines, with any field."""
+    lines = [f"VERSION {version}", "FIELDS x y z Höhe[m]", "SIZE 4 4 4 4", "TYPE F F F F",
+             "WIDTH 200", "HEIGHT 1", "DATA ascii", *(f"{x} {y} {z} 7" for x, y, z in POINTS)]
+    (tmp_path / "a.pcd").write_bytes("".join(line + end for line in lines).encode())
+    cloud = read_points(tmp_path / "a.pcd")
+    np.testing.assert_allclose(cloud.points, POINTS, atol=1e-6)
+    assert cloud.titles == {"Hohe_m": "Höhe[m]"}
+
+
+def test_padding_of_pcd_is_no_column(tmp_path):
+    """PCL calls the bytes between fields _."""
+    header = ("VERSION 0.7\nFIELDS x y z _\nSIZE 4 4 4 1\nTYPE F F F U\nCOUNT 1 1 1 4\n"
+              "WIDTH 200\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 200\nDATA binary\n")
+    table = np.column_stack([POINTS, np.zeros(200)]).astype(np.float32)
+    (tmp_path / "a.pcd").write_bytes(header.encode() + table.tobytes())
+    assert not read_points(tmp_path / "a.pcd").attributes
+
+
 @pytest.mark.parametrize(("name", "row", "scalar"), [
     ("a.pts", "-1200 110 118 156", "intensity"), ("a.pts", "17 110 118 156", "intensity"),
     ("a.xyz", "110 118 156 0.5", "scalar_0"), ("a.xyz", "110 118 156 17", "scalar_0"),

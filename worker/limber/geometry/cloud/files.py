@@ -24,6 +24,7 @@ from limber.reading import read_arrays
 _AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("X", "Y", "Z"),
          ("//X", "Y", "Z"))
 _NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"), ("Nx", "Ny", "Nz"))
+_PCD_PADDING = "#$%&~~"  # how pypcd4 begins the names of fields that are called _
 _FARTHEST = 1e15
 """No coordinate lies beyond, whatever its unit."""
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("R", "G", "B"))
@@ -151,15 +152,50 @@ def _read_pcd(path: Path) -> Cloud:
     from pypcd4 import PointCloud
 
     check_pcd(path)
-    content = PointCloud.from_path(path)
-    names = [name for name in content.fields if name != "_"]
+    stream, titles = _pcd_stream(path)
+    content = PointCloud.from_fileobj(stream)
+    names = [name for name in content.fields if not name.startswith(_PCD_PADDING)]
     columns = {name: np.asarray(content.pc_data[name]).ravel() for name in names}
     if "rgb" in columns:
         packed = columns.pop("rgb")
         packed = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
         columns |= {"r": packed >> 16 & 255, "g": packed >> 8 & 255, "b": packed & 255}
         names = [name for name in names if name != "rgb"] + ["r", "g", "b"]
-    return _from_columns(names, columns)
+    return replace(_from_columns(names, columns), titles=titles)
+
+
+def _pcd_stream(path: Path) -> tuple[io.BytesIO, dict[str, str]]:
+    """A PCD file as its package reads it, and what the file calls fields of other names.
+
+    Versions before 0.7 lack entries of the header; some programs end lines with blanks, or have
+    marks in the names of fields.
+    """
+    raw, body = header_bytes(path, b"\nDATA")
+    said = {words[0]: words[1:] for line in raw.decode("utf-8", "replace").splitlines()
+            if (words := line.split()) and not words[0].startswith("#")}
+    for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "DATA"):
+        if not said.get(key):
+            raise InputError(f"{path} has no {key} in its header.", "A PCD file says it there.",
+                             "Export it again.")
+    fields = said["FIELDS"]
+    own = [title for title in fields if title != "_"]
+    names = iter(property_names(own))
+    renamed = [title if title == "_" else next(names) for title in fields]
+    size = int(said["WIDTH"][0]) * int(said.get("HEIGHT", "1")[0])
+    told = {"VERSION": ["0.7"], "FIELDS": renamed, "SIZE": said["SIZE"], "TYPE": said["TYPE"],
+            "COUNT": said.get("COUNT") or ["1"] * len(fields), "WIDTH": said["WIDTH"],
+            "HEIGHT": said.get("HEIGHT") or ["1"], "POINTS": said.get("POINTS") or [str(size)],
+            "DATA": said["DATA"]}
+    header = "".join(f"{key} {' '.join(words)}\n" for key, words in told.items()).encode()
+    with open(path, "rb") as stream:
+        stream.seek(body)
+        points = stream.read()
+    if said["DATA"][0] == "ascii":
+        points = b"\n".join(b" ".join(line.split()) for line in points.splitlines())
+    return io.BytesIO(header + points), {
+        name: title for name, title in zip(renamed, fields, strict=True) if name != title}
+
+
 
 
 def _read_text(path: Path) -> Cloud:
