@@ -127,6 +127,22 @@ def test_text_as_programs_write_it(tmp_path, name, content):
             read_points(tmp_path / name).points, [[1.5, 2, 3.25], [4, 5, 6.5]])
 
 
+def test_points_of_colmap(tmp_path):
+    """Each point is followed by the images that saw it, so that rows are not of one length."""
+    rows = "".join(f"{k + 7} {x} {y} {z} 9 8 7 0.3 {'1 2 ' * (k % 4)}\n"
+                   for k, (x, y, z) in enumerate(POINTS))
+    (tmp_path / "points3D.txt").write_text(
+        "# 3D point list with one line of data per point:\n#   POINT3D_ID, X, Y, Z, R, G, B, ERROR,"
+        " TRACK[] as (IMAGE_ID, POINT2D_IDX)\n# Number of points: 200\n" + rows)
+    cloud = read_points(tmp_path / "points3D.txt")
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert cloud.attributes.keys() == {"color", "point3d_id", "error"}
+    with open(tmp_path / "points3D.txt", "a") as stream:
+        stream.write("99 1.5 2.5")
+    with pytest.raises(InputError, match="line 204 has 3 values"):
+        read_points(tmp_path / "points3D.txt")
+
+
 @pytest.mark.parametrize("end", ["\n", " \n", "\r\n"])
 @pytest.mark.parametrize("version", [".5", "0.6", ".7"])
 def test_pcd_of_older_versions_and_with_blanks(tmp_path, version, end):

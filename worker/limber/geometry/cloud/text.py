@@ -12,6 +12,7 @@ from limber.errors import InputError
 _AXES = (("x", "y", "z"), ("points:0", "points:1", "points:2"), ("pos_x", "pos_y", "pos_z"),
          ("easting", "northing", "height"), ("easting", "northing", "elevation"),
          ("easting", "northing", "altitude"), ("easting", "northing", "z"))
+_COLMAP, _COLMAP_HEAD = "POINT3D_ID", 1000  # in the first characters of COLMAP's points3D.txt
 _UNIT = re.compile(r"[\s_]*[\[(](m|cm|mm|in)[\])]$|_(m|cm|mm)$")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 
@@ -31,6 +32,8 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
         InputError: no numbers, too few columns, or a line that is none of the table; it is named.
     """
     text = _decoded(path.read_bytes()).replace('"', "")
+    if _COLMAP in text[:_COLMAP_HEAD]:
+        return _colmap(path, text)
     lines = [line for line in text.splitlines() if line.strip() and not _is_comment(line)]
     if not lines:
         raise InputError(f"{path} has no lines with numbers.", "A point cloud was expected.",
@@ -54,6 +57,17 @@ def read_table(path: Path) -> tuple[list[str], list[str], np.ndarray]:
     if len(names) != table.shape[1]:
         names = titles = ["x", "y", "z", *_guessed(table[:, 3:], path.suffix.lower() == ".pts")]
     return names, titles, table
+
+
+def _colmap(path: Path, text: str) -> tuple[list[str], list[str], np.ndarray]:
+    """Columns of COLMAP's points3D.txt, without the images that saw each point: as many as did."""
+    names = ["point3d_id", "x", "y", "z", "red", "green", "blue", "error"]
+    cut = [" ".join(line.split()[:len(names)]) for line in text.splitlines()]
+    lines = [line for line in cut if line and not _is_comment(line)]
+    if not lines:
+        raise InputError(f"{path} has no points.", "A reconstruction of COLMAP was expected.",
+                         "Export it again.")
+    return names, names, _numbers(path, lines, None, "\n".join(cut))
 
 
 def _without_counts(lines: list[str]) -> list[str]:
