@@ -46,6 +46,8 @@ def main(arguments: list[str]) -> int:
     if asked.ci:
         parts.append(provided_blender())
     parts.append(command("style", [BIN / "ruff", "check", "addon", "worker", "tests", "scripts"]))
+    if not others or asked.fast:
+        parts.append(command("types", [BIN / "mypy"]))
     parts.extend(tests(asked.fast, others))
     if asked.ci:
         parts += [command(name, [ROOT / "scripts" / f"test_{name}"]) for name in ("zip", "wheel")]

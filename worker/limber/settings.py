@@ -106,12 +106,13 @@ def _missing(model: type[BaseModel], values: dict[str, Any], names: list[str]) -
     seen, meant, proposed = [], [], []
     for name in names:
         field, flag = model.model_fields[name], _flag(name)
-        extra = field.json_schema_extra or {}
-        short = extra.get("short", flag)
+        declared = field.json_schema_extra
+        extra = declared if isinstance(declared, dict) else {}
+        short = str(extra.get("short", flag))
         seen.append(flag if short == flag else f"{short} ({flag})")
         meant.append(f"{short}: {field.description}" if len(names) > 1 else field.description or "")
         proposed.append(f"{short} " + shlex.quote(
-            extra.get("example", name.upper()).format(stem=stem)))
+            str(extra.get("example", name.upper())).format(stem=stem)))
     what = "option" if len(names) == 1 else "options"
     return InputError(f"Missing {what} {' and '.join(seen)}.", " ".join(meant),
                       f"Add, for example: {' '.join(proposed)}")

@@ -92,7 +92,7 @@ class SampleStream:
             raise ValueError("protocol version 2 refused")
         self.version = struct.unpack(">4I", self._ask(rtde.CONTROL_VERSION, b"", timeout))
         self.rate = 125.0 if self.version[0] <= 3 else 500.0
-        names = _NAMES
+        names: tuple[str, ...] = _NAMES
         if rtde.output_types([_TOOL], self.version) != ["NOT_FOUND"]:
             names = (*_NAMES, _TOOL)
         reply = self._ask(rtde.OUTPUT_SETUP,

@@ -64,9 +64,9 @@ def unlisted(folder: Path, manifest: Manifest) -> list[str]:
     """Return names of files that no stage wrote, without the folder's own hidden ones, sorted."""
     if journal.is_pending(folder):
         # Files that go when the commit is finished were listed all the same.
-        listed = manifest.files.keys() | read_manifest(folder).files.keys()
+        listed = set(manifest.files) | set(read_manifest(folder).files)
     else:
-        listed = manifest.files.keys()
+        listed = set(manifest.files)
     names = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
     return sorted(name.as_posix() for name in names
                   if not name.parts[0].startswith(".") and not is_owned_name(name.name)
