@@ -36,7 +36,6 @@ from limber.planning.resolve import ResolvedPath, resolve_side_by_side
 from limber.planning.search_files import CostToGo
 from limber.planning.timing import DEFAULT_PACE, Pace
 from limber.progress import SILENT, Progress
-from limber.threads import one_thread
 
 _RESERVE = 1.01  # on what limits are tightened by: the risk changes a little with the path
 _OWN = 0.003  # [m] of the surface about a target that does not hide it
@@ -92,7 +91,6 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         NoPathError: no path, or none that keeps the limits on the full model; says why and where.
         ConvergenceError: the branch cannot be solved along the shortest path.
     """
-    one_thread()
     goal = _goal(field, grasp_model, settings, region)
     start = _start(field, goal, settings)
     limits = limits or Limits.of(settings)

@@ -94,7 +94,6 @@ from limber.session.inbox import Inbox, Received, read_commands
 from limber.session.learning import Checked, Learnt
 from limber.session.loading import load_held
 from limber.session.settings import SessionSettings
-from limber.threads import one_thread
 from limber.version import VERSION
 
 _SWITCH_SECONDS = 0.001
@@ -276,14 +275,10 @@ def _outdoors(command: protocol.Weather) -> Outdoors:
 def _steady() -> None:
     """Take away what would hold up a frame now and then.
 
-    Kernels are loaded before the first frame needs them; BLAS keeps to one thread, for a second
-    one waits for the trainer to leave its core; a waiting thread gets the interpreter within a
-    millisecond; garbage collection looks at what is new only.
+    Kernels are loaded before the first frame needs them; a waiting thread gets the interpreter
+    within a millisecond; garbage collection looks at what is new only.
     """
-    import scipy.linalg  # noqa: F401 (its BLAS must be there to be limited)
-
     compile_kernels()
-    one_thread()
     sys.setswitchinterval(_SWITCH_SECONDS)
     gc.collect()
     gc.freeze()

@@ -53,9 +53,7 @@ def run_tetwild(vertices: np.ndarray, faces: np.ndarray, *, edge_length: float, 
                  epsilon=epsilon, stop_energy=stop_energy, coarsen=coarsen)
         command = [sys.executable, "-m", "limber.geometry.tets.tetwild_process", str(source),
                    str(target), str(os.getpid())]
-        # fTetWild uses TBB and OpenMP: one thread each, since a second one gains nothing.
-        environment = os.environ | {"OMP_NUM_THREADS": "1",
-                                    "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         # It also writes a file of its own (__tracked_surface.stl) where it runs.
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                                    stderr=subprocess.PIPE, env=environment, cwd=folder)

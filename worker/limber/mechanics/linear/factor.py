@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from limber.mechanics.linear.fronts import make_fronts, postordered
 from limber.mechanics.linear.supernodal import SupernodalFactor
 from limber.sparse import CholmodFactor, SuperLuFactor, general_factor
-from limber.threads import one_thread
 
 if TYPE_CHECKING:
     from limber.mechanics.linear.pattern import Pattern
@@ -26,11 +25,7 @@ Factor = SupernodalFactor | CholmodFactor | SuperLuFactor
 
 
 def make_factor(pattern: "Pattern") -> Factor:
-    """Return the fastest factor for a pattern that is installed; one thread from now on.
-
-    The pattern's order of elimination has loaded cvxopt, the last of the libraries to limit.
-    """
-    one_thread()
+    """Return the fastest factor for a pattern that is installed."""
     fronts = make_fronts(pattern.node_starts, pattern.node_rows)
     if fronts.flops <= _MOST_FLOPS:
         return SupernodalFactor(fronts)

@@ -36,6 +36,9 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
+# Of the median radius: the grid that each round starts from. A tenth of the step that ends a fit,
+# and far coarser than what libraries round differently.
+_GRID = 5e-6
 _MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
@@ -96,7 +99,12 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
             radii shrink from round to round.
         progress: Called each round.
     """
-    nodes, radius = skeleton.nodes.copy(), skeleton.radius.copy()
+    # Leaves, which lie on no axis, lead a fit astray; then a last digit that differs grows from
+    # round to round until other cylinders are chosen. On a grid it does not outlive its round.
+    grid = 2.0**np.floor(np.log2(_GRID * float(np.median(skeleton.radius))))
+    skeleton = replace(skeleton, nodes=_on_grid(skeleton.nodes, grid),
+                       radius=np.maximum(_on_grid(skeleton.radius, grid), grid))
+    nodes, radius = skeleton.nodes, skeleton.radius
     spread = 0.35 * float(np.median(radius))
     floor = 0.05 * float(np.median(radius))
     near, found_at = None, nodes
@@ -147,6 +155,7 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
         nodes = nodes + step[:, :3] * shrink[:, None]
         radius = radius + np.clip(step[:, 3], -0.4 * radius, 0.8 * radius)
         nodes, radius = _near_start(skeleton, nodes, radius)
+        nodes, radius = _on_grid(nodes, grid), np.maximum(_on_grid(radius, grid), grid)
         progress((number + 1) / rounds, "fitting axes", noise_m=noise)
         if number > rounds // 2 + 1 and size.max() < 1e-3 * floor and spread <= 1.01 * noise:
             break
@@ -164,6 +173,11 @@ def fit_axes(skeleton: Skeleton, points: np.ndarray, *, rounds: int = 12,
     fitted = replace(skeleton, nodes=nodes, radius=np.maximum(radius, 0.1 * floor),
                      radius_sigma=sigma, radius_state=state)
     return AxisFit(fitted, match.segment, match.residual, noise, seen)
+
+
+def _on_grid(values: np.ndarray, grid: float) -> np.ndarray:
+    """Values [m] of any shape, rounded to multiples of ``grid`` [m]."""
+    return np.round(values / grid) * grid
 
 
 def _limit(spread: float, noise: float, trusted: float, radius: np.ndarray) -> np.ndarray:
