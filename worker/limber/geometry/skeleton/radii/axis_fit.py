@@ -36,9 +36,9 @@ from limber.geometry.skeleton.skeleton import INTERPOLATED, MEASURED, Skeleton
 from limber.geometry.skeleton.sweep import resample, tangents
 from limber.progress import SILENT, Progress
 
-# Of the median radius: the grid that each round starts from. A tenth of the step that ends a fit,
+# Of the median radius: the grid that each round starts from. A fifth of the step that ends a fit,
 # and far coarser than what libraries round differently.
-_GRID = 5e-6
+_GRID = 1e-5
 _MOVED = 0.2  # of their radii: nodes that moved less have the same cylinders around each point
 _REACH = 2.0  # how far an axis may move from where the contraction saw it, in its radii
 _SLOPE = 1.0  # smoothing length of the radius against slopes, in local radii
