@@ -14,6 +14,7 @@ from limber.cli import call
 from limber.errors import InputError, MeshingError
 from limber.geometry import reconstruct as reconstruction
 from limber.geometry.cloud.cloud import Cloud
+from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.generated import generate_branch
 from limber.geometry.settings import ReconstructSettings
 from limber.geometry.skeleton.files import read_skeleton, read_swc
@@ -176,14 +177,18 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
         split_off=[{"points": 7, "distance": 0.7 / 3, "at": place}],
         unlikely=[{"length": 1e-9 / 3, "at": place, "probability": 0.3}])
     path = tmp_path / "found.npz"
-    FoundSkeleton(found, leaves_cut=True).write(path)
+    leaves = [Leaf(np.array([40, 3, 7]), 1 / 3), Leaf(np.array([41, 0]), 1 / 7)]
+    FoundSkeleton(found, leaves).write(path)
     read = FoundSkeleton.read(path)
-    assert read.leaves_cut
+    assert [(leaf.points.tolist(), leaf.area) for leaf in read.leaves] == [
+        (leaf.points.tolist(), leaf.area) for leaf in leaves]
     assert plain(asdict(read.result)) == plain(asdict(found))
     arrays = dict(np.load(path))
     for name, value in (("parent", np.arange(6)), ("node_of_point", np.full(40, 6)),
                         ("told", np.array("{}")), ("nodes", np.full((6, 3), np.nan)),
-                        ("nodes", np.zeros((6, 3))), ("radius", np.zeros(6))):
+                        ("nodes", np.zeros((6, 3))), ("radius", np.zeros(6)),
+                        ("leaf_points", np.array([40, 3, 7])),
+                        ("leaf_points", np.array([40, 3, 7, 45, 0]))):
         np.savez(path, **arrays | {name: value})
         with pytest.raises(InputError, match=r"found\.npz"):
             FoundSkeleton.read(path)

@@ -32,12 +32,13 @@ from limber.geometry.tets.tetrahedra import mesh_branch
 from limber.plain import plain
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
+_LEAFY = ("--unexplained", "1", "--leaves", "cut")
 SCANS = (("coffeetree_branch/branch.xyz", ["--unit", "m"]),
          ("aRchi_tree_1/Tree_1.ply", ["--unit", "m", "--leave-out"]),
          ("apple_rgbd/frame_00025.ply", ["--unit", "mm", "--up", "0", "-1", "0"]),
          ("apple_rgbd/frame_00125.ply", ["--unit", "mm", "--up", "0", "-1", "0"]),
-         ("tomato_maize/tomato_03-05.xyz", ["--unit", "mm", "--unexplained", "1"]),
-         ("tomato_maize/maize_03-13.ply", ["--unit", "mm", "--unexplained", "1"]))
+         ("tomato_maize/tomato_03-05.xyz", ["--unit", "mm", *_LEAFY]),
+         ("tomato_maize/maize_03-13.ply", ["--unit", "mm", *_LEAFY]))
 
 
 VIEWS = ("round", "one-sided")

@@ -28,7 +28,7 @@ SCANS = {"coffeetree_branch/branch.xyz": {}, "aRchi_tree_1/Tree_1.ply": {},
 AS_IT_IS = "as it is"
 CHANGES = (AS_IT_IS, "half", "turn", "shuffle", "shift", "unit")
 """What is done to a scan, the most telling first."""
-_LEAFY = {"unexplained": 1.0, "leave_out": True}
+_LEAFY = {"unexplained": 1.0, "leave_out": True, "leaves": "cut"}
 
 
 def changes(cloud: Cloud, settings: dict, seed: int) -> dict[str, tuple[Cloud, dict]]:

@@ -62,4 +62,4 @@ def leafy_case(seed: int) -> ScanCase:
     leaf = leaf + rng.normal(0, 0.0003, leaf.shape)
     on_leaf = np.repeat([False, True], [len(branch.cloud.points), len(leaf)])
     return ScanCase(f"leafy_{seed}", seed, truth, np.vstack([branch.cloud.points, leaf]),
-                    settings={"leave_out": True}, leaf=on_leaf)
+                    settings={"leave_out": True, "leaves": "cut"}, leaf=on_leaf)

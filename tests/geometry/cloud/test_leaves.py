@@ -1,19 +1,22 @@
 """Leaves are told from stems by shape, cut off, and hang on the stems as mass."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from benchmarks.scan_cases import one_sided_case
+from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.files import read_cloud
-from limber.geometry.cloud.leaves import _with_rims, find_leaves
+from limber.geometry.cloud.leaves import Leaf, _with_rims, find_leaves
 from limber.geometry.cloud.preparation import prepare
 from limber.geometry.generated import generate_branch
-from limber.geometry.leafy import without_leaves
-from limber.geometry.reconstruct import _MOSTLY
+from limber.geometry.leafy import check_agreed, without_leaves
+from limber.geometry.reconstruct import _MOSTLY, reconstruct_cloud
 from limber.geometry.settings import ReconstructSettings
+from limber.geometry.skeleton.skeletonise import skeletonise
 from limber.stages.loading import load_point_masses
 from limber.stages.reconstruct import reconstruct
 from limber.stages.skeleton import review_skeleton
@@ -103,7 +106,7 @@ def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> 
     branch, points, on_leaf, area = seedling
     scan, folder = tmp_path / "scan.ply", tmp_path / "a.branch"
     Cloud(points).write_ply(scan)
-    result = reconstruct(scan, folder, ReconstructSettings(leave_out=True))
+    result = reconstruct(scan, folder, ReconstructSettings(leave_out=True, leaves="cut"))
     assert result["length_m"] == pytest.approx(branch.skeleton.length, rel=0.15)
     assert any("leaves" in text and "cut off" in text for text in result["warnings"])
     assert result["leaf_mass_kg"] == pytest.approx(0.2 * area, rel=0.3)
@@ -119,3 +122,94 @@ def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> 
     again = json.loads((folder / "point_masses.json").read_text())
     assert sum(mass["mass_kg"] for mass in again if mass.get("kind") == "leaf") == (
         pytest.approx(result["leaf_mass_kg"]))
+
+
+def test_leaves_are_not_cut_off_unasked(seedling, tmp_path) -> None:
+    """Over a tenth of the points: refused, with the share and a place in the file's coordinates."""
+    _, points, on_leaf, _ = seedling
+    scan = tmp_path / "scan.ply"
+    moved = 1000 * points + [700.0, -300.0, 2000.0]
+    Cloud(moved).write_ply(scan)
+    with pytest.raises(InputError, match=r"--leaves cut.*--leaves keep") as refused:
+        reconstruct(scan, tmp_path / "a.branch", ReconstructSettings(unit="mm"))
+    share, *place = re.search(
+        r"^(\d+) % of the points.*? at \((.*?), (.*?), (.*?)\)", str(refused.value)).groups()
+    assert float(share) == pytest.approx(100 * on_leaf.mean(), abs=10)
+    away = np.linalg.norm(moved[on_leaf] - np.array(place, float), axis=1)
+    assert away.min() < 0.1
+    assert not (tmp_path / "a.branch" / "mesh.vtu").exists()
+
+
+def test_few_leaves_need_no_consent() -> None:
+    """Up to a tenth of the points passes, more does not."""
+    cloud = Cloud(np.random.default_rng(0).random((1000, 3)))
+    prepared = prepare(cloud, 1.0, ReconstructSettings(keep_sheets=True))
+    check_agreed(prepared, [Leaf(np.arange(len(prepared.cloud) // 10), 1e-3)], "m")
+    with pytest.raises(InputError, match="11 % of the points look like 1 leaf"):
+        check_agreed(prepared, [Leaf(np.arange(110), 1e-3)], "m")
+
+
+def _tube(start, end, radius: float, spacing: float, rng: np.random.Generator,
+          view=None) -> np.ndarray:
+    """Points of a round rod [m]; of a ``view`` as many as a sensor there gets off the surface."""
+    start, way = np.array(start, float), np.subtract(end, start).astype(float)
+    length = np.linalg.norm(way)
+    count = int(2 * np.pi * radius * length / spacing**2)
+    along, turn = rng.random((count, 1)), rng.uniform(0, 2 * np.pi, count)
+    first = np.cross(way, [0.3, 1.0, 0.2])
+    first /= np.linalg.norm(first)
+    normal = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * np.cross(way / length, first)
+    points = start + along * way + radius * normal
+    return points if view is None else points[normal @ view > rng.random(count)]
+
+
+def _spray(seed: int, spacing: float) -> np.ndarray:
+    """Twigs that fork in one plane, scanned about as coarsely as they are thick."""
+    rng, parts = np.random.default_rng(seed), []
+
+    def grow(start: np.ndarray, turn: float, length: float, radius: float, forks: int) -> None:
+        end = start + length * np.array([np.cos(turn), 0.05 * rng.normal(), np.sin(turn)])
+        parts.append(_tube(start, end, 0.85 * radius, spacing, rng))
+        for _ in range(3 * (forks > 0)):
+            share, aside = rng.uniform(0.3, 1), rng.choice([-1, 1]) * rng.uniform(0.4, 0.9)
+            grow(start + share * (end - start), turn + aside, length * rng.uniform(0.4, 0.7),
+                 0.6 * radius, forks - 1)
+    grow(np.zeros(3), np.pi / 2, 0.5, 0.01, 3)
+    points = np.vstack(parts)
+    return points + rng.normal(0, 1e-3, points.shape)
+
+
+@pytest.mark.parametrize(("seed", "spacing"), [(3, 0.010), (2, 0.016)])
+def test_twigs_that_fork_in_one_plane_are_no_leaf(seed: int, spacing: float) -> None:
+    """Of these bare branches 40 and 87 % were leaves: a plane of lines is no sheet."""
+    assert find_leaves(_spray(seed, spacing)) == []
+
+
+def test_a_stem_seen_from_one_side_is_no_leaf() -> None:
+    """Its skeleton shows it round, though half of its points lie on a strip that is flat."""
+    rng = np.random.default_rng(0)
+    view = np.array([0.97, 0.1, -0.2])
+    stem = np.vstack([_tube([0, 0, 0], [0.05, 0.1, 3], 0.1, 0.01, rng, view),
+                      _tube([0, 0, 1.8], [0.3, 0.2, 2.0], 0.01, 0.01, rng, view)])
+    stem += rng.normal(0, 3e-3, stem.shape)
+    prepared = prepare(Cloud(stem), 1.0, ReconstructSettings(), up=np.array([0.0, 0.0, 1.0]))
+    assert len(without_leaves(prepared)[1]) > 0
+    found = skeletonise(prepared.cloud.points)
+    assert without_leaves(prepared, found=found)[1] == []
+
+
+@pytest.mark.parametrize("count", [1, 3, 39, 40, 60, 100, 250])
+def test_few_points_are_searched_for_leaves(count: int) -> None:
+    """No point may have a neighbour at the finest scale; it ended in a traceback."""
+    rng = np.random.default_rng(count)
+    flat = rng.random((count, 3)) * [1, 1, 0]
+    for points in (rng.random((count, 3)), flat, np.outer(rng.random(count), [0.2, 0.1, 1.0]),
+                   np.repeat(rng.random((count // 3 + 1, 3)), 3, axis=0)):
+        assert isinstance(find_leaves(points), list)
+
+
+@pytest.mark.parametrize("count", [60, 250])
+def test_a_random_cloud_is_refused_plainly(count: int) -> None:
+    with pytest.raises(InputError):
+        reconstruct_cloud(Cloud(np.random.default_rng(count).random((count, 3))),
+                          ReconstructSettings())

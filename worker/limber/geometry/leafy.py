@@ -6,20 +6,52 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from limber.constants import UNIT_METRES
+from limber.errors import InputError
 from limber.geometry.cloud.leaves import Leaf, find_leaves
 from limber.geometry.cloud.preparation import POINT_MINIMUM, Prepared
-from limber.geometry.skeleton.skeleton import Skeleton
-from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT, thinned
+from limber.geometry.skeleton.skeleton import LIMITED, Skeleton
+from limber.geometry.skeleton.skeletonise import FIT_POINT_LIMIT, SkeletonResult, thinned
+
+UNASKED = 0.1
+"""Share of the points up to which leaves are cut off without the user's consent."""
 
 _LEAST = 0.05  # of the points, that leaves must be to be cut off
+# Of its radius, up to which a point lies on a round axis; a filled blade that a rod was fitted to
+# has a third of its points there.
+_ON_AXIS = 0.15
+_MOST = 0.5  # of a piece's points, that decide
+# Mean of the unit vectors from the axis: of an evenly seen arc of 120 degrees. One view of a stem
+# shows pi/4, since a sensor's points thin out towards the rim; a rod through a blade 0.83 to 0.97.
+_ARC = np.sin(np.pi / 3) / (np.pi / 3)
 
 
-def without_leaves(prepared: Prepared, least: float = _LEAST) -> tuple[Prepared, list[Leaf]]:
-    """Cut the leaves off a prepared scan; all of it and no leaf where they are less than ``least``.
+def without_leaves(prepared: Prepared, least: float = _LEAST, found: SkeletonResult | None = None,
+                   ) -> tuple[Prepared, list[Leaf]]:
+    """Cut the leaves off a prepared scan.
+
+    Args:
+        prepared: The scan.
+        least: Share of the points under which leaves are left in place.
+        found: The skeleton of the whole scan: what its axes show to be round is no leaf.
+
+    Returns:
+        The wood, and the leaves that were cut off.
     """
-    leaves = _leaves_of(prepared.cloud.points)
+    points = prepared.cloud.points
+    leaves = _leaves_of(points)
+    if found is not None and leaves:
+        wood = _on_round_axes(found, points)
+        leaves = [leaf for leaf in leaves if wood[leaf.points].mean() < _MOST]
+    if leaf_mask(leaves, len(points)).mean() < least:
+        return prepared, []
+    return cut_off(prepared, leaves)
+
+
+def cut_off(prepared: Prepared, leaves: list[Leaf]) -> tuple[Prepared, list[Leaf]]:
+    """Return a scan without these leaves, and the leaves; whole and none if too little remains."""
     wood = ~leaf_mask(leaves, len(prepared.cloud))
-    if (~wood).mean() < least or wood.sum() < POINT_MINIMUM:
+    if wood.sum() < POINT_MINIMUM:
         return prepared, []
     return replace(prepared, cloud=prepared.cloud.subset(wood)), leaves
 
@@ -40,6 +72,55 @@ def _leaves_of(points: np.ndarray) -> list[Leaf]:
         leaf_of[leaf.points] = number
     own = leaf_of[cKDTree(points[some]).query(points)[1]]
     return [Leaf(np.flatnonzero(own == number), leaf.area) for number, leaf in enumerate(leaves)]
+
+
+def check_agreed(prepared: Prepared, leaves: list[Leaf], unit: str) -> None:
+    """Refuse to cut off more than ``UNASKED`` of a scan unless its user agreed.
+
+    Args:
+        prepared: The whole scan.
+        leaves: What looks like leaves.
+        unit: Of the file, as the settings name it.
+
+    Raises:
+        InputError: they are more.
+    """
+    share = float(leaf_mask(leaves, len(prepared.cloud)).mean())
+    if share <= UNASKED:
+        return
+    largest = max(leaves, key=lambda leaf: leaf.area)
+    # The median point: the middle of a curled blade lies on no point.
+    blade = prepared.cloud.points[largest.points]
+    nearest = blade[np.argmin(np.linalg.norm(blade - np.median(blade, axis=0), axis=1))]
+    place = (nearest + prepared.origin) / UNIT_METRES[unit]
+    count = f"{len(leaves)} {'leaf' if len(leaves) == 1 else 'leaves'}"
+    raise InputError(
+        f"{100 * share:.0f} % of the points look like {count}, flat and not round; the largest "
+        f"is at ({', '.join(f'{value:.6g}' for value in place)}), "
+        f"{1e4 * largest.area:.3g} cm2.",
+        f"Limber does not cut off more than {100 * UNASKED:.0f} % of a scan without being told "
+        "to: flat wood may look like a leaf.",
+        "If these are leaves, cut them off and keep their mass (--leaves cut). If they are wood, "
+        "keep all points (--leaves keep).")
+
+
+def _on_round_axes(found: SkeletonResult, points: np.ndarray) -> np.ndarray:
+    """Which points [n, 3] lie on an axis whose points show that it is round, shape [n].
+
+    They must lie on its surface, and on enough of its circumference: any narrow strip lies on some
+    cylinder. A radius at its limit was not measured.
+    """
+    skeleton, node = found.skeleton, found.node_of_point
+    axis = skeleton.nodes[node] - skeleton.nodes[skeleton.parent[node]]
+    axis /= np.maximum(np.linalg.norm(axis, axis=1), 1e-300)[:, None]
+    aside = points - skeleton.nodes[node]
+    aside -= np.einsum("ij,ij->i", aside, axis)[:, None] * axis
+    aside /= np.maximum(np.linalg.norm(aside, axis=1), 1e-300)[:, None]
+    count = np.maximum(np.bincount(node, minlength=skeleton.node_count), 1)
+    mean = np.stack([np.bincount(node, column, skeleton.node_count) for column in aside.T], axis=1)
+    is_round = (np.linalg.norm(mean / count[:, None], axis=1) < _ARC) & (
+        skeleton.radius_state != LIMITED)
+    return is_round[node] & (np.abs(found.residual) < _ON_AXIS * skeleton.radius[node])
 
 
 def leaf_mask(leaves: list[Leaf], count: int) -> np.ndarray:
@@ -80,7 +161,8 @@ def leaf_masses(leaves: list[Leaf], points: np.ndarray, skeleton: Skeleton, dens
 
 def leaves_text(masses: list[dict[str, Any]], share: float) -> str:
     """What to tell of leaves that were cut off, ``share`` of the points."""
-    return (f"{len(masses)} leaves ({100 * share:.0f} % of the points, "
+    count = f"{len(masses)} {'leaf' if len(masses) == 1 else 'leaves'}"
+    return (f"{count} ({100 * share:.0f} % of the points, "
             f"{1e4 * sum(m['area_m2'] for m in masses):.0f} cm2) were told from the stems and cut "
             f"off. Their mass, {1e3 * sum(m['mass_kg'] for m in masses):.3g} g, hangs on the stems "
             "(--leaf-density; --leaves keep takes them as wood).")

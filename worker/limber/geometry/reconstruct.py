@@ -12,7 +12,14 @@ from limber.errors import InputError
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.cloud.preparation import Prepared, prepare
-from limber.geometry.leafy import leaf_mask, leaf_masses, leaves_text, without_leaves
+from limber.geometry.leafy import (
+    check_agreed,
+    cut_off,
+    leaf_mask,
+    leaf_masses,
+    leaves_text,
+    without_leaves,
+)
 from limber.geometry.left_out import (
     leave_out_twigs,
     tell_left_out,
@@ -123,7 +130,7 @@ def reconstruct_cloud(raw: Cloud, settings: ReconstructSettings, *, own: Skeleto
             progress.warn(text)
     alignment, cloud, found = _aligned(wood, found, settings)
     if keep is not None and known is None:
-        keep(alignment, found.skeleton, FoundSkeleton(whole, bool(leaves)))
+        keep(alignment, found.skeleton, FoundSkeleton(whole, leaves))
     if own is None:
         check_explained(whole, settings.unexplained)
     # Kept beside the mesh's own, which edits of the skeleton make anew.
@@ -155,27 +162,30 @@ def _searched(prepared: Prepared, settings: ReconstructSettings, own: Skeleton |
               progress: Progress) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
     """The skeleton, the part of the scan that it was found of, and the leaves cut off that."""
     found = _skeleton(prepared, settings, own, progress)
-    if own is not None or settings.leaves != "cut":
+    if own is not None or settings.leaves == "keep":
         return found, prepared, []
     if _may_be_leafy(found, prepared, settings):
-        wood, leaves = without_leaves(prepared)
+        wood, leaves = without_leaves(prepared, found=found)
     elif prepared.view is None:
         # A few fat rods may explain leaves that curl, in few points: what most of a scan is, its
         # shape tells.
-        wood, leaves = without_leaves(prepared, _MOSTLY)
+        wood, leaves = without_leaves(prepared, _MOSTLY, found)
     else:
         return found, prepared, []
+    if settings.leaves == "ask":
+        check_agreed(prepared, leaves, settings.unit)
     return (_skeleton(wood, settings, own, progress.part(0.55, 1.0)), wood, leaves) if leaves else (
         found, prepared, [])
 
 
 def _found_before(prepared: Prepared, known: FoundSkeleton, progress: Progress,
                   ) -> tuple[SkeletonResult, Prepared, list[Leaf]]:
-    wood, leaves = without_leaves(prepared) if known.leaves_cut else (prepared, [])
-    if len(known.result.node_of_point) != len(wood.cloud):
+    cut = sum(len(leaf.points) for leaf in known.leaves)
+    if len(known.result.node_of_point) + cut != len(prepared.cloud):
         raise InputError(f"The skeleton that was found before is of {len(known.result.residual)} "
-                         f"points, the scan has {len(wood.cloud)}.", "It is of another scan.",
-                         "Reconstruct again with --force.")
+                         f"points, the scan has {len(prepared.cloud) - cut}.",
+                         "It is of another scan.", "Reconstruct again with --force.")
+    wood, leaves = cut_off(prepared, known.leaves)
     progress(0.55, "skeleton, as it was found before")
     return known.result, wood, leaves
 

@@ -123,9 +123,10 @@ class ReconstructSettings(PreparationSettings, SkeletonSettings, MeshSettings):
     upright: bool = Field(
         False, description="As in the paper, turn the branch so that it grows along z, and gravity "
         "with it; else the scan's own up stays up.")
-    leaves: Literal["cut", "keep"] = Field(
-        "cut", description="cut: of a scan that would be refused (--unexplained), leaves are told "
-        "from stems by their shape and hang on them as mass; keep: all is taken as wood.")
+    leaves: Literal["ask", "cut", "keep"] = Field(
+        "ask", description="Where much of a scan is flat or lies on no round axis: cut: cut the "
+        "leaves off and hang their mass on the stems; ask: the same, but stop if leaves are over "
+        "10 % of the points; keep: all points are wood.")
     unexplained: float = Field(
         0.3, ge=0, le=1, description="Refuse a scan of whose points a larger share lies on no "
         "round axis (leaves); 1 takes all.")

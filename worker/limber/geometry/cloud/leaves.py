@@ -3,7 +3,9 @@
 Around a point of a leaf the scan is a sheet: wide in two directions, thin in the third. On a stem
 it is so only within a part of the stem's own radius; from there on it is round, or, where one side
 alone was seen, as curved as it is wide, and farther out it is a line. So what is flat and wide
-at one scale, and neither round nor a line at the next ones, is a leaf.
+at one scale, and neither round nor a line at the next ones, is a leaf. Of a scan whose points are
+as far apart as its twigs are thick, twigs that fork in one plane are wide and flat at a scale that
+holds several of them: there each point lies on a line at a finer scale, on a leaf it does not.
 """
 
 from dataclasses import dataclass
@@ -61,8 +63,12 @@ def find_leaves(points: np.ndarray) -> list[Leaf]:
 
 
 def _found(points: np.ndarray) -> list[Leaf]:
+    if len(points) < _SMALLEST:
+        return []
     spacing = float(np.median(cKDTree(points).query(points[::max(1, len(points) // 5000)], k=2)[0][
         :, 1]))
+    if spacing <= 0:
+        return []  # Most points coincide with another: no neighbourhood tells a shape.
     on_leaf = _on_sheets(points, spacing)
     tree = cKDTree(points)
     near = tree.query(points, k=min(16, len(points)))[1]
@@ -105,20 +111,23 @@ def _labels(points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _on_sheets(points: np.ndarray, spacing: float) -> np.ndarray:
     """Which points lie on a sheet, shape [n]."""
-    wide, flat = [], []
+    wide, flat, line = [], [], []
     for step in range(_SCALES + _AFTER):
         scale = _FINEST * spacing * _STEP**step
         chosen = voxel_thinned(points, _CELL * scale)
         values, count = _variances(points[chosen], scale)
         nearest = cKDTree(points[chosen]).query(points)[1]
         told = count >= _LEAST
-        wide.append((told & (values[:, 1] > _WIDE * values[:, 2]))[nearest])
+        broad = values[:, 1] > _WIDE * values[:, 2]
+        wide.append((told & broad)[nearest])
+        line.append((told & ~broad)[nearest])
         flat.append(np.where(told, values[:, 0] / np.maximum(values[:, 1], 1e-300), 1.0)[nearest])
-    wide, flat = np.array(wide), np.array(flat)
+    wide, flat, line = np.array(wide), np.array(flat), np.array(line)
     found = np.zeros(len(points), bool)
     for step in range(_SCALES):
         after = flat[step + 1:step + 1 + _AFTER]
-        found |= wide[step] & (flat[step] < _FLAT) & (after < _CURVED).all(axis=0)
+        sheet = wide[step] & ~line[:step].any(axis=0)
+        found |= sheet & (flat[step] < _FLAT) & (after < _CURVED).all(axis=0)
     return found
 
 
@@ -130,7 +139,8 @@ def _variances(points: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray
     count = 1 + np.bincount(one, minlength=total)
     way = points[other] - points[one]
     first = np.stack([np.bincount(one, way[:, k], total) for k in range(3)], axis=1)
-    first /= count[:, None]
+    # Without a single pair bincount returns integers: no division in place.
+    first = first / count[:, None]
     second = np.empty((total, 3, 3))
     for i in range(3):
         for j in range(i + 1):

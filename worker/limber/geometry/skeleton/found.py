@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from limber.errors import InputError
+from limber.geometry.cloud.leaves import Leaf
 from limber.geometry.skeleton.contraction.laplacian_contraction import (
     Contraction,
     ContractionStatus,
@@ -27,7 +28,8 @@ _SKELETON: dict[str, tuple[int | str, ...]] = {
     "nodes": ("n", 3), "parent": ("n",), "radius": ("n",), "radius_sigma": ("n",),
     "branch": ("n",), "order": ("n",), "radius_state": ("n",), "probability": ("n",)}
 _POINTS: dict[str, tuple[int | str, ...]] = {
-    "node_of_point": ("m",), "residual": ("m",), "contracted": ("c", 3), "linearity": ("c",)}
+    "node_of_point": ("m",), "residual": ("m",), "contracted": ("c", 3), "linearity": ("c",),
+    "leaf_points": ("l",)}
 _Place = tuple[float, float, float]
 
 
@@ -37,11 +39,11 @@ class FoundSkeleton:
 
     Attributes:
         result: What the search came to.
-        leaves_cut: Leaves were cut off first.
+        leaves: What was cut off the prepared cloud first.
     """
 
     result: SkeletonResult
-    leaves_cut: bool
+    leaves: list[Leaf]
 
     def write(self, path: Path) -> None:
         """Write an NPZ file."""
@@ -50,10 +52,12 @@ class FoundSkeleton:
             "noise", "bridges", "split_off", "loops", "pruned", "second_base", "other_root",
             "leafy", "unlikely")} | {
             "iterations": result.contraction.iterations, "status": result.contraction.status,
-            "leaves_cut": self.leaves_cut}
+            "leaves": [{"count": len(leaf.points), "area": leaf.area} for leaf in self.leaves]}
         np.savez(path, told=np.array(json.dumps(plain(told))), **asdict(result.skeleton),
                  node_of_point=result.node_of_point, residual=result.residual,
-                 contracted=result.contraction.points, linearity=result.contraction.linearity)
+                 contracted=result.contraction.points, linearity=result.contraction.linearity,
+                 leaf_points=np.concatenate([np.zeros(0, np.int64), *(
+                     leaf.points for leaf in self.leaves)]))
 
     @classmethod
     def read(cls, path: Path) -> "FoundSkeleton":
@@ -78,7 +82,7 @@ class FoundSkeleton:
             [bridge.found() for bridge in told.bridges],
             [piece.found() for piece in told.split_off], told.loops, told.pruned,
             _place(told.second_base), _place(told.other_root), told.leafy,
-            [twig.found() for twig in told.unlikely]), told.leaves_cut)
+            [twig.found() for twig in told.unlikely]), _leaves(path, arrays, told))
 
 
 class _Part(BaseModel):
@@ -110,6 +114,13 @@ class _Twig(_Part):
     probability: float
 
 
+class _Leaf(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    count: int = Field(ge=1)
+    area: float
+
+
 class _Told(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -124,7 +135,7 @@ class _Told(BaseModel):
     unlikely: list[_Twig]
     iterations: int
     status: ContractionStatus
-    leaves_cut: bool
+    leaves: list[_Leaf]
 
 
 def _told(path: Path, arrays: dict[str, np.ndarray]) -> _Told:
@@ -136,6 +147,17 @@ def _told(path: Path, arrays: dict[str, np.ndarray]) -> _Told:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise _damaged(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}.") from error
+
+
+def _leaves(path: Path, arrays: dict[str, np.ndarray], told: _Told) -> list[Leaf]:
+    points = arrays["leaf_points"]
+    ends = np.cumsum([leaf.count for leaf in told.leaves], dtype=np.int64)
+    total = int(ends[-1]) if len(ends) else 0
+    if len(points) != total or len(np.unique(points)) != total or not _are_below(
+            points, len(arrays["node_of_point"]) + total):
+        raise _damaged(path, "Its leaves are not parts of the scan.")
+    return [Leaf(own, leaf.area) for own, leaf in zip(
+        np.split(points, ends[:-1]), told.leaves, strict=True)] if total else []
 
 
 def _is_tree(parent: np.ndarray) -> bool:
