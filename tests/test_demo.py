@@ -16,9 +16,9 @@ OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 @pytest.fixture
 def stages(monkeypatch):
     """Stages that do nothing: their arguments by name; `fail` names one that finds no way."""
-    seen: dict[str, list[str]] = {"fail": []}
+    seen: dict = {"fail": [], "pull": {"young_true_pa": [1e9]}}
     results = {"estimate": {"young_pa": [1e9], "young_interval_pa": [[9e8, 1.1e9]]},
-               "virtual-pull": {"young_true_pa": [1e9]},
+               "virtual-pull": seen["pull"],
                "plan": {"baseline": {}, "plan": {}, "energy_saved_percent": 1.0,
                         "length_added_percent": 2.0}}
 
@@ -44,6 +44,20 @@ def test_what_is_known_of_a_scan_reaches_the_stages(stages, tmp_path) -> None:
                  "--crop-high 4.0 5.0 6.0"):
         assert part in told
     assert " ".join(stages["plan"]).endswith("--goal 0.1 0.2 0.3")
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_simulated_pull_of_ones_own_scan_is_no_truth(stages, tmp_path, own, capsys) -> None:
+    """Its modulus is assumed, at the top and in the tables; that of a generated branch is true."""
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("0 0 0\n")
+    stages["pull"]["young_assumed"] = own
+    assert cli.call(["demo", *([str(scan)] if own else []), "-o", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr()
+    words = told.out + told.err
+    assert ("nothing is measured of this branch's stiffness" in words) == own
+    assert ("assumed E [MPa]" in words) == own and ("true E [MPa]" in words) != own
+    assert ("hold the true modulus" in words) != own
 
 
 @pytest.mark.parametrize("failing", ["plan", "estimate"])

@@ -11,6 +11,7 @@ from limber.geometry.skeleton.files import write_cylinders
 from limber.geometry.skeleton.skeleton import UNRESOLVED, Skeleton
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.report import swings
+from limber.report.estimate_figures import young_along_branch
 from limber.report.page import draw_page
 from limber.report.tables import (
     cause_rows,
@@ -20,6 +21,7 @@ from limber.report.tables import (
     held_sentence,
     modulus_rows,
 )
+from limber.scene.graphs import young_graph
 from limber.stages.report import write_report
 from limber.store import Branch
 
@@ -122,6 +124,25 @@ def test_a_known_truth_tells_how_far_the_intervals_held():
     rows = modulus_rows(estimate, pull)
     assert [row[-1] for row in rows] == ["in the interval", "yes", "NO", "NO"]
     assert held_sentence(estimate, pull).startswith("1 of 3 ")
+    assert "true E [MPa]" in rows[0] and held_sentence(estimate, pull).endswith("true modulus.")
+
+
+def test_an_assumed_modulus_is_never_called_true():
+    """A simulated pull of a scan that nobody pulled: its modulus is assumed, in every word."""
+    estimate = {"young_pa": [2e6], "young_interval_pa": [[1e6, 4e6]]}
+    pull = {"young_true_pa": [3e6], "young_assumed": True}
+    told = " ".join(modulus_rows(estimate, pull)[0]) + held_sentence(estimate, pull)
+    assert "assumed E [MPa]" in told and "this branch was not pulled" in told
+    assert "true" not in told and "error" not in told
+    curve = {"fractions": [0.2, 0.8], "young_pa": [2e6, 1e6],
+             "young_interval_pa": [[1e6, 3e6], [5e5, 2e6]]}
+    for assumed in (False, True):
+        truth = {"fractions": [0.2, 0.8], "young_pa": [2e6, 1e6], "assumed": assumed}
+        word = "assumed" if assumed else "true"
+        drawn = young_graph(curve | {"truth": truth})
+        assert word in [line["label"] for line in drawn["lines"]]
+        axes = young_along_branch(curve | {"truth": truth}).axes[0]
+        assert word in axes.get_legend_handles_labels()[1]
 
 
 def test_tables_of_what_makes_a_modulus_unsure_and_of_foretold_pulls():

@@ -22,8 +22,8 @@ from limber.options import (
     without_foreign_options,
 )
 
-# Young's modulus [Pa] at the control points for the simulated pull on a scan that comes without
-# a recording: green wood that softens towards the tip.
+# Assumed Young's modulus [Pa] at the control points for the simulated pull on a scan that comes
+# without a recording: green wood that softens towards the tip.
 DEMO_YOUNG = (2.0e9, 1.6e9, 1.2e9, 0.8e9)
 
 # Share of the whole time by which each stage ends, for the bar; measured once, need not be exact.
@@ -89,7 +89,7 @@ _option = functools.partial(click.option, cls=GroupedOption, group="demo")
          help="Where the grasp shall be, in the branch's frame [m]; else a far pose.")
 @_option("--young", default=",".join(f"{value:g}" for value in DEMO_YOUNG),
          show_default=True, metavar="A,B,C,D",
-         help="True Young's modulus [Pa] at the control points of your CLOUD's pull.")
+         help="Assumed Young's modulus [Pa] at the control points of your CLOUD's pull.")
 @_option("--seed", type=int, default=1, show_default=True,
          help="Of the generated branch, the sensor noise and the planner.")
 @_option("--force", is_flag=True, help="Reconstruct again even if nothing has changed.")
@@ -98,7 +98,8 @@ _option = functools.partial(click.option, cls=GroupedOption, group="demo")
 @settings_options(ReconstructSettings, "scan", without=("young",))
 def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed: int, robot: bool,
             **wishes: Any) -> dict[str, Any]:
-    """The whole pipeline on one branch: a generated one with known truth, or your CLOUD."""
+    """The whole pipeline on one branch: a generated one with known truth, or your CLOUD with a
+    simulated pull, whose modulus is assumed."""
     if robot:
         return _closed_loop(run, cloud, output or Path("out") / "robot", seed)
     if cloud is not None and not cloud.is_file():
@@ -112,6 +113,9 @@ def command(run: Run, cloud: Path | None, output: Path | None, young: str, seed:
     _make_folder(demo.folder)
     started = time.perf_counter()
     run.say(f"Limber demo on {cloud or 'a generated branch'}, results in {demo.folder}")
+    if cloud is not None:
+        run.say("The pull is simulated with an assumed Young's modulus (--young): nothing is "
+                "measured of this branch's stiffness.")
     branch, failure = _run_stages(demo, cloud, name, young=young, seed=seed, wishes=wishes)
     _show_tables(demo)
     summary = _summary(demo, branch) | {"demo_seconds": round(time.perf_counter() - started, 1)}

@@ -77,6 +77,7 @@ class _Pull(_Told):
 class _Truth(_Told):
     young_pa: list[_Positive] | None = None
     fractions: list[_Share] | None = None
+    assumed: bool | None = None
 
 
 class _Estimate(_Told):

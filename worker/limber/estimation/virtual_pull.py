@@ -61,6 +61,7 @@ class TrueBranch:
         young: [Pa], shape [K].
         gravity: In the branch's frame [m/s^2].
         is_weightless: Whether it has no weight, whatever the settings ask for.
+        is_assumed: Whether its moduli are assumed: the scan is of a branch that nobody pulled.
     """
 
     mesh: TetMesh
@@ -70,6 +71,7 @@ class TrueBranch:
     young: np.ndarray
     gravity: tuple[float, float, float] = GRAVITY
     is_weightless: bool = False
+    is_assumed: bool = False
 
 
 def true_branch(skeleton: Skeleton, settings: VirtualPullSettings, *,
@@ -191,7 +193,8 @@ def _entry(truth: TrueBranch, settings: VirtualPullSettings, is_weightless: bool
              "density": settings.density, "damping": list(settings.damping),
              "fractions": list(truth.fractions),
              "control_points_m": truth.control_points.tolist(),
-             "tet_count": truth.mesh.tet_count, "seed": settings.seed}
+             "tet_count": truth.mesh.tet_count, "seed": settings.seed,
+             "assumed": truth.is_assumed}
     return PullEntry(
         observation="depth" if settings.camera else "markers",
         drive="force" if settings.weight is not None else settings.drive,

@@ -60,7 +60,7 @@ def young_along_branch(estimate: dict[str, Any]) -> Any:
     truth = estimate.get("truth")
     if truth:
         axes.plot(truth["fractions"], np.array(truth["young_pa"]) / 1e6, "D", ms=7, mfc="none",
-                  color=TRUE, label="true")
+                  color=TRUE, label="assumed" if truth.get("assumed") else "true")
     if young.max() > 5 * young.min() or interval[:, 1].max() > 20 * young.max():
         axes.set_yscale("log")
     else:

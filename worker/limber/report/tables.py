@@ -4,6 +4,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+ASSUMED = ("The modulus of the simulated pull is assumed: this branch was not pulled. The estimate "
+           "shows that the assumed modulus is found again, and nothing about the real branch.")
+
 
 def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
                  ) -> list[list[str]]:
@@ -11,11 +14,13 @@ def modulus_rows(estimate: Mapping[str, Any], pull: Mapping[str, Any] | None,
 
     Args:
         estimate: ``young_pa`` [K] and ``young_interval_pa`` [K][2] [Pa].
-        pull: What ``limber virtual-pull`` returned (``young_true_pa`` [K]), or None.
+        pull: What ``limber virtual-pull`` returned (``young_true_pa`` [K], and ``young_assumed``
+            where these are of a scan that nobody pulled), or None.
     """
     truth = (pull or {}).get("young_true_pa")
     header = ["control point", "E [MPa]", "95 % interval [MPa]"]
-    rows = [[*header, "true E [MPa]", "error", "in the interval"] if truth else header]
+    told = ["assumed E [MPa]", "difference"] if is_assumed(pull) else ["true E [MPa]", "error"]
+    rows = [[*header, *told, "in the interval"] if truth else header]
     for number, young in enumerate(estimate["young_pa"]):
         row = [str(number + 1), _mpa(young), _interval(estimate, number)]
         if truth:
@@ -29,7 +34,13 @@ def held_sentence(estimate: Mapping[str, Any], pull: Mapping[str, Any]) -> str:
     """How many 95 % intervals hold the truth, in words; arguments of :func:`modulus_rows`."""
     truth = pull["young_true_pa"]
     held = sum(_holds(estimate, number, value) for number, value in enumerate(truth))
-    return f"{held} of {len(truth)} intervals of 95 % hold the true modulus."
+    return f"{held} of {len(truth)} intervals of 95 % hold the " + (
+        f"assumed modulus. {ASSUMED}" if is_assumed(pull) else "true modulus.")
+
+
+def is_assumed(pull: Mapping[str, Any] | None) -> bool:
+    """Whether a simulated pull's modulus is assumed, and no truth about the scanned branch."""
+    return bool((pull or {}).get("young_assumed"))
 
 
 def comparison_rows(plan: Mapping[str, Any]) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -32,8 +33,8 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
     """Simulate a pull of a branch and write it as ``pulls/NAME``.
 
     Returns:
-        ``pull``, ``young_true_pa``, ``control_points_m``, ``frame_count``, ``tet_count`` of the
-        truth's mesh, ``peak_force_n``, ``travel_m``.
+        ``pull``, ``young_true_pa``, ``young_assumed``, ``control_points_m``, ``frame_count``,
+        ``tet_count`` of the truth's mesh, ``peak_force_n``, ``travel_m``.
 
     Raises:
         InputError: the branch has no skeleton, or the settings do not fit it.
@@ -64,6 +65,7 @@ def virtual_pull(branch_folder: Path, name: str, settings: VirtualPullSettings, 
         reaction = np.linalg.norm(pull.wrenches[:, :3], axis=1)
         stage.result.update({
             "pull": name, "young_true_pa": truth.young, "control_points_m": truth.control_points,
+            "young_assumed": truth.is_assumed,
             "fractions": truth.fractions, "frame_count": len(pull.times),
             "tet_count": truth.mesh.tet_count, "peak_force_n": reaction.max(),
             "travel_m": np.linalg.norm(pull.poses[:, :3] - pull.poses[0, :3], axis=1).max()})
@@ -86,8 +88,9 @@ def load_truth(branch: Branch, settings: VirtualPullSettings) -> TrueBranch:
         known = {"fractions": tuple(told["fractions"]), "young": told["young_pa"]}
         where = "truth/skeleton.swc"
     body = load_mesh(branch) if _is_meshed_body(branch) else None
-    return true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,
-                       body=body, scan=_scan(branch, settings), **known)
+    found = true_branch(read_swc(branch.path(where)), settings, gravity=branch.gravity,
+                        body=body, scan=_scan(branch, settings), **known)
+    return replace(found, is_assumed=not known)
 
 
 def _scan(branch: Branch, settings: VirtualPullSettings) -> np.ndarray | None:
