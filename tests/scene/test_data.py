@@ -1,7 +1,9 @@
 """What a scene shows, worked out by the core: the order of vertices, averages, scales, refusals."""
 
+import ast
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ from limber.alignment import Alignment
 from limber.errors import BranchFolderError, InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics.frames import node_average
+from limber.report import plan_figures
+from limber.scene.colours import PATH_COLOURS, linear_of
 from limber.scene.data import scene_data
+from limber.scene.graphs import FIRST, SECOND
 from limber.store import Branch
 
 
@@ -461,3 +466,18 @@ def test_the_arm_of_the_dry_run_is_where_its_joints_say(tmp_path, mesh, away):
     np.testing.assert_allclose(links[:, 6], points, atol=1e-7)
     lengths = np.linalg.norm(np.diff(links[:, :7], axis=1), axis=2)
     np.testing.assert_allclose(lengths, np.repeat([np.hypot(arm.a, arm.d)], 5, axis=0), atol=1e-7)
+
+
+def test_paths_have_the_same_colours_everywhere():
+    """In report, scene and graphs the gentle path is red and the shortest one blue."""
+    tree = ast.parse((Path(__file__).parents[2] / "addon/scene.py").read_text(encoding="utf-8"))
+    colors = next(node.value for node in tree.body if isinstance(node, ast.Assign)
+                  and getattr(node.targets[0], "id", "") == "COLORS")
+    shown = dict(zip([key.value for key in colors.keys], colors.values, strict=True))
+    for key, graph, reddest in (("plan", FIRST, True), ("baseline", SECOND, False)):
+        srgb = np.array([int(PATH_COLOURS[key][i:i + 2], 16) for i in (1, 3, 5)]) / 255
+        linear = ast.literal_eval(shown[f"path:{key}"])
+        assert np.allclose(linear_of(srgb), linear, atol=0.01)
+        for colour in (srgb, graph):
+            assert (colour[0] > colour[2]) == reddest
+    assert plan_figures.PATH_COLOURS is PATH_COLOURS

@@ -9,20 +9,23 @@ from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
 from limber.planning.search_files import CostToGo, read_trees
+from limber.scene.colours import PATH_COLOURS
 from limber.store import Branch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = {"baseline": "#c0504d", "plan": "#1f5fa8"}
 _LABELS = {"baseline": "shortest (length alone)", "plan": "gentle (deformation-aware)"}
+_STILL = 1e-9  # [m] a path that is no longer has no length
 _GRID = 160  # points of the slice along its longer side
 
 
 def report_figures(branch: Branch, name: str) -> list[tuple["Figure", str]]:
-    """Return the figures of plan ``name`` with their captions."""
+    """Return the figures of plan ``name`` with their captions; none of one that stays in place."""
     plan = read_plan(branch.path(f"plans/{name}.json"))
+    if plan.summary["plan"]["length_m"] <= _STILL:
+        return []
     field = EnergyField.read(branch.path("energy.npz"))
     shown = [
         (along_paths(plan), "Energy above the hanging state (strain and weight), gripper force and "
@@ -57,10 +60,10 @@ def along_paths(plan: PlanFile) -> "Figure":
     axes = figure.subplots(1, 3)
     for key, path in _ways(plan).items():
         along = 1e3 * arc_lengths(path.poses[:, :3])
-        style = {"color": _COLOURS[key], "label": _LABELS[key]}
+        style = {"color": PATH_COLOURS[key], "label": _LABELS[key]}
         axes[0].plot(along, 1e3 * path.energies, **style)
         if path.field_energies is not None:
-            axes[0].plot(along, 1e3 * path.field_energies, "--", lw=1, color=_COLOURS[key])
+            axes[0].plot(along, 1e3 * path.field_energies, "--", lw=1, color=PATH_COLOURS[key])
         axes[1].plot(along, path.force_sizes, **style)
         axes[2].plot(along, 100 * path.strains, **style)
     for axis, label in zip(axes, ("energy above rest [mJ]", "gripper force [N]",
@@ -168,8 +171,8 @@ class _View:
     def draw_paths(self, axis: "Axes") -> None:
         for key, points in self.paths.items():
             axis.plot(*(1e3 * points.T), color="white", lw=4)
-            axis.plot(*(1e3 * points.T), color=_COLOURS[key], lw=2, label=_LABELS[key])
-            axis.plot(*(1e3 * points[-1]), "o", color=_COLOURS[key], mec="white")
+            axis.plot(*(1e3 * points.T), color=PATH_COLOURS[key], lw=2, label=_LABELS[key])
+            axis.plot(*(1e3 * points[-1]), "o", color=PATH_COLOURS[key], mec="white")
         axis.plot(*(1e3 * self.paths["plan"][0]), "s", color="black", mec="white", label="start")
         axis.plot(*(1e3 * self.rest), "x", color="black", ms=9, mew=2, label="rest pose")
         axis.set(xlim=1e3 * self.x[[0, -1]], ylim=1e3 * self.y[[0, -1]])
@@ -194,7 +197,7 @@ def convergence(plan: PlanFile) -> "Figure":
         if history:
             cost = np.array([entry["cost"] for entry in history])
             axis.plot([entry["iteration"] for entry in history], cost / cost[-1],
-                      color=_COLOURS[key], label=_LABELS[key])
+                      color=PATH_COLOURS[key], label=_LABELS[key])
     axis.set(xlabel="iterations", ylabel="cost / final cost")
     axis.grid(alpha=0.25)
     axis.legend(frameon=False)
@@ -211,10 +214,10 @@ def certificate(plan: PlanFile) -> "Figure":
     spacing = 1e3 * np.array([level["spacing_m"] for level in levels])
     lower, upper = (np.array([level[name] for level in levels], float)
                     for name in ("lower", "upper"))
-    axis.fill_between(spacing, lower, upper, color=_COLOURS["plan"], alpha=0.15,
+    axis.fill_between(spacing, lower, upper, color=PATH_COLOURS["plan"], alpha=0.15,
                       label="the best path lies here")
-    axis.plot(spacing, upper, "o-", color=_COLOURS["plan"], label="best path found")
-    axis.plot(spacing, lower, "o--", color=_COLOURS["plan"], label="no path is cheaper: proven")
+    axis.plot(spacing, upper, "o-", color=PATH_COLOURS["plan"], label="best path found")
+    axis.plot(spacing, lower, "o--", color=PATH_COLOURS["plan"], label="no path is cheaper: proven")
     axis.set(xscale="log", xlabel="cells of the grid [mm]", ylabel="cost", ylim=(0.0, None))
     axis.invert_xaxis()
     axis.set_xticks(spacing, [f"{value:.2g}" for value in spacing])
@@ -241,9 +244,9 @@ def trade_off(plan: PlanFile) -> "Figure":
     # A path that is allowed to be longer may be any shorter one: the curve only falls.
     best = np.minimum.accumulate(energy)
     axis.fill_between(span, floor, np.interp(span, length, best), where=span >= length.min(),
-                      color=_COLOURS["plan"], alpha=0.15, label="the best lies here")
-    axis.plot(span, floor, "--", color=_COLOURS["plan"], lw=1, label="proven bound")
-    axis.plot(length, energy, "o-", color=_COLOURS["plan"], ms=4, label="gentlest found")
+                      color=PATH_COLOURS["plan"], alpha=0.15, label="the best lies here")
+    axis.plot(span, floor, "--", color=PATH_COLOURS["plan"], lw=1, label="proven bound")
+    axis.plot(length, energy, "o-", color=PATH_COLOURS["plan"], ms=4, label="gentlest found")
     axis.axvline(1e3 * detour["longest_m"], color="black", lw=1, ls=":", label="length allowed")
     axis.set(xlabel="length of the path [mm]", ylabel="energy over length [mJ m]", ylim=(0.0, None))
     axis.grid(alpha=0.25)
