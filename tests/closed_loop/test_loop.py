@@ -14,7 +14,7 @@ from limber.closed_loop.watching import Watch
 from limber.commands.robot import _points
 from limber.errors import InputError, NoPathError, SafetyStop, WorkError
 from limber.geometry.skeleton.skeleton import Skeleton
-from limber.planning.planners.gentle import UNPROVEN
+from limber.planning.problem import UNPROVEN
 from limber.progress import Progress
 from limber.robot.arms import arm_named
 from limber.robot.calibration import fit_base

@@ -29,7 +29,8 @@ GOAL = GraspGoal((0.1, 0.06, 0.02), 0.01)
 def problem_on(field, *, start=START, goal=GOAL, deformation=1.0, **limits):
     weights = CostWeights.between(field, start, goal.centre(field), deformation=deformation,
                                   distance=1.5).weights
-    return GentleProblem(field, field.limited(**limits), weights, start, goal)
+    limited = field.limited(**limits)  # the field taken for the branch
+    return GentleProblem(field, limited, weights, start, goal, beyond=limited)
 
 
 @pytest.fixture(scope="module")

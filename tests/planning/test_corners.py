@@ -42,12 +42,14 @@ def bowing_field():
 
 
 def problem_on(field, share):
-    """Across the shell, with a limit of a ``share`` of the force that the end needs."""
+    """Across the shell, with a limit of a ``share`` of the force that the end needs; the field is
+    taken for the branch."""
     ends = field.region.chart.plain.curved(np.array([[-0.08, 0.03, 0.0], [0.06, 0.07, 0.0]]))
     goal = GraspGoal(tuple(ends[1]), 0.004)
     weights = CostWeights.between(field, ends[0], ends[1], deformation=1.0, distance=1.5).weights
     limit = share * np.linalg.norm(field.force(ends), axis=1).max()
-    return GentleProblem(field, field.limited(max_force=limit), weights, ends[0], goal)
+    limited = field.limited(max_force=limit)
+    return GentleProblem(field, limited, weights, ends[0], goal, beyond=limited)
 
 
 def poses_near_the_floor(field, count):
@@ -123,6 +125,7 @@ def test_no_proof_stands_against_a_path(bowing_field):
     path, cost = refine(line, enough)
     assert cost == enough.cost(path) < np.inf
     assert not judge(enough).proven
-    held = replace(enough, limits=enough.limits._replace(max_force=0.9 * np.linalg.norm(
-        bowing_field.force(enough.start[None]))))
-    assert judge(held).proven
+    limited = enough.limits._replace(max_force=0.9 * np.linalg.norm(
+        bowing_field.force(enough.start[None])))
+    assert judge(replace(enough, limits=limited, beyond=limited)).proven
+    assert not judge(replace(enough, limits=limited)).proven, "nothing is known of its error"

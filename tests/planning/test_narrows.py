@@ -44,9 +44,11 @@ def shell_field():
 
 
 def problem_on(field, **limits):
+    """From rest to the goal, the field taken for the branch."""
+    limited = field.limited(**limits)
     weights = CostWeights.between(field, field.rest, GOAL.centre(field), deformation=1.0,
                                   distance=1.5).weights
-    return GentleProblem(field, field.limited(**limits), weights, field.rest.copy(), GOAL)
+    return GentleProblem(field, limited, weights, field.rest.copy(), GOAL, beyond=limited)
 
 
 def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_field):

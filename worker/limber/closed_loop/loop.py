@@ -25,7 +25,7 @@ from limber.geometry.generated import read_truth
 from limber.geometry.skeleton.files import read_swc
 from limber.jobs.process import run_stage
 from limber.plain import plain
-from limber.planning.planners.gentle import UNPROVEN
+from limber.planning.problem import UNPROVEN
 from limber.progress import SILENT, Progress
 from limber.robot.arms import arm_named
 from limber.robot.cell import Cell, read_cell, write_cell

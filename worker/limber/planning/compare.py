@@ -1,6 +1,7 @@
 """Two paths to the same goal region on one field: the shortest, and the gentle one."""
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,17 +20,19 @@ from limber.planning.goals import (
 )
 from limber.planning.limits import UNITS, Limits
 from limber.planning.planners.detour import DetourPath, plan_detour
-from limber.planning.planners.gentle import UNPROVEN, GentlePath, plan_gentle
+from limber.planning.planners.gentle import GentlePath, plan_gentle
 from limber.planning.planners.ompl_engine import ompl_missing
 from limber.planning.planners.refine import refine
 from limber.planning.planners.tree_search import PathProblem, Search
 from limber.planning.planners.trees import FoundPath, found_again, plan_path
-from limber.planning.problem import GentleProblem, NoWayError
+from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
 from limber.planning.settings import PlanSettings
 from limber.progress import SILENT, Progress
 
 _SHARES = (1.0, 0.5, 0.2)  # of the margins that are tried
 _AT_START = 1e-4  # [m] the approach ends that near
+NOTHING_ASKED = "none"
+"""The engine of paths that stay where they are."""
 _ANY = 1e6  # gap: any path will do
 
 
@@ -55,17 +58,24 @@ class PathPair:
     detour: DetourPath | None = None
     trees: dict[str, FoundPath] = field(default_factory=dict)
 
+    @property
+    def stays(self) -> bool:
+        """Whether the start lies in the goal, so that the paths have no length."""
+        return self.plan.engine == NOTHING_ASKED
+
 
 def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-                limits: Limits, *, before: PathPair | None = None, progress: Progress = SILENT,
-                ) -> PathPair:
+                limits: Limits, *, asked: Limits | None = None, before: PathPair | None = None,
+                progress: Progress = SILENT) -> PathPair:
     """Plan both paths within ``limits``, tighter by what the field may be wrong by where it can be.
 
-    ``before`` is what was found until the field learnt: its trees are not grown again where their
-    paths still hold.
+    ``asked`` are the limits before they were tightened for what the field does not know, ``limits``
+    where not given: that no path exists is said of those. ``before`` is what was found until the
+    field learnt: its trees are not grown again where their paths still hold.
 
-    Where no path keeps the margins, one that keeps the limits on the field alone is planned: the
-    full model decides whether it holds. That no path exists is said without margins only.
+    Where no path keeps the margins, one that keeps the limits on the field alone is planned; where
+    none does either, and that proves nothing, one that may keep them on the branch
+    (:meth:`~.limits.Limits.beyond`). The full model decides whether it holds.
 
     Raises:
         InputError: the start is not allowed.
@@ -74,32 +84,61 @@ def plan_within(field: EnergyField, start: np.ndarray, goal: Goal, settings: Pla
     margins = limits.margins(field)
     _check_start(field, start, limits.on(field))
     none = dict.fromkeys(margins, 0.0)
+    surely = (asked or limits).beyond(field)
     # A start near its limit leaves room for a part of the margins only.
     parts = [{name: share * value for name, value in margins.items()} for share in _SHARES]
     parts = [part for part in parts if allowed_points(start[None], limits.on(field, part))[0]]
     if any(margins.values()) and parts:
         try:
             found = plan_pair(field, start, goal, settings, limits.on(field, parts[0]),
-                              before=before, progress=progress.part(0.0, 0.5))
+                              beyond=surely, before=before, progress=progress.part(0.0, 0.5))
             return replace(found, margins=parts[0])
         except NoPathError:
             progress.warn("No path keeps the limits with margins for the error of the energy "
                           f"field ({_told(parts[0])}): planned without; the full model decides.")
-    return replace(plan_pair(field, start, goal, settings, limits.on(field),
-                             before=before, progress=progress.part(0.5, 1.0)), margins=none)
+    try:
+        found = plan_pair(field, start, goal, settings, limits.on(field), beyond=surely,
+                          before=before, progress=progress.part(0.5, 1.0))
+    except NoWayError as error:
+        found = _in_doubt(error, field, start, goal, settings, limits, surely,
+                          before=before, progress=progress.part(0.5, 1.0))
+    return replace(found, margins=none)
+
+
+def _in_doubt(none: NoWayError, field: EnergyField, start: np.ndarray, goal: Goal,
+              settings: PlanSettings, limits: Limits, surely: FieldArrays,
+              **options: Any) -> PathPair:
+    """Return what is planned with as much more than the limits as the field may be wrong by.
+
+    Raises:
+        NoWayError: ``none``, where it is proven, the field is not wrong, or that is of no use.
+    """
+    doubts = limits.doubts(field)
+    if UNPROVEN not in none.seen or not any(doubts.values()):
+        raise none
+    options["progress"].warn(
+        "No path keeps the limits on the energy field, and none is proven away: planned with as "
+        f"much more as its error allows ({_told(doubts)}); the full model decides.")
+    try:
+        return plan_pair(field, start, goal, settings, limits.beyond(field), beyond=surely,
+                         **options)
+    except NoPathError:
+        raise none from None
 
 
 def _told(margins: dict[str, float]) -> str:
-    return ", ".join(f"{name.replace('_', ' ')} {value:.2g} {UNITS[name]}".rstrip()
-                     for name, value in margins.items() if value)
+    return ", ".join(f"{name.replace('_', ' ')} " + (
+        f"{value:.2g} {UNITS[name]}".rstrip() if value < np.inf else "not known")
+        for name, value in margins.items() if value)
 
 
 def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
-              limits: FieldArrays | None = None, *, before: PathPair | None = None,
-              progress: Progress = SILENT) -> PathPair:
+              limits: FieldArrays | None = None, *, beyond: FieldArrays | None = None,
+              before: PathPair | None = None, progress: Progress = SILENT) -> PathPair:
     """Plan both paths under the same limits, and bound the cost of any path from below.
 
-    ``limits`` are those of the settings where not given.
+    ``limits`` are those of the settings where not given; ``beyond`` what the bound counts on
+    (:class:`~.problem.GentleProblem`).
 
     Raises:
         InputError: the start is not allowed.
@@ -107,6 +146,8 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     """
     limits = limits or limits_of(field, settings)
     _check_start(field, start, limits)
+    if goal.distance(field, start[None])[0] <= goal.tolerance:
+        return _staying(field, start, goal, settings, limits, beyond)
     nobody: GoalOverLimitsError | None = None
     try:
         goals = goal_points(goal, field, limits, seed=settings.seed)
@@ -120,7 +161,7 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
     trees = _trees(limits, field, start, goal, goals, settings, weighed,
                    {} if before is None else before.trees,
                    progress.part(0.0, 0.5)) if nobody is None else {}
-    problem = GentleProblem(field, limits, weighed.weights, start, goal)
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
     known = [path.points for path in trees.values()]
     try:
         gentle, detour = _gentle(problem, known, settings, progress.part(0.5, 1.0))
@@ -152,6 +193,18 @@ def plan_pair(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanS
         compared[f"{name}, not smoothed"] = path.raw
     return PathPair(baseline, plan, _approach(problem, settings), weighed, certificate, compared,
                     detour=detour, trees=trees)
+
+
+def _staying(field: EnergyField, start: np.ndarray, goal: Goal, settings: PlanSettings,
+             limits: FieldArrays, beyond: FieldArrays | None) -> PathPair:
+    """Return what is planned where the start lies in the goal: both paths stay there."""
+    weighed = CostWeights.between(field, start, goal.centre(field),
+                                  deformation=settings.deformation_weight,
+                                  distance=settings.distance_weight)
+    problem = GentleProblem(field, limits, weighed.weights, start, goal, beyond=beyond)
+    path = FoundPath(np.stack([start, start]), 0.0, 0.0, engine=NOTHING_ASKED)
+    return PathPair(path, path, _approach(problem, settings), weighed, Certificate(0.0, 0.0),
+                    {"straight line": path.points, "eikonal": path.points})
 
 
 def _gentle(problem: GentleProblem, known: list[np.ndarray], settings: PlanSettings,
@@ -227,7 +280,8 @@ def _approach(problem: GentleProblem, settings: PlanSettings) -> np.ndarray:
     cost = CostWeights.between(field, field.rest, start, distance=settings.distance_weight,
                                deformation=max(settings.deformation_weight, 1.0))
     there = GraspGoal(tuple(map(float, start)), _AT_START)
-    way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there)
+    way = GentleProblem(field, problem.limits, cost.weights, field.rest.copy(), there,
+                        beyond=problem.beyond)
     line = np.linspace(field.rest, start, 40)
     points, least = refine(line, way)
     if not np.isfinite(least):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from limber.errors import InputError
-from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays
+from limber.planning.field.energy_field import LOADS, EnergyField, FieldArrays, GraspSamples
 from limber.planning.obstacles import Obstacle, closeness, closest
 from limber.planning.resolve import SolvedPoses
 from limber.planning.settings import PlanSettings
@@ -142,13 +142,10 @@ class Limits:
 
     def margins(self, known: EnergyField) -> "dict[str, float]":
         """Return how much tighter than asked to plan on a field: by limit, 0 for none asked."""
-        samples = known.samples
         missed = {"energy": known.missed[:, 0],
                   "force": np.linalg.norm(known.missed[:, 1:4], axis=1),
                   **dict(zip(LOADS, known.missed[:, 4:].T, strict=True))}
-        values = {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
-                  **samples.loads}
-        inner = ~known.region.is_face()
+        values, inner = _sampled(known.samples), ~known.region.is_face()
         found = dict.fromkeys(UNITS, 0.0)
         for name, limit in self.asked().items():
             if values[name] is None:
@@ -159,8 +156,34 @@ class Limits:
             near = inner & (size > _NEAR[0] * limit) & (size < _NEAR[1] * limit)
             near = near if near.sum() >= _FEWEST else inner
             off = np.quantile(np.abs(missed[name][near]), _COVERED)
-            found[name] = min(float(off), _MOST * limit)
+            found[name] = min(float(off), _MOST * limit) if off < np.inf else _MOST * limit
         return found
+
+    def doubts(self, known: EnergyField) -> "dict[str, float]":
+        """Return by how much more than a limit the field may say of a pose that keeps it: by
+        limit, 0 for none asked, infinite where the field's error is not known.
+
+        The most that the field, fitted without it, says too much of a sample that keeps the limit
+        or is not far over it. A proof that no path keeps the limits counts on that: margins, which
+        most poses keep, would do for a plan that is checked afterwards, and for no proof.
+        """
+        found = dict.fromkeys(UNITS, 0.0)
+        inner, values = ~known.region.is_face(), _sampled(known.samples)
+        above = _above(known)
+        for name, limit in self.asked().items():
+            size, more = values[name], above[name]
+            if size is None:
+                found[name] = np.inf
+                continue
+            sure = inner & np.isfinite(more)
+            near = sure & (np.abs(size) < _NEAR[1] * limit)
+            near = near if near.sum() >= _FEWEST else sure
+            found[name] = float(more[near].max(initial=0.0)) if near.any() else np.inf
+        return found
+
+    def beyond(self, known: EnergyField) -> FieldArrays:
+        """Return the field with limits that it exceeds only where the branch exceeds these."""
+        return self.on(known, {name: -more for name, more in self.doubts(known).items()})
 
     def on(self, known: EnergyField, margins: dict[str, float] | None = None) -> FieldArrays:
         """Return the field with these limits for compiled loops, tighter by ``margins``."""
@@ -186,6 +209,24 @@ class Limits:
         return (np.logical_and.reduce(within)
                 & (places >= self.low - 1e-6).all(axis=1)
                 & (places <= self.high + 1e-6).all(axis=1))
+
+
+def _sampled(samples: GraspSamples) -> "dict[str, np.ndarray | None]":
+    """Return what limits are on at samples, by the names of ``UNITS``, shape [m] each."""
+    return {"energy": samples.energies, "force": np.linalg.norm(samples.forces, axis=1),
+            **samples.loads}
+
+
+def _above(known: EnergyField) -> dict[str, np.ndarray]:
+    """Return by how much the field, fitted without it, says too much of each sample, by the names
+    of ``UNITS``, shape [m] each; nan where that is not known."""
+    samples, missed = known.samples, known.missed
+    size = np.linalg.norm(samples.forces, axis=1)
+    above = {"energy": missed[:, 0],
+             "force": np.linalg.norm(samples.forces + missed[:, 1:4], axis=1) - size}
+    table = samples.load_table
+    more = np.abs(table + missed[:, 4:]) - np.abs(table)
+    return above | dict(zip(LOADS, more.T, strict=True))
 
 
 def with_unit(name: str) -> str:

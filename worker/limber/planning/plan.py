@@ -39,6 +39,8 @@ from limber.progress import SILENT, Progress
 
 _RESERVE = 1.01  # on what limits are tightened by: the risk changes a little with the path
 _OWN = 0.003  # [m] of the surface about a target that does not hide it
+_CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
+_STILL = 1e-9  # [m] a path that is no longer has no length
 _WIDE_GAP = 5.0  # percent, above which the user is told in a warning
 
 
@@ -107,8 +109,9 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
         began = perf_counter()
         is_last = number == settings.replans
         try:
-            before, pair = pair, plan_within(field, start, aim, settings, planned_limits,
-                                             before=pair, progress=ahead.part(0.0, 0.3))
+            before, pair = pair, plan_within(
+                field, start, aim, settings, planned_limits, asked=limits, before=pair,
+                progress=ahead.part(0.0, 0.3))
         except NoWayError as none:
             doubt_there = None if is_last else asked_in_doubt(
                 field, grasp_model, start, aim, planned_limits, ahead.part(0.3, 1.0))
@@ -143,7 +146,7 @@ def plan_motion(field: EnergyField, grasp_model: GraspModel, settings: PlanSetti
                 {name: _RESERVE * share for name, share in risks[-1].excess.items() if share > 1.0})
         off = field_error(field, plan.solved)
         is_last = is_last or stopped
-        is_near = is_last or off <= settings.field_error / 100.0
+        is_near = is_last or pair.stays or off <= settings.field_error / 100.0
         if settings.inertia and not broken and is_near and limits.asked():
             moving = check_motion(
                 grasp_model, plan, limits if not risks else risks[-1].left(limits, plan), pace,
@@ -292,7 +295,7 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
         "start_m": start, "seed": settings.seed, "planner": settings.planner,
         "engine": chosen_engine(settings.engine),
         "certificate": pair.certificate.describe() | {"full_model": _on_full_model(
-            field, pair, after)},
+            field, goal, pair, after)},
         "paths_on_field": {name: asdict(_on_field(field, points)) | {
             "peak_strain": float(np.abs(field.load(resample(points, STEP), "strain")).max())}
             for name, points in pair.compared.items()},
@@ -306,27 +309,33 @@ def _summary(field: EnergyField, goal: Goal, start: np.ndarray, pair: PathPair,
         "is the potential of strain and weight, and the gripper's force is its gradient",
         "baseline": asdict(before) | _checked(field, baseline),
         "plan": asdict(after) | _checked(field, plan),
-        "energy_saved_percent": _change(before.energy_integral_jm, after.energy_integral_jm, -1),
-        "peak_energy_saved_percent": _change(before.peak_energy_j, after.peak_energy_j, -1),
-        "length_added_percent": _change(before.length_m, after.length_m, 1),
+        **(dict.fromkeys(_CHANGES) if pair.stays else dict(zip(_CHANGES, (
+            _change(before.energy_integral_jm, after.energy_integral_jm, -1),
+            _change(before.peak_energy_j, after.peak_energy_j, -1),
+            _change(before.length_m, after.length_m, 1)), strict=True))),
         "convergence": {"baseline": pair.baseline.history, "plan": pair.plan.history},
     }
 
 
-def _on_full_model(field: EnergyField, pair: PathPair, found: PathMeasures) -> dict[str, Any]:
+def _on_full_model(field: EnergyField, goal: Goal, pair: PathPair, found: PathMeasures,
+                   ) -> dict[str, Any]:
     """Return what the bound says of every branch whose energy is nowhere farther below the field's
     than 95 % of the samples were, each left out in turn, and how far above that the plan is.
 
     With c = w E + l and E less an error e, but not below 0, c is nowhere less than l / (l + w e) of
-    what it was, and so is the bound.
+    what it was, and so is the bound. Of a goal for a target it says nothing: where the target is
+    the field does not know well enough.
     """
     weights = pair.cost.weights
     cheap = field.samples.energies <= 1.5 * max(found.peak_energy_j, 1e-12)
     missed = np.abs(field.missed[cheap & ~field.region.is_face(), 0])
     error = float(np.quantile(missed, 0.95)) if len(missed) else float(
         np.abs(field.missed[:, 0]).max())
-    lower = pair.certificate.lower * weights.length / (weights.length + weights.energy * error)
     cost = weights.energy * found.energy_integral_jm + weights.length * found.length_m
+    if not np.isfinite(error) or goal.doubt(field) > 0.0:
+        return {"field_error_j": error if np.isfinite(error) else None, "lower_bound": None,
+                "cost": cost, "gap_percent": None}
+    lower = pair.certificate.lower * weights.length / (weights.length + weights.energy * error)
     return {"field_error_j": error, "lower_bound": lower, "cost": cost,
             "gap_percent": 100.0 * (cost / lower - 1.0) if lower > 0.0 else None}
 
@@ -353,6 +362,9 @@ def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
 
 
 def _doubts(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
+    if summary["plan"]["length_m"] <= _STILL:
+        return ["The start lies in the goal already: the path has no length, and there is nothing "
+                "to save."]
     doubts = []
     for key, label, most in (("baseline", "shortest", 15.0), ("plan", "gentle", field_error)):
         error = 100.0 * summary[key]["field_energy_error"]

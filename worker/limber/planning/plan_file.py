@@ -104,7 +104,7 @@ class PlanGoal(_Told):
 class PlanBranchBound(_Told):
     """The same on the full model."""
 
-    field_error_j: float
+    field_error_j: float | None = None
     gap_percent: float | None = None
 
 

@@ -12,6 +12,10 @@ from limber.planning.goals import Goal
 _FINE = 0.001  # [m] spacing at which a finished path is costed and its validity checked
 
 
+UNPROVEN = "nor is it proven that none exists"
+"""Of what is said without a path: more samples may show one. Across processes the words tell."""
+
+
 class NoWayError(NoPathError):
     """No path from the start to the goal keeps the limits on the field: proven, or none found."""
 
@@ -23,6 +27,10 @@ class GentleProblem:
     ``weights`` are the cost of an edge. ``field_error`` [J] is subtracted from the energy where a
     lower bound is asked for, so that it holds for every branch whose energy lies that near. No path
     may be longer than ``longest`` [m]; bounds do without that limit, and hold with it as well.
+
+    ``beyond`` are limits that the field exceeds only where the branch exceeds those that were
+    asked for (:meth:`~limber.planning.limits.Limits.beyond`). Bounds and proofs count on them
+    alone; without them no limit proves anything.
     """
 
     energy_field: EnergyField
@@ -32,6 +40,15 @@ class GentleProblem:
     goal: Goal
     field_error: float = 0.0
     longest: float = np.inf
+    beyond: FieldArrays | None = None
+
+    @property
+    def sure_limits(self) -> FieldArrays:
+        """The limits ``beyond`` which a pose surely is not allowed; infinite where unknown."""
+        if self.beyond is not None:
+            return self.beyond
+        return self.limits._replace(max_energy=np.inf, max_force=np.inf, max_loads=np.full(
+            len(LOADS), np.inf))
 
     def cost(self, path: np.ndarray) -> float:
         """Return the cost of a polyline [n, 3]; infinite if it breaks a limit, is too long or
@@ -50,21 +67,37 @@ class GentleProblem:
 
     def limits_in_words(self) -> str:
         """Return the limits that there are, or an empty string."""
-        limits = self.limits
-        kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
-            ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
-            *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
-                 ("", "Pa", "N", "Nm", "(1: it touches)"), strict=True)) if value < np.inf]
-        return (" at most " + " and ".join(kept)) if kept else ""
+        return _in_words(self.limits)
 
     def goal_excess(self, point: np.ndarray) -> float:
         """Return how far ``point`` [3] is outside the goal region [m], negative inside."""
         return float(self.goal.distance(self.energy_field, point[None])[0]) - self.goal.tolerance
 
 
+def _in_words(limits: FieldArrays) -> str:
+    kept = [f"{name} {value:.3g} {unit}".rstrip() for name, value, unit in (
+        ("energy", limits.max_energy, "J"), ("force", limits.max_force, "N"),
+        *zip([name.replace("_", " ") for name in LOADS], limits.max_loads,
+             ("", "Pa", "N", "Nm", "(1: it touches)"), strict=True)) if value < np.inf]
+    return (" at most " + " and ".join(kept)) if kept else ""
+
+
 def no_way(problem: GentleProblem, proof: str) -> NoWayError:
     """Return what is said where no path exists, and how that is proven."""
+    counted = _in_words(problem.sure_limits)
+    if counted:
+        proof += (" The largest error of the energy field on samples left out is counted: none "
+                  f"leads there with{counted} on the field either.")
     return NoWayError(
-        f"No path exists: with{problem.limits_in_words() or ' poses that the branch accepts'} no "
+        "No path exists in the sampled region: with"
+        f"{problem.limits_in_words() or ' poses that the branch accepts'} no "
         "way leads from the start to the goal.", proof,
         "Raise the limit, choose another goal, or sample farther (`limber energy --deflection`).")
+
+
+def not_found(problem: GentleProblem, why: str) -> NoWayError:
+    """Return what is said where no path was found, and ``why`` that proves nothing."""
+    return NoWayError(
+        f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} "
+        f"was found, {UNPROVEN}.", why,
+        "Loosen the limits a little, or sample more poses with `limber energy --samples`.")

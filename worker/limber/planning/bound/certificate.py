@@ -7,8 +7,9 @@ its first axis runs from the start to the goal, and refined where a better path 
 could still run: a cell through which even the bounds say no path is as cheap drops out, and what
 is left is a thin tube.
 
-Limits: a cell where motion is surely not allowed is closed; a cell in doubt stays open, so the
-bound stays one. If closed cells separate start and goal, that proves that no path exists.
+Limits: a cell where motion is surely not allowed, the field's error counted, is closed; a cell in
+doubt stays open, so the bound stays one. If closed cells separate start and goal, that proves that
+no path exists.
 """
 
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from limber.planning.bound.subsolution import (
     widened,
 )
 from limber.planning.field.energy_field import LOADS
-from limber.planning.problem import GentleProblem, NoWayError, no_way
+from limber.planning.problem import GentleProblem, NoWayError, no_way, not_found
 from limber.planning.search_files import CostToGo
 from limber.progress import SILENT, Progress
 
@@ -53,7 +54,8 @@ class Certificate:
     """A lower bound and how it was reached.
 
     Attributes:
-        lower: No path to the goal costs less.
+        lower: No path that keeps the limits, on the field or on the branch, costs less to where
+            the goal is on the field.
         upper: Cost of the best path known, infinite without one.
         levels: For each grid ``spacing_m``, ``open_cells``, ``lower``, ``upper`` and when [s].
         field_error_j: What was subtracted from the energy before bounding [J].
@@ -71,6 +73,8 @@ class Certificate:
     @property
     def gap(self) -> float:
         """How far above the best the known path can be at most: upper / lower - 1."""
+        if self.upper == 0.0:
+            return 0.0
         return self.upper / self.lower - 1.0 if self.lower > 0.0 else np.inf
 
     def describe(self) -> dict:
@@ -217,6 +221,9 @@ def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
     ground = terrain(rate, slopes, raw > 0.0, open_cells, grid.spacing, problem.weights.length)
     goal = _about_goal(problem, grid, ground)
     if not goal.meets:
+        if problem.goal.doubt(problem.energy_field) > 0.0:
+            raise not_found(problem, f"On a grid of {1e3 * grid.spacing:.1f} mm it is out of reach "
+                            "by less than the energy field may be wrong by.")
         raise _separated(problem, grid, open_cells)
     to_goal, factor = subsolution(ground, goal.known, goal.cost, goal.inside)
     slack = factor * goal.slack
@@ -337,9 +344,9 @@ def _surely_outside(problem: GentleProblem, grid: _Grid) -> np.ndarray:
 
 def _surely_over(problem: GentleProblem, grid: _Grid, cells: np.ndarray, energy: np.ndarray,
                  force: np.ndarray) -> np.ndarray:
-    """Return those of ``cells`` in which no point keeps the limits; ``energy`` and ``force`` at
-    their corners and next to them."""
-    limits, field, over = problem.limits, problem.energy_field, np.zeros(cells.shape, bool)
+    """Return those of ``cells`` in which no point keeps the limits, the field's error counted;
+    ``energy`` and ``force`` at their corners and next to them."""
+    limits, field, over = problem.sure_limits, problem.energy_field, np.zeros(cells.shape, bool)
     if limits.max_energy < np.inf:
         over |= least_between(energy, grid.along_edges(force), cells) > (
             limits.max_energy + problem.field_error)

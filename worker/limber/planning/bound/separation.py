@@ -8,7 +8,9 @@ hold a point of the goal, no path does. If cells that keep all limits at their c
 mostly is one.
 
 What a limit is on is at least in a cell what its values and slopes at the corners say
-(:mod:`limber.planning.bound.corners`).
+(:mod:`limber.planning.bound.corners`). That is said of the field. The branch itself may keep a
+limit where the field does not: for a proof a cell is closed only where the field is over the limit
+by more than its error, and may hold a point of the goal where a target is as near as its error.
 """
 
 from collections.abc import Iterator
@@ -21,7 +23,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from limber.planning.bound.corners import CURVATURE_FACTOR, off_zero
 from limber.planning.cost import resample
 from limber.planning.field.chart import Chart
-from limber.planning.field.energy_field import LOADS
+from limber.planning.field.energy_field import LOADS, FieldArrays
 from limber.planning.field.trust import nearest_of
 from limber.planning.goals import allowed_points
 from limber.planning.problem import GentleProblem
@@ -137,18 +139,26 @@ class Verdict:
 
 
 def judge(problem: GentleProblem) -> Verdict:
-    """Cut cells until they prove that no path exists or a way leads by them, or there are too many.
-    """
+    """Return a way on the field, or whether it is proven that the branch has none."""
+    on_field = _judged(problem, problem.limits, 0.0)
+    if not on_field.proven:
+        return on_field
+    return _judged(problem, problem.sure_limits, problem.goal.doubt(problem.energy_field))
+
+
+def _judged(problem: GentleProblem, limits: FieldArrays, goal_doubt: float) -> Verdict:
+    """Cut cells until they prove that no path keeps ``limits`` and comes as near as ``goal_doubt``
+    [m] to the goal, or a way leads by them, or there are too many."""
     cells = _first(problem)
     while True:
         cells = cells.take(~_surely_outside(cells))
         positions, nodes = cells.nodes()
-        over, doubt = _surely_over(cells, positions, nodes)
+        over, doubt = _surely_over(cells, limits, positions, nodes)
         begin = cells.holding(problem.start)
         away = problem.goal.distance(problem.energy_field, positions)[nodes]
         least, bends = _least(away)
         tolerance = problem.goal.tolerance
-        ends = ~over & (least <= tolerance)
+        ends = ~over & (least <= tolerance + goal_doubt)
         kept = allowed_points(positions, problem.limits)[nodes]
         open_cells = np.flatnonzero(~over | begin)
         cells, begin, ends = cells.take(open_cells), begin[open_cells], ends[open_cells]
@@ -205,17 +215,17 @@ def _surely_outside(cells: _Cells) -> np.ndarray:
     return outside
 
 
-def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
+def _surely_over(cells: _Cells, limits: FieldArrays, positions: np.ndarray, nodes: np.ndarray,
                  ) -> tuple[np.ndarray, np.ndarray]:
-    """Return in which cells no point keeps the limits, bool [n], and how much in doubt each axis
+    """Return in which cells no point keeps ``limits``, bool [n], and how much in doubt each axis
     leaves that, [n, 3]; ``nodes`` [n, 32] are the numbers of each cell's ``positions`` [m, 3]."""
     over, doubt = np.zeros(len(nodes), bool), np.zeros((len(nodes), 3))
-    for values, slopes, limit in _limited(cells.problem, positions):
+    for values, slopes, limit in _limited(cells.problem, limits, positions):
         along = cells.chart.push_forward(positions, slopes) * cells.edges
         least, bends = _least(values[nodes], along[nodes])
         over |= least > limit
         doubt = np.maximum(doubt, bends / limit)
-    limit = cells.problem.limits.max_force
+    limit = limits.max_force
     if limit < np.inf:
         force = cells.problem.energy_field.force(positions)[nodes]
         bends = _bends(force)
@@ -228,11 +238,11 @@ def _surely_over(cells: _Cells, positions: np.ndarray, nodes: np.ndarray,
     return over, doubt
 
 
-def _limited(problem: GentleProblem, positions: np.ndarray,
+def _limited(problem: GentleProblem, limits: FieldArrays, positions: np.ndarray,
              ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
     """Yield what is limited at ``positions`` [m, 3] besides the force, smooth, shape [m], its slope
     to the position, [m, 3], and its limit."""
-    field, limits = problem.energy_field, problem.limits
+    field = problem.energy_field
     if limits.max_energy < np.inf:
         yield (field.energy(positions), field.force(positions),
                limits.max_energy + problem.field_error)

@@ -46,7 +46,7 @@ _SMOOTHING = 1e-6  # of the scaled system; more blurs the valley, less invites r
 _CHOSEN_BY = ("energy_error_median", "energy_error_most", "force_error_median", "force_error_most")
 _MOST = 0.95  # of the samples are no farther off
 _MOST_TIPS = 0.9  # likewise; what is beyond lies where the branch may go aside either way
-_OPTIONAL = {"targets": "targets_m", "torques": "torques_nm",
+_OPTIONAL = {"strains": "strains", "targets": "targets_m", "torques": "torques_nm",
              "strain_places": "strain_places_m", "stresses": "stresses_pa",
              "shape_slopes": "shape_slopes", "axial_forces": "axial_forces_n", "reduced": "reduced"}
 LOADS = ("strain", "stress", "axial_force", "torque", "closeness")
@@ -59,7 +59,7 @@ _SHAPES = {"poses": ("m", 6), "energies_j": ("m",), "forces_n": ("m", 3), "tips_
 _OPTIONAL_SHAPES = {
     "strains": ("m",), "targets_m": ("m", "t", 3), "torques_nm": ("m", 3),
     "strain_places_m": ("m", 3), "stresses_pa": ("m",), "shape_slopes": ("m", 3, "s"),
-    "axial_forces_n": ("m",), "reduced": ("m",),
+    "axial_forces_n": ("m",), "reduced": ("m",), "left_out_place_errors_m": ("m", "places"),
     "rest_pose": (6,), "chart_pivot_m": (3,), "chart_radius_m": (), "energy_error": (),
     "force_error": (),
     **{f"{fit}_{name}": shape for fit in ("energy_fit", "shape_fit", "load_fit")
@@ -104,7 +104,7 @@ class GraspSamples:
     tips: np.ndarray
     min_det_f: np.ndarray
     rejected_poses: np.ndarray
-    strains: np.ndarray
+    strains: np.ndarray | None
     targets: np.ndarray | None = None
     torques: np.ndarray | None = None
     strain_places: np.ndarray | None = None
@@ -181,7 +181,10 @@ class EnergyField:
         load_fit: Channels: those of ``LOADS``.
         region: Where the field may be believed.
         errors: On samples left out; see :func:`error_measures`.
-        missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 9].
+        missed: There, prediction less truth of energy [J], force [N] and loads, shape [m, 9]; nan
+            where it is not known.
+        misplaced: There, distance of the predicted tip and targets from the true ones [m], shape
+            [m, 1 + targets]; nan where it is not known.
     """
 
     samples: GraspSamples
@@ -193,6 +196,7 @@ class EnergyField:
     region: TrustRegion
     errors: dict[str, float]
     missed: np.ndarray
+    misplaced: np.ndarray
 
     @property
     def rest(self) -> np.ndarray:
@@ -221,6 +225,16 @@ class EnergyField:
         """
         first = 3 if target is None else 6 + 3 * target
         return self._value(self.shape_fit, points, slice(first, first + 3), True)
+
+    def place_error(self, target: int | None = None) -> float:
+        """Return how far the tip, or a target, may be from where the field has it [m].
+
+        The largest distance at samples left out, inside the samples' hull; infinite where none is
+        known.
+        """
+        off = self.misplaced[~self.region.is_face(), 0 if target is None else 1 + target]
+        return float(np.max(off, where=np.isfinite(off), initial=0.0)) if (
+            np.isfinite(off).any()) else np.inf
 
     def tip_gradient(self, points: np.ndarray, target: int | None = None) -> np.ndarray:
         """Return d tip_c / d x_k, shape [n, 3 (k), 3 (c)]."""
@@ -266,8 +280,8 @@ class EnergyField:
         arrays = {
             "poses": samples.poses, "energies_j": samples.energies,
             "forces_n": samples.forces, "tips_m": samples.tips, "min_det_f": samples.min_det_f,
-            "strains": samples.strains, "rejected_poses": samples.rejected_poses,
-            "left_out_errors": self.missed,
+            "rejected_poses": samples.rejected_poses,
+            "left_out_errors": self.missed, "left_out_place_errors_m": self.misplaced,
             "chart_pivot_m": self.chart.pivot, "chart_radius_m": np.array(self.chart.radius),
             "chart_layers": np.array([[chart.stretch, chart.depth]
                                       for chart in (self.chart, self.shape_chart)]),
@@ -301,8 +315,6 @@ class EnergyField:
             samples = GraspSamples(
                 arrays["poses"], arrays["energies_j"], arrays["forces_n"], arrays["tips_m"],
                 arrays["min_det_f"], arrays["rejected_poses"],
-                # Older programs knew no strain: 1 everywhere, which no limit allows.
-                arrays.get("strains", np.ones(len(arrays["poses"]))),
                 **{name: arrays.get(stored) for name, stored in _OPTIONAL.items()})
             if "chart_layers" not in arrays:  # of an older program
                 return fit_field(samples, arrays["chart_base_m"])
@@ -316,14 +328,14 @@ class EnergyField:
                 raise ValueError("two charts are needed")
             charts = [replace(region.chart, stretch=float(stretch), depth=float(depth))
                       for stretch, depth in arrays["chart_layers"]]
-            missed = arrays["left_out_errors"]
+            missed, misplaced = _errors_in(arrays, samples)
             errors = dict(zip(arrays["error_names"].tolist(), arrays["error_values"].tolist(),
                               strict=True))
         except (KeyError, ValueError, OSError, TypeError) as error:
             raise InputError(f"{path} is not an energy field ({error}).",
                              "It was not written by `limber energy`, or is damaged.",
                              "Run `limber energy` again with --force.") from error
-        return cls(samples, *charts, *fits, region, errors, missed)
+        return cls(samples, *charts, *fits, region, errors, missed, misplaced)
 
 
 def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: float | None = None,
@@ -360,7 +372,7 @@ def fit_field(samples: GraspSamples, base: np.ndarray | None = None, radius: flo
         return float(np.prod([errors[name] for name in _CHOSEN_BY]))
 
     def shape_missed(choice: FitChoice) -> float:
-        size = np.linalg.norm(_tips_missed(bending, choice, chart)[inside], axis=1)
+        size = _misplaced(bending, choice, chart)[inside, 0]
         return float(np.median(size) * np.quantile(size, _MOST_TIPS))
 
     choice = _least(energy_missed, charts, progress.part(0.0, 0.5))
@@ -385,13 +397,32 @@ def _least(missed: Callable[[FitChoice], float], charts: Sequence[tuple[float, f
     return best[0]
 
 
-def _tips_missed(samples: GraspSamples, choice: FitChoice, chart: Chart) -> np.ndarray:
-    """Return how far each sample's tip is off in the fit to all the others [m], shape [m, 3]."""
+def _errors_in(arrays: dict[str, np.ndarray], samples: GraspSamples,
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``missed`` and ``misplaced`` as a file has them; nan for what it does not have."""
+    places = 1 + (0 if samples.targets is None else samples.targets.shape[1])
+    found = []
+    for name, columns in (("left_out_errors", 4 + len(LOADS)), ("left_out_place_errors_m", places)):
+        whole = np.full((len(samples.poses), columns), np.nan)
+        known = arrays.get(name, np.empty((len(whole), 0)))
+        if known.ndim != 2 or len(known) != len(whole) or known.shape[1] > columns:
+            raise ValueError(f"{name} does not fit the poses")
+        whole[:, :known.shape[1]] = known
+        found.append(whole)
+    return found[0], found[1]
+
+
+def _misplaced(samples: GraspSamples, choice: FitChoice, chart: Chart, channels: slice = slice(3),
+               ) -> np.ndarray:
+    """Return how far each sample's tip is off in the fit to all the others [m], and its targets
+    with more ``channels`` than those of the tip, shape [m, channels / 3]."""
     chart = choice.on(chart)
     slopes = _slopes_on(chart, samples)
-    return RadialInterpolant.leave_one_out(
-        chart.map(samples.positions), samples.tips, None if slopes is None else slopes[:, :, 3:6],
+    missed = RadialInterpolant.leave_one_out(
+        chart.map(samples.positions), samples.shape[:, 3:][:, channels],
+        None if slopes is None else slopes[:, :, 3:][:, :, channels],
         kernel=choice.kernel, shape=choice.shape, smoothing=_SMOOTHING)[:, 0]
+    return np.linalg.norm(missed.reshape(len(missed), -1, 3), axis=2)
 
 
 def _with_slopes(samples: GraspSamples) -> np.ndarray:
@@ -518,11 +549,14 @@ def _fitted(samples: GraspSamples, choice: FitChoice, bent: FitChoice, region: T
                                   **options)
     loads = RadialInterpolant.fit(places, samples.load_table, **options)
     off = -RadialInterpolant.leave_one_out(places, samples.load_table, **options)[:, 0]
-    tips = _tips_missed(bending, bent, region.chart)
+    off[:, [one is None for one in samples.loads.values()]] = np.nan
+    found = _misplaced(bending, bent, region.chart, slice(None))
+    misplaced = np.full((len(samples.poses), found.shape[1]), np.nan)
+    misplaced[sure] = found
     inside = ~region.is_face()[sure]
-    errors["tip_error_median_m"] = float(np.median(np.linalg.norm(tips[inside], axis=1)))
+    errors["tip_error_median_m"] = float(np.median(found[inside, 0]))
     return EnergyField(samples, chart, shape_chart, energy, shape, loads, region, errors,
-                       np.column_stack([missed, off]))
+                       np.column_stack([missed, off]), misplaced)
 
 
 def _rows(points: np.ndarray) -> np.ndarray:

@@ -15,11 +15,8 @@ from limber.planning.bound.separation import Verdict, judge
 from limber.planning.cost import arc_lengths
 from limber.planning.planners.easiest import easiest_way
 from limber.planning.planners.refine import refine
-from limber.planning.problem import GentleProblem, NoWayError, no_way
+from limber.planning.problem import GentleProblem, no_way, not_found
 from limber.progress import SILENT, Progress
-
-UNPROVEN = "nor is it proven that none exists"
-"""Of what is said without a path: more samples may show one. Across processes the words tell."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +56,7 @@ def plan_gentle(problem: GentleProblem, others: list[np.ndarray] | None = None, 
             return best[1]
         if rough is not None:
             # Coarser cells than those that left it open will not settle it.
-            raise NoWayError(
-                f"No path to the goal with{problem.limits_in_words() or ' poses that are known'} "
-                f"was found, {UNPROVEN}.", f"It is open on {_grid(verdicts[0])}.",
-                "Loosen the limits a little, or sample more poses with `limber energy --samples`.")
+            raise not_found(problem, f"It is open on {_grid(verdicts[0])}.")
         verdicts.append(judge(problem))
         # A path that keeps the limits is a better proof than cells that separate.
         way = verdicts[0].way

@@ -1,0 +1,135 @@
+"""The field's error counts in every proof: of each limit, and of where a target is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from limber.errors import InputError
+from limber.planning import compare
+from limber.planning.bound import separation
+from limber.planning.bound.separation import judge
+from limber.planning.cost import CostWeights
+from limber.planning.field.energy_field import EnergyField, fit_field
+from limber.planning.goals import GraspGoal, TargetGoal
+from limber.planning.limits import Limits
+from limber.planning.problem import UNPROVEN, GentleProblem, NoWayError
+from limber.planning.regions import Ball
+from limber.planning.settings import PlanSettings
+from limber.progress import Progress
+
+START, GOAL = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
+LEVEL, RISE, ROUGH = 1.0, 2.0, 0.15
+"""Of a load: everywhere, more of it in a layer across the way, and what no fit can foretell."""
+
+
+@pytest.fixture(autouse=True)
+def few_cells(monkeypatch):
+    """The finest grids take seconds and add nothing here."""
+    monkeypatch.setattr(separation, "_MOST_CELLS", 40_000)
+
+
+@pytest.fixture(scope="module")
+def rough_samples(well):
+    """Every load has a wall across x = 0 and is rough; the tip's place is rough by 4 mm."""
+    samples = well.samples(count=150)
+    generator = np.random.default_rng(1)
+    load = (LEVEL + RISE * np.exp(-(samples.positions[:, 0] / 0.08)**2)
+            + ROUGH * generator.uniform(-1.0, 1.0, len(samples.poses)))
+    return replace(samples, strains=load, stresses=load, axial_forces=load,
+                   torques=np.column_stack([load, 0 * load, 0 * load]),
+                   tips=samples.tips + 0.004 * generator.uniform(-1.0, 1.0, samples.tips.shape))
+
+
+@pytest.fixture(scope="module")
+def rough_field(rough_samples):
+    return fit_field(rough_samples)
+
+
+def lowest_in_the_wall(field, name):
+    """Return the least of a load where the way crosses x = 0, by the field."""
+    points = field.region.draw(4000, np.random.default_rng(0)) * [0.0, 1.0, 1.0]
+    return field.load(points[field.region.contains(points)], name).min()
+
+
+def problem_on(field, limits, goal=GOAL):
+    weights = CostWeights.between(field, START, np.array(GOAL.position), deformation=1.0,
+                                  distance=1.5).weights
+    return GentleProblem(field, limits.on(field), weights, START, goal, beyond=limits.beyond(field))
+
+
+@pytest.mark.parametrize("name", ["strain", "stress", "axial_force", "torque"])
+def test_what_the_field_may_be_wrong_by_is_no_proof(rough_field, name):
+    """A wall of a load, over the limit by less than the field's error, proves nothing; a limit that
+    is too low for that as well does."""
+    lowest = lowest_in_the_wall(rough_field, name)
+    doubt = Limits(**{name: lowest}).doubts(rough_field)[name]
+    assert 0.5 * ROUGH < doubt < 5.0 * ROUGH
+    near = problem_on(rough_field, Limits(**{name: lowest - 0.4 * doubt}))
+    held_for_true = judge(replace(near, beyond=near.limits))
+    assert held_for_true.proven, "the field alone would have been a proof"
+    assert not judge(near).proven
+    assert judge(problem_on(rough_field, Limits(**{name: lowest - 1.4 * doubt}))).proven
+
+
+@pytest.mark.parametrize("seen", [f"None was found, {UNPROVEN}.", "No path exists."])
+def test_what_only_the_fields_error_forbids_is_planned(rough_field, monkeypatch, seen):
+    """With the limit looser by that error, for the full model to decide; and it is said. What is
+    proven is not tried."""
+    settings, limits, told, tried = PlanSettings(), Limits(strain=2.4), [], []
+    there = compare.plan_pair(rough_field, START, GraspGoal(tuple(START), 0.01), settings)
+
+    def plan_pair(_field, _start, _goal, _settings, tried_limits, *, beyond, **_options):
+        tried.append(tried_limits.max_loads[0])
+        assert beyond.max_loads[0] == pytest.approx(2.4 + doubt)
+        if tried[-1] <= 2.4:
+            raise NoWayError(seen, "On a grid.", "Raise the limit.")
+        return there
+
+    doubt = limits.doubts(rough_field)["strain"]
+    monkeypatch.setattr(compare, "plan_pair", plan_pair)
+    arguments = rough_field, START, GOAL, settings, limits
+    progress = Progress(on_warning=told.append)
+    if UNPROVEN in seen:
+        found = compare.plan_within(*arguments, progress=progress)
+        assert not any(found.margins.values()) and tried[-1] == pytest.approx(2.4 + doubt)
+        assert any("as its error allows (strain 0." in words for words in told)
+    else:
+        with pytest.raises(NoWayError, match="No path exists"):
+            compare.plan_within(*arguments, progress=progress)
+        assert max(tried) == 2.4
+
+
+def test_a_target_may_be_nearer_than_the_field_has_it(rough_field):
+    """A ball just beyond the tip's reach by the field is not proven away, one far off is."""
+    reach = rough_field.tip(rough_field.region.draw(4000, np.random.default_rng(0)))
+    off = rough_field.place_error()
+    assert 0.002 < off < 0.02
+    for away, proven in ((0.5 * off, False), (4.0 * off, True)):
+        centre = (0.0, 0.0, float(reach[:, 2].max()) + 0.005 + away)
+        problem = problem_on(rough_field, Limits(), TargetGoal(Ball(centre, 0.005)))
+        assert judge(problem).proven == proven
+
+
+def without(arrays, *names):
+    return {name: values for name, values in arrays.items() if name not in names}
+
+
+def test_a_field_of_an_older_program_opens_and_proves_nothing(rough_field, tmp_path):
+    """No errors in its file: no limit and no target is proven away, and margins are the widest."""
+    rough_field.write(tmp_path / "new.npz")
+    with np.load(tmp_path / "new.npz") as arrays:
+        np.savez(tmp_path / "old.npz",
+                 **without(arrays, "left_out_errors", "left_out_place_errors_m"))
+        np.savez(tmp_path / "oldest.npz", **without(arrays, "strains"))
+    new = EnergyField.read(tmp_path / "new.npz")
+    assert np.array_equal(new.misplaced, rough_field.misplaced)
+    assert judge(problem_on(new, Limits(strain=0.9))).proven
+    old, limits = EnergyField.read(tmp_path / "old.npz"), Limits(strain=0.9)
+    assert limits.doubts(old)["strain"] == np.inf and old.place_error() == np.inf
+    assert limits.margins(old)["strain"] == pytest.approx(0.27)
+    assert not judge(problem_on(old, limits)).proven
+    far = TargetGoal(Ball((0.0, 0.0, 2.0), 0.01))
+    assert not judge(problem_on(old, Limits(), far)).proven
+    with pytest.raises(InputError, match="knows no strain"):
+        Limits(strain=0.9).margins(EnergyField.read(tmp_path / "oldest.npz"))
