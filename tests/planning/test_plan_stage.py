@@ -98,6 +98,27 @@ def test_files_tell_the_same(planned_branch, small_mesh):
     assert len(data) == 32 + 12 * frames["frame_count"] * vertex_count
 
 
+@pytest.mark.parametrize("place", ["rest", "elsewhere"])
+def test_a_plan_whose_goal_is_its_start_saves_nothing(copied, place):
+    """Planned at once, without a number for what it saves; the reason is said, and the report
+    holds."""
+    told, start = [], None
+    where = EnergyField.read(copied / "energy.npz").rest
+    if place == "elsewhere":
+        where = np.array(read_plan(copied)["plan"]["poses"])[-1, :3]
+        start = tuple(map(float, where))
+    plan_paths(copied, PlanSettings(start=start, goal=tuple(where + [0.004, 0.0, 0.0]),
+                                    inertia=False), name="stay", workers=1,
+               progress=Progress(on_warning=told.append))
+    plan = read_plan(copied, "stay")
+    assert plan["plan"]["length_m"] < 1e-9 and plan["baseline"]["length_m"] < 1e-9
+    for change in ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent"):
+        assert plan[change] is None
+    assert len(plan["rounds"]) == 1
+    assert [words for words in told if "The start lies in the goal" in words] == told
+    assert report_figures(Branch.open(copied), "stay") == []
+
+
 def test_folder_can_be_read_again_and_is_not_done_twice(copied):
     """A moved folder opens, its field gives numbers, and the same stage returns at once."""
     branch = Branch.open(copied)

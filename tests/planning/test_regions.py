@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from limber.errors import InputError
+from limber.planning.compare import plan_pair
 from limber.planning.field.energy_field import fit_field
 from limber.planning.goals import TargetGoal, goal_points
 from limber.planning.plan import _goal
@@ -60,6 +61,30 @@ def test_a_named_target_is_brought_into_a_box(ridge):
     found = 2.0 * points + [0.0, 0.1, 0.2]
     assert len(points) > 20 and box.distance(found).max() < 2e-3
     assert box.distance(1.5 * points + [0.0, 0.0, 0.3]).max() > 0.01
+
+
+def test_a_region_larger_than_what_was_sampled_has_goal_poses(ridge_field):
+    """A ball that holds many sampled poses and none deep inside, as a second arm's reach is."""
+    goal = TargetGoal(Ball((0.0, 0.7, 0.3), 0.65))
+    everywhere = ridge_field.region.draw(2000, np.random.default_rng(0))
+    inside = goal.distance(ridge_field, everywhere) <= goal.tolerance
+    assert 0.3 < inside.mean() < 0.8
+    points = goal_points(goal, ridge_field, ridge_field.limited())
+    assert len(points) == 200
+    assert goal.distance(ridge_field, points).max() <= goal.tolerance
+    assert np.ptp(points, axis=0).min() > 0.5 * np.ptp(everywhere[inside], axis=0).min()
+    assert ridge_field.region.contains(goal.centre(ridge_field)[None])[0]
+
+
+def test_a_start_in_the_goal_stays_there(ridge_field):
+    """Both paths have no length, and no path costs less."""
+    goal = TargetGoal(Ball((0.0, 0.7, 0.3), 0.65))
+    start = np.array([0.0, 0.1, 0.0])
+    found = plan_pair(ridge_field, start, goal, PlanSettings())
+    assert found.stays and found.certificate.gap == 0.0
+    for path in (found.plan, found.baseline):
+        assert np.array_equal(path.points, [start, start])
+    assert np.allclose(found.approach[[0, -1]], [ridge_field.rest, start])
 
 
 @pytest.mark.parametrize(("settings", "words"), [

@@ -12,6 +12,7 @@ from limber.planning.resolve import ResolvedPath, SolvedPoses
 
 _APART = 0.01  # [m] between states of a path that become samples
 _MOST_LEARNT = 12  # of them a round
+_ROUND_OFF = 1e-12  # of the samples' largest energy
 _SLACK = 1e-3  # share of the goal's tolerance that is round-off
 
 
@@ -48,7 +49,9 @@ def field_error(field: EnergyField, states: SolvedPoses) -> float:
     """Return how far the field's energy is from that of states, root mean square over theirs."""
     size = float(np.sqrt(np.mean(states.energies**2)))
     off = field.energy(states.poses[:, :3]) - np.maximum(states.energies, 0.0)
-    return float(np.sqrt(np.mean(off**2))) / size if size else 0.0
+    # At rest there is nothing but round-off.
+    felt = size > _ROUND_OFF * field.samples.energies.max()
+    return float(np.sqrt(np.mean(off**2))) / size if felt else 0.0
 
 
 def learnt(field: EnergyField, grasp_model: GraspModel, path: ResolvedPath, limits: Limits,

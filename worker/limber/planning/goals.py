@@ -33,6 +33,11 @@ class Goal(Protocol):
         """Return how far off the goal the branch is with its grasp at ``points`` [m], [n]."""
         ...
 
+    def doubt(self, field: EnergyField) -> float:
+        """Return how much nearer than its ``distance`` the branch may be at most [m]; infinite
+        where the field's error is not known."""
+        ...
+
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         """Return grasp positions likely to be in the region, shape [n, 3]."""
         ...
@@ -55,6 +60,9 @@ class GraspGoal:
 
     def distance(self, field: EnergyField, points: np.ndarray) -> np.ndarray:
         return np.linalg.norm(np.asarray(points) - self.position, axis=1)
+
+    def doubt(self, field: EnergyField) -> float:
+        return 0.0
 
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
         inside = ball(count, generator) * self.tolerance + self.position
@@ -94,11 +102,22 @@ class TargetGoal:
         outside = self.region.distance(field.tip(points, self.target))
         return outside + self.tolerance + self.inset
 
+    def doubt(self, field: EnergyField) -> float:
+        return self.inset + field.place_error(self.target)
+
     def guess(self, field: EnergyField, count: int, generator: np.random.Generator) -> np.ndarray:
-        # The region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
-        points = field.region.draw(20 * count, generator)
-        points = points[np.argsort(self.distance(field, points))[:count]]
-        wanted = self.region.draw(count, generator)
+        # A small region is a thin bent lens in grasp space: draw everywhere, then walk onto it.
+        # Who is in it already stays: in a large one a walk may lead out of the samples.
+        drawn = field.region.draw(20 * count, generator)
+        distance = self.distance(field, drawn)
+        points = drawn[distance <= self.tolerance][:count]
+        return np.concatenate([points, self._walked(
+            field, drawn[np.argsort(distance)[len(points):count]], generator)])
+
+    def _walked(self, field: EnergyField, points: np.ndarray, generator: np.random.Generator,
+                ) -> np.ndarray:
+        """Return ``points`` [n, 3] moved so that the target comes towards places in the region."""
+        wanted = self.region.draw(len(points), generator)
         for _ in range(8):
             outside = self.distance(field, points) > 0.5 * self.tolerance
             steps = _damped_steps(field.tip_gradient(points, self.target),
@@ -108,6 +127,8 @@ class TargetGoal:
 
     def centre(self, field: EnergyField) -> np.ndarray:
         points = self.guess(field, 50, np.random.default_rng(0))
+        trusted = points[field.region.contains(points)]
+        points = trusted if len(trusted) else points
         return points[np.argmin(self.distance(field, points))]
 
     def place(self, states: SolvedPoses) -> np.ndarray:

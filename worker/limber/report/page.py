@@ -25,6 +25,7 @@ from limber.reading import read_arrays
 from limber.report import executions, figures, loads, swings
 from limber.report.ringing import vibration_rows
 from limber.report.tables import (
+    ASSUMED,
     caliper_rows,
     cause_rows,
     comparison_rows,
@@ -32,6 +33,7 @@ from limber.report.tables import (
     diameter_rows,
     doubt_rows,
     held_out_rows,
+    is_assumed,
     modulus_rows,
     order_rows,
     share_rows,
@@ -114,6 +116,8 @@ def _summary(branch: Branch, picture: Path | None) -> Section:
     section = Section("Summary")
     if picture is not None:
         section.pictures.append((_inline_png(_read_png(picture)), "The scene, rendered."))
+    if is_assumed(_virtual_result(branch)):
+        section.text.append(ASSUMED)
     result = _reconstruction(branch)
     rows = [["what", "value"]]
     source = branch.manifest.source
@@ -236,8 +240,9 @@ def _pull(branch: Branch, name: str) -> Section:
     pull = read_pull(branch.path(f"pulls/{name}"))
     if _is_virtual(branch, name):
         section.text.append(
-            "This pull was simulated, with a known Young's modulus and sensor noise, on another "
-            "and finer mesh: there is no robot recording of this branch.")
+            f"This pull was simulated, with {'a known' if _has_truth(branch) else 'an assumed'} "
+            "Young's modulus and sensor noise, on another and finer mesh: there is no robot "
+            "recording of this branch.")
     section.draw(figures.pull(pull), "Force on the branch and displacement of the grasp over time.")
     return section
 
@@ -251,8 +256,13 @@ def _estimate(branch: Branch) -> Section:
 
     estimate = read_estimate(branch.path("estimate.json"))
     virtual = _virtual_result(branch)
-    section.tables.append(("Estimated against true" if virtual else "Estimated",
-                           modulus_rows(estimate, virtual)))
+    section.tables.append((
+        "Estimated" if not virtual else "Estimated against assumed" if is_assumed(virtual)
+        else "Estimated against true", modulus_rows(estimate, virtual)))
+    if is_assumed(virtual):
+        section.text.append(ASSUMED)
+        if estimate.get("truth"):
+            estimate["truth"]["assumed"] = True
     for title, rows in [
             ("What makes it unsure: standard deviations", deviation_rows(estimate)),
             ("Pulls foretold by a fit that did not see them: RMS errors",
@@ -363,9 +373,12 @@ def _plan(branch: Branch, name: str) -> Section:
     section.tables.append(("Shortest path (length alone) against the gentle one "
                            "(deformation-aware), both scored on the full model",
                            comparison_rows(plan)))
-    section.text.append(
-        f"The gentle path saves {plan['energy_saved_percent']:.1f} % of the energy along the "
-        f"path for {plan['length_added_percent']:+.1f} % of length. Seed {plan['seed']}.")
+    saved, added = plan["energy_saved_percent"], plan["length_added_percent"]
+    section.text.append((
+        "The start lies in the goal: the paths have no length, and there is nothing to save."
+        if saved is None or added is None else
+        f"The gentle path saves {saved:.1f} % of the energy along the "
+        f"path for {added:+.1f} % of length.") + f" Seed {plan['seed']}.")
     if (gap := (plan.get("certificate") or {}).get("gap_percent")) is not None:
         section.text.append(f"Certificate: on the energy field it is at most {gap:.1f} % above the "
                             "best possible path; no path is cheaper than the lower bound.")
@@ -439,7 +452,15 @@ def _is_virtual(branch: Branch, name: str) -> bool:
 
 def _virtual_result(branch: Branch) -> dict[str, Any] | None:
     names = [name for name in branch.names("pulls") if _is_virtual(branch, name)]
-    return branch.manifest.stages[f"pull:{names[0]}"].result if names else None
+    if not names:
+        return None
+    return branch.manifest.stages[f"pull:{names[0]}"].result | {
+        "young_assumed": not _has_truth(branch)}
+
+
+def _has_truth(branch: Branch) -> bool:
+    """Whether the branch was generated: of a scan of another one no modulus is known."""
+    return branch.has("truth/truth.json")
 
 
 def _read_png(path: Path) -> bytes:
