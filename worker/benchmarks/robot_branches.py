@@ -126,11 +126,11 @@ def _follow_trial(seed: int, source: str, voided: Voided, address: str) -> Numbe
     except (AssertionError, LimberError) as error:
         print(f"seed {seed}: {error}", flush=True)
         return Numbers("branches", seed, source, {"stopped": str(error)})
-    within, error = result["force_within_share"], result["force_error_of_peak"]
-    print(f"seed {seed}: within {within:.3f}, 95 % of the path below {100 * error:.1f} % of "
+    within, peak = result["force_within_share"], result["force_error_of_peak"]
+    print(f"seed {seed}: within {within:.3f}, 95 % of the path below {100 * peak:.1f} % of "
           f"{result['predicted_peak_force_n']:.1f} N, the virtual branch's extrapolation off by "
           f"{off:.2f} N at most", flush=True)
-    return Numbers("branches", seed, source, {"within": float(within), "error": float(error),
+    return Numbers("branches", seed, source, {"within": float(within), "error": float(peak),
                                               "way": float(result["path_error_m"])})
 
 
