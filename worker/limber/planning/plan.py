@@ -362,7 +362,7 @@ def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
 
 
 def _doubts(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
-    if summary["plan"]["length_m"] <= _STILL:
+    if summary["plan"].get("length_m", 1.0) <= _STILL:
         return ["The start lies in the goal already: the path has no length, and there is nothing "
                 "to save."]
     doubts = []
