@@ -13,9 +13,10 @@ _SKELETON = """
 import hashlib, sys
 import numpy as np
 from limber.geometry.skeleton.skeletonise import skeletonise
-found = skeletonise(np.load(sys.argv[1]), root=np.zeros(3)).skeleton
+result = skeletonise(np.load(sys.argv[1]), root=np.zeros(3))
+found = result.skeleton
 print(hashlib.sha256(found.nodes.tobytes() + found.parent.tobytes()
-                     + found.radius.tobytes()).hexdigest())
+                     + found.radius.tobytes()).hexdigest(), result.noise)
 """
 _LIBRARIES = "import numpy, scipy.linalg\nimport cvxopt.cholmod\n"
 _SOLVED = """
