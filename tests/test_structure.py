@@ -81,7 +81,7 @@ CORE = ROOT / "worker" / "limber"
 LAYERS = (
     ("version", "constants", "errors", "lazy", "threads", "compiled", "sparse", "alignment",
      "heartbeat", "machine_errors", "names", "optional", "owner", "files", "reading", "caches",
-     "plain", "progress", "settings", "terminal"),
+     "plain", "present", "progress", "settings", "terminal"),
     ("jobs",),
     ("store", "geometry"),
     ("mechanics",), ("exports",),

@@ -99,7 +99,7 @@ def assert_same(now: np.ndarray, then: np.ndarray, name: str) -> None:
         np.testing.assert_array_equal(now, then, name)
     else:
         rtol = 1e-3 if "weights" in name else 1e-6
-        np.testing.assert_allclose(now, then, rtol, rtol * np.abs(then).max(initial=0.0),
+        np.testing.assert_allclose(now, then, rtol, rtol * np.nanmax(np.abs(then), initial=0.0),
                                    err_msg=name)
 
 

@@ -56,17 +56,18 @@ def test_two_grasps_and_a_release(session, model):
     rest = session.latest().positions
     one = session.grab(point=[0.0, 0.0, 0.1], mode="clamped", radius=0.011)
     two = session.grab(vertex=tip_vertex(session), radius=0.011)
-    assert (one["grasp"], two["grasp"]) == (1, 2)
+    numbers = [one["grasp"], two["grasp"]]
+    assert numbers[1] == numbers[0] + 1
     first = np.array(one["pose"]) + [0.01, 0, 0, 0, 0.1, 0]
     # A little in tension: pushed together, it could buckle to either side.
     second = np.array(two["pose"]) + [0.02, 0.01, -0.0005, 0, 0, 0]
-    session.move(first, grasp=1)
-    frame = settled(session, session.move(second, grasp=2))
+    session.move(first, grasp=numbers[0])
+    frame = settled(session, session.move(second, grasp=numbers[1]))
     grasps = [Grasp.at(model.mesh, [0, 0, 0.1], 0.011, "clamped"),
               Grasp.at(model.mesh, rest[rest[:, 2].argmax()], 0.011, "pinned")]
     full = solve_static(model, grasp=grasps, pose=np.array([first, second])).require()
     assert frame.status == Status.full and frame.is_trusted
-    assert [held.number for held in frame.grasps] == [1, 2]
+    assert [held.number for held in frame.grasps] == numbers
     for held, force, torque in zip(frame.grasps, full.reaction_force, full.reaction_torque,
                                    strict=True):
         np.testing.assert_allclose(held.force, force, atol=1e-4 * np.abs(force).max())
@@ -77,8 +78,8 @@ def test_two_grasps_and_a_release(session, model):
     assert frame.greatest_strain > 0.001
     assert frame.strains.max() == pytest.approx(frame.greatest_strain, rel=1e-4)
     assert np.abs(frame.positions - frame.strain_place).sum(axis=1).min() < 0.01
-    reply = session.release(1)
-    assert reply["grasps"] == [2]
+    reply = session.release(numbers[0])
+    assert reply["grasps"] == numbers[1:]
     free = settled(session, session.release()["id"])
     np.testing.assert_allclose(free.positions, rest, atol=1e-6)
     assert abs(free.energy) < 1e-9 and not free.grasps

@@ -1,6 +1,7 @@
 """Weather and cuts in a session: as `limber load` has them, on the branch that is held."""
 
 import json
+import shutil
 from concurrent.futures import Future
 from dataclasses import replace
 from threading import Event
@@ -70,10 +71,11 @@ def test_without_axes_it_is_said(branch_folder):
 
 
 @pytest.fixture()
-def with_axes(branch_folder):
-    with Branch.open(branch_folder).stage("axes") as stage:
+def with_axes(branch_folder, tmp_path):
+    folder = shutil.copytree(branch_folder, tmp_path / "axes.branch")
+    with Branch.open(folder).stage("axes") as stage:
         AXIS.write_swc(stage.path("skeleton.swc"))
-    return branch_folder
+    return folder
 
 
 class Said:
