@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.planning.conftest import small_grasp_model
 
 from limber.errors import InputError, WorkError
 from limber.planning.field import energy_field
 from limber.planning.field.chart import Chart
 from limber.planning.field.energy_field import EnergyField, error_measures, fit_field
 from limber.planning.field.radial import RadialInterpolant
+from limber.planning.field.sampling import energy_inputs, is_sampled_on
 from limber.planning.field.trust import TrustRegion
 
 ELSEWHERE = np.random.default_rng(9).uniform(-0.1, 0.1, (80, 3))
@@ -232,3 +234,18 @@ def test_a_sample_at_a_snap_costs_the_others_no_slopes(well):
         field = fit_field(replace(samples, shape_slopes=known))
         missed.append(np.sqrt(np.mean((field.tip(places) - tip(places))**2)))
     assert missed[1] < 1.5 * missed[0] < 0.7 * missed[2]
+
+
+def test_a_field_knows_its_branch_on_any_machine(small_mesh, small_skeleton):
+    """Last digits of a grasp's weights differ between machines; fields of earlier versions digested
+    them, so that a folder that was moved asked for its field again."""
+    model = small_grasp_model(small_mesh, small_skeleton, None)
+    inputs, centre = energy_inputs(model), model.grasp.centre
+    elsewhere = replace(model.grasp, weights=np.nextafter(model.grasp.weights, 1.0))
+    assert energy_inputs(replace(model, grasp=elsewhere)) == inputs
+    assert is_sampled_on(inputs, centre, model)
+    assert not is_sampled_on(inputs | {"material": "another"}, centre, model)
+    earlier = {name: value for name, value in inputs.items() if name != "grasp nodes"}
+    earlier["grasp"] = "a digest of another machine's weights"
+    assert is_sampled_on(earlier, np.nextafter(centre, 1.0), model)
+    assert not is_sampled_on(earlier, centre + [1e-6, 0.0, 0.0], model)

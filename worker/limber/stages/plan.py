@@ -73,7 +73,7 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
         Cancelled: the best so far was kept, where there was one and no finished plan of the name.
     """
     from limber.planning.field.energy_field import EnergyField
-    from limber.planning.field.sampling import energy_inputs
+    from limber.planning.field.sampling import energy_inputs, is_sampled_on
     from limber.planning.limits import Limits
     from limber.planning.plan import plan_motion
     from limber.planning.plan_file import whole_motion
@@ -93,12 +93,13 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     energy_stage = branch.manifest.stages["energy"]
     grasp_model = load_grasp_model(branch, gravity=bool(energy_stage.settings["gravity"]),
                                    progress=progress)
-    digests = energy_inputs(grasp_model)
-    if energy_stage.reads != digests:
+    field = EnergyField.read(field_path)
+    if not is_sampled_on(energy_stage.reads, field.rest, grasp_model):
         raise BranchFolderError(
             "The energy field is of another mesh, material, weight or of other targets.",
             "The branch was meshed or estimated anew, or got targets, since `limber energy` ran.",
             "Run `limber energy` again.")
+    digests = energy_inputs(grasp_model)
     grasp_model = grasp_model.damped(known_damping(branch))
     digests = digests | {"damping": repr(grasp_model.model.damping)}
     stiffer = _stiffer(branch) if settings.max_stress else 1.0
@@ -119,7 +120,6 @@ def plan(folder: Path, settings: PlanSettings, *, name: str = "path",
     if in_cell is not None:
         in_cell.check_goal(settings)
     with branch.stage(key, settings, reads=reads, digests=digests) as stage:
-        field = EnergyField.read(field_path)
         limits = asked if in_cell is None else in_cell.limits
         pace = Pace(settings.speed, settings.acceleration)
         if in_cell is not None:

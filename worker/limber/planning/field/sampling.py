@@ -8,7 +8,7 @@ has been solved, and it starts from that solution. So every step is short, also 
 have to jump, and the branch stays in the equilibrium that bends out of rest.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +35,8 @@ _SHARE_POSES = 30
 """Poses of one tree. How many trees there are must not depend on how many processes work on
 them, nor what they find."""
 _SECOND_TRIES = 3  # other solutions to start from, for a pose that one could not reach
+_SAME_PLACE = 1e-9  # of the mesh's size: last digits differ between machines
+_GRASP_INPUT = "grasp nodes"
 TWO_SHAPES = "two shapes"
 """Among the reasons for which poses are refused: which of two shapes it is depends on the way."""
 
@@ -262,15 +264,38 @@ def _slack(forces: np.ndarray, usual: np.ndarray, drawn: float) -> np.ndarray:
     return slack
 
 
+def is_sampled_on(reads: Mapping[str, str], rest: np.ndarray, grasp_model: GraspModel) -> bool:
+    """Whether a field was sampled on this model.
+
+    Args:
+        reads: :func:`energy_inputs` when it was sampled.
+        rest: Where the field's grasp is at rest [m], shape [3].
+        grasp_model: The model as it is now.
+    """
+    inputs = energy_inputs(grasp_model)
+    if _GRASP_INPUT not in reads:
+        # Of an earlier version, which digested the weights: the grasp's place tells as much.
+        del inputs[_GRASP_INPUT]
+        away = np.linalg.norm(rest - grasp_model.grasp.centre)
+        if away > _SAME_PLACE * np.ptp(grasp_model.mesh.nodes, axis=0).max():
+            return False
+    return all(reads.get(name) == value for name, value in inputs.items())
+
+
 def energy_inputs(grasp_model: GraspModel) -> dict[str, str]:
-    """Return digests of what the field depends on: geometry, grasp, material, weight, targets."""
+    """Return digests of what the field depends on: geometry, grasp, material, weight, targets.
+
+    Only of what is stored or counted: a grasp's weights are computed, and their last digits differ
+    between machines, to which a branch folder may be moved.
+    """
     import hashlib
 
     model, material = grasp_model.model, hashlib.sha256()
     for values in (model.young, model.poisson, model.density):
         material.update(np.ascontiguousarray(values, float).tobytes())
-    grasp = hashlib.sha256(repr(grasp_model.grasp.key()).encode())
+    grasp = grasp_model.grasp
+    nodes = hashlib.sha256(np.ascontiguousarray(grasp.nodes, np.int64).tobytes())
     return {"mesh geometry": grasp_model.mesh.geometry_digest(), "material": material.hexdigest(),
-            "grasp": grasp.hexdigest(),
+            _GRASP_INPUT: f"{grasp.mode} {nodes.hexdigest()}",
             "weight": str((model.gravity.tolist(), model.point_masses)),
             "targets": str(grasp_model.branch.targets)}
