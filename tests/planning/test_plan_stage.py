@@ -154,13 +154,14 @@ def test_other_modulus_makes_the_field_stale(copied):
         plan_paths(copied, PlanSettings(**QUICK), name="other")
 
 
+@pytest.mark.usefixtures("coarse_bound")
 def test_refusals_leave_the_folder_as_it_was(copied):
     """Goals out of reach, over a limit, doubled, or a cancel: an error each, no file changed."""
     before = sorted(p.name for p in copied.rglob("*") if p.name != ".lock")
     with pytest.raises(NoPathError, match="misses it by"):
         plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
     with pytest.raises(NoPathError, match=r"force .* where 0.01 .*is allowed"):
-        plan_paths(copied, PlanSettings(max_force=0.01), name="bad")
+        plan_paths(copied, PlanSettings(max_force=0.01, replans=1, iterations=300), name="bad")
     with pytest.raises(NoPathError, match=r"in millimetres\?"):
         plan_paths(copied, PlanSettings(goal=(20.0, 0.0, 400.0)), name="bad")
     with pytest.raises(InputError, match=r"in millimetres\?"):

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from limber.alignment import Alignment
+from limber.constants import PATH_COLOURS
 from limber.errors import BranchFolderError, InputError
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.mechanics.frames import node_average
 from limber.report import plan_figures
-from limber.scene.colours import PATH_COLOURS, linear_of
+from limber.scene.colours import linear_of
 from limber.scene.data import scene_data
 from limber.scene.graphs import FIRST, SECOND
 from limber.store import Branch

@@ -12,3 +12,7 @@ UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "um": 1e-6}
 
 FOUND_SKELETON = "scan_skeleton"
 """The skeleton as a scan showed it, in the coordinates of the scan's file: .swc and .csv."""
+
+PATH_COLOURS = {"plan": "#e52145", "baseline": "#1965ce"}
+"""Of the planned path and of the one that it is compared with, in report and scene; the add-on's
+``COLORS`` are the same, linear."""

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from limber.constants import PATH_COLOURS
 from limber.planning.cost import arc_lengths
 from limber.planning.field.energy_field import EnergyField
 from limber.planning.plan_file import PlanFile, Way, read_plan
 from limber.planning.search_files import CostToGo, read_trees
-from limber.scene.colours import PATH_COLOURS
 from limber.store import Branch
 
 if TYPE_CHECKING:

@@ -11,9 +11,6 @@ _COLOUR_MAPS = {
     "inferno": ("#1b0c41", "#4a0c6b", "#781c6d", "#a52c60", "#cf4446", "#ed6925", "#fb9b06",
                 "#f7d13d", "#fcffa4"),
 }
-PATH_COLOURS = {"plan": "#e52145", "baseline": "#1965ce"}
-"""Of the planned path and of the one that it is compared with, in report and scene; the add-on's
-``COLORS`` are the same, linear."""
 _MOST_DECADES = 1e3  # a logarithmic scale spans at most this; what is below has its first colour
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"))
 

@@ -20,7 +20,7 @@ from limber.scene.colours import with_unit
 MEASURED, SIMULATED, TRUE = (0.95, 0.95, 0.95), (0.40, 0.71, 1.0), (1.0, 0.62, 0.30)
 FIRST, SECOND = (0.93, 0.36, 0.42), (0.45, 0.62, 1.0)
 """Of the planned path and of the one that it is compared with: as the paths themselves
-(:data:`limber.scene.colours.PATH_COLOURS`), lighter on the graph's dark ground."""
+(:data:`limber.constants.PATH_COLOURS`), lighter on the graph's dark ground."""
 _MOST_POINTS = 400
 _LOG_FROM = 5.0
 """Times that a quantity above zero grows by before its axis is logarithmic."""
