@@ -105,3 +105,17 @@ def branch_template(tmp_path_factory, small, small_bench):
 def branch_folder(branch_template, tmp_path):
     """A copy to work in: a branch folder can be moved and copied."""
     return shutil.copytree(branch_template, tmp_path / "small.branch")
+
+
+_QUICK_SECONDS = 2.0
+"""A test without the mark `slow` takes half a second; several times that is worth a word."""
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name the tests that lack the mark `slow`, so that `scripts/test --fast` stays fast."""
+    reports = terminalreporter.getreports("passed") + terminalreporter.getreports("failed")
+    for report in reports:
+        if report.when == "call" and report.duration > _QUICK_SECONDS and not (
+                {"slow", "real_time", "real_blender"} & set(report.keywords)):
+            terminalreporter.write_line(
+                f"not marked slow, and took {report.duration:.1f} s: {report.nodeid}")

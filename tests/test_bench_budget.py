@@ -86,6 +86,7 @@ def _square(task: int) -> int:
     return task * task
 
 
+@pytest.mark.slow
 def test_tasks_of_several_workers_give_their_results():
     """A clock that stands: all fit. One at its end: so many as there have to be."""
     assert dict(side_by_side(_square, range(4), Budget(60), workers=2)) == {

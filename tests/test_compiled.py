@@ -34,6 +34,7 @@ class Pair(NamedTuple):
 """
 
 
+@pytest.mark.slow
 def test_a_moved_type_is_compiled_anew(tmp_path):
     """A kernel kept with an argument's type that has since moved to another module still runs,
     and is then kept again.
@@ -55,6 +56,7 @@ def test_a_moved_type_is_compiled_anew(tmp_path):
     assert run("after") == ["3.0", "1"]
 
 
+@pytest.mark.slow
 def test_that_it_compiles_is_told_once(tmp_path):
     """Before the first kernel is compiled; not where it is kept."""
     (tmp_path / "kernel.py").write_text("""
@@ -180,6 +182,7 @@ def _damaged(number):
     return number
 
 
+@pytest.mark.slow
 def test_processes_of_a_pool_warn_through_the_command():
     """Two that find damage: one warning."""
     told = []

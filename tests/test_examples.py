@@ -34,6 +34,7 @@ def test_all_are_run_here():
         "estimate.sh", "render.sh", "bend.py", "night.toml"}
 
 
+@pytest.mark.slow
 def test_the_core_in_ten_lines(tmp_path):
     """Further out it holds more energy and pulls harder."""
     folder = shutil.copytree(EXAMPLE, tmp_path / "a.branch")
@@ -48,6 +49,7 @@ def test_the_core_in_ten_lines(tmp_path):
     assert len([line for line in text.splitlines() if line.strip()]) <= 10
 
 
+@pytest.mark.slow
 def test_the_readmes_python(tmp_path):
     """Its blocks run as they stand, in a folder that has the branch they name."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"),
@@ -62,6 +64,7 @@ def test_the_readmes_python(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="the script is bash's")
 def test_headless_estimation(branch_folder, tmp_path):
     """A recording becomes a pull, and the estimate's JSON stands beside the folder."""

@@ -138,6 +138,7 @@ def test_virtual_pull(folder, expected):
                                atol=1e-5)
 
 
+@pytest.mark.slow
 def test_session(folder, expected):
     """A client of a session that answers with the full model."""
     from limber.session.client import InteractiveSession

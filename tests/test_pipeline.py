@@ -53,6 +53,7 @@ def done(tmp_path_factory) -> tuple[Path, dict[str, dict]]:
     return branch, results
 
 
+@pytest.mark.slow
 def test_every_stage_reports_what_the_design_says(done):
     """Each result has the contract's keys, `done`, no error, and finite numbers."""
     _, results = done
@@ -97,6 +98,7 @@ def test_report_is_whole_and_self_contained(done):
     assert "This pull was simulated" in html
 
 
+@pytest.mark.slow
 def test_picture_shows_something(done):
     """The render is a PNG with many colours: a branch, not an empty background."""
     from PIL import Image
@@ -108,6 +110,7 @@ def test_picture_shows_something(done):
     assert len(colours) > 500
 
 
+@pytest.mark.slow
 def test_second_run_computes_nothing(done):
     """A stage whose input and settings have not changed is skipped and gives the same result."""
     branch, results = done
@@ -120,6 +123,7 @@ def test_second_run_computes_nothing(done):
     Branch.open(branch, verify=True)
 
 
+@pytest.mark.slow
 def test_folder_can_be_moved(done, tmp_path):
     """A copy elsewhere verifies and goes on from where it was."""
     branch, _ = done
@@ -129,6 +133,7 @@ def test_folder_can_be_moved(done, tmp_path):
     assert run_stage(["report", str(moved)])["missing"] == []
 
 
+@pytest.mark.slow
 def test_bad_cloud_costs_no_result(done, tmp_path):
     """A truncated cloud on an existing folder ends with 2 and leaves every file as it was."""
     branch, _ = done
@@ -141,6 +146,7 @@ def test_bad_cloud_costs_no_result(done, tmp_path):
     assert {p: p.read_bytes() for p in branch.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize(("stage", "options"), [
     ("estimate", ["--force"]), ("energy", ["--force", "--samples", "60"]),

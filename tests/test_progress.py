@@ -48,6 +48,7 @@ def test_json_lines_are_whole_and_throttled():
     assert lines[0]["loss"] == 0.5
 
 
+@pytest.mark.slow
 def test_a_sign_of_life_says_what_was_computed():
     """Beats come while nothing is reported; what this process and its children compute is in them.
     """

@@ -89,6 +89,7 @@ def test_a_header_that_is_no_header(tmp_path):
         read_arrays(path, "numbers")
 
 
+@pytest.mark.slow
 def test_an_archive_that_would_flood_the_memory(tmp_path):
     """A megabyte that expands to a gigabyte is refused before it does."""
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:

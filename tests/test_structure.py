@@ -24,6 +24,7 @@ def imported_modules(folder: Path) -> dict[Path, set[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_core_never_imports_bpy():
     """No file of worker/limber imports bpy or another Blender module."""
     blender = {"bpy", "bmesh", "mathutils", "gpu", "bl_ext"}
@@ -163,6 +164,7 @@ def test_layers_import_downwards():
     graphlib.TopologicalSorter({name: others - {name} for name, others in graph.items()}).prepare()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", list(PARTS))
 def test_parts_of_a_package_import_downwards(package):
     """No part imports one after it, nor a plain file of the package that imports it back."""
@@ -207,6 +209,7 @@ OWN_LINES = {"robot", "session", "jobs", "batch.records", "store.lock", "estimat
              "geometry.tets.tetwild_process"}
 
 
+@pytest.mark.slow
 def test_files_come_in_through_one_door():
     """JSON, TOML and arrays are read by limber.reading, which checks them, and nowhere else."""
     doors = ("json.loads", "json.load", "tomllib.loads", "tomllib.load", "np.load",
@@ -231,6 +234,7 @@ def test_numerical_packages_know_no_branch_folder():
     assert not wrong
 
 
+@pytest.mark.slow
 def test_only_stages_open_branch_folders():
     """Branch.open and Branch.create are called by stages, the session and the store alone."""
     allowed = {"stages", "session", "store", "commands", "closed_loop"}
@@ -260,6 +264,7 @@ def test_public_names_are_there(package):
     assert tried and not failed
 
 
+@pytest.mark.slow
 def test_dependencies_are_imported():
     """Every dependency in pyproject.toml is imported by the core or called by it by name."""
     import re

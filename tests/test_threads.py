@@ -27,6 +27,7 @@ solve_static(BranchModel(mesh, young=1e8, poisson=0.3, density=900.0)).require()
 """
 
 
+@pytest.mark.slow
 def test_a_leafy_scan_has_one_skeleton_whatever_threads_the_user_has(tmp_path: Path) -> None:
     """With 1, 2 and 4 threads, also of libraries loaded first, and after a solve: to the last bit.
 
@@ -60,6 +61,7 @@ def test_limber_leaves_no_library_with_two_threads(before: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_factorisation_leaves_every_library_with_one_thread():
     """After a static solve all BLAS libraries of the process, cvxopt's too, use one thread."""
     program = (

@@ -70,6 +70,7 @@ def test_a_worker_that_is_missing(bpy, use, monkeypatch, tmp_path):
     assert bpy.ops.limber.report() == {"FINISHED"}
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs(bpy, use, monkeypatch):
     """It says nothing and does not end when asked: that is told, and it is ended all the same."""
     from tests.addon.test_panels import _draw
@@ -93,6 +94,7 @@ def test_a_worker_that_hangs(bpy, use, monkeypatch):
     assert bpy.ops.limber.report() == {"FINISHED"}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc"), reason="reads /proc")
 def test_nothing_of_a_job_stays_open(bpy, use):
     """Pipes and threads of twenty jobs are gone with them."""

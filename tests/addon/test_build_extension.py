@@ -145,6 +145,7 @@ def _check(path):
     assert not [name for name in names if "__pycache__" in name or name.endswith(".pyc")]
 
 
+@pytest.mark.slow
 def test_by_the_bpy_package(tmp_path, bpy):
     """Blender's own validator, as the bpy package of .venv has it, accepts folder and zip."""
     if not list((ROOT / ".venv").glob("lib/python3*/site-packages/bpy")):

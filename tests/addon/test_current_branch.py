@@ -43,6 +43,7 @@ def _mark(bpy, parent):
     return empty
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chosen", ["surface", "another part", "what hangs on it"])
 def test_a_step_works_on_the_branch_of_the_active_object(bpy, two, chosen):
     """a opened, then b, then a made active: the target goes into a, and all else says a too."""
@@ -59,6 +60,7 @@ def test_a_step_works_on_the_branch_of_the_active_object(bpy, two, chosen):
     assert part("panels.steps").state_of(scene, "target")[0] is part("steps").StepState.DONE
 
 
+@pytest.mark.slow
 def test_the_branch_used_last_stays(bpy, two):
     """A lamp is chosen after a: still a. The one opened last is the current one before."""
     folders, (first, second) = two
@@ -77,6 +79,7 @@ def test_the_branch_used_last_stays(bpy, two):
     assert branches.find_surface(scene) == branches.surface_of(first)
 
 
+@pytest.mark.slow
 def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
     """Entered in the panel or given by a script: its branch becomes active; one that is not shown
     leaves none active."""
@@ -99,6 +102,7 @@ def test_a_folder_that_was_chosen_is_the_current_one(bpy, two, tmp_path):
     assert [_targets(folder) for folder in (*folders, third)] == [[], ["fruit"], ["bud"]]
 
 
+@pytest.mark.slow
 def test_a_refused_folder_leaves_the_current_one(bpy, two, tmp_path):
     """What cannot be opened is not where the next step writes."""
     folders, _ = two
@@ -107,6 +111,7 @@ def test_a_refused_folder_leaves_the_current_one(bpy, two, tmp_path):
     assert part("branches").current_folder(bpy.context.scene) == folders[1]
 
 
+@pytest.mark.slow
 def test_a_scan_stands_for_its_own_folder(bpy, two, tmp_path):
     """Imported beside a branch, then chosen again: a branch is made in the scan's folder."""
     folders, (first, _) = two
@@ -132,6 +137,7 @@ def test_a_shipped_scene_has_its_folder(bpy, registered, name):
     assert part("panels.steps").state_of(scene, "estimate")[1] is not None
 
 
+@pytest.mark.slow
 def test_a_scene_of_the_worker_has_its_folder(bpy, registered, bare_beam, capsys):
     """`limber scene`: relative to the file; moved without its folder, the steps say what to do."""
     there = bare_beam.folder.parent / "scenes" / "beam.blend"

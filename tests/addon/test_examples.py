@@ -20,6 +20,7 @@ def run(bpy, registered, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 def test_scan_to_branch(bpy, run, tmp_path):
     """A scan in millimetres becomes a branch that a fruit bends down, in a file."""
     scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.006).cloud
@@ -38,6 +39,7 @@ def test_scan_to_branch(bpy, run, tmp_path):
     assert 1e-4 < before - top() < 0.3
 
 
+@pytest.mark.slow
 def test_colour_and_render(bpy, run, beam, tmp_path):
     """The bent beam in the colours of its energy: transparent around it, and not of one colour."""
     from PIL import Image
@@ -76,6 +78,7 @@ def test_a_picture_without_a_branch_is_refused(bpy, tmp_path, shown):
         script["check"](tmp_path / "b.png")
 
 
+@pytest.mark.slow
 def test_compare_branches(bpy, run, beam, tmp_path):
     """Two branches stand apart, each with its row in the table."""
     other = tmp_path / "other.branch"

@@ -93,6 +93,7 @@ def test_cancel_is_asked_first(jobs, tmp_path):
     assert job.result["cleaned"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc"), reason="reads /proc")
 def test_stubborn_worker_is_killed_with_its_children(jobs, tmp_path, monkeypatch):
     """A worker that ignores SIGTERM is killed after a while, and what it started as well."""
@@ -115,6 +116,7 @@ def test_stubborn_worker_is_killed_with_its_children(jobs, tmp_path, monkeypatch
     assert not _alive(child)
 
 
+@pytest.mark.slow
 def test_jobs_wait_for_their_turn(jobs, tmp_path):
     """One after the other, in order; one that is taken out is not run."""
     log = tmp_path / "log.txt"
@@ -144,6 +146,7 @@ def test_what_follows_a_failure_is_not_run(jobs, tmp_path):
     assert other.wait() is jobs.JobState.DONE
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs_is_told_from_one_that_works(jobs, tmp_path, monkeypatch):
     """Signs of life with work, without work, and none; what remains by what was done."""
     monkeypatch.setattr(jobs, "_SILENT_SECONDS", 1.0)

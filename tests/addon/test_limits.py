@@ -34,6 +34,7 @@ def test_colours_go_from_green_to_red(limits):
     assert colours[4, 1] < 0.3 and (colours[4] == colours[5]).all()
 
 
+@pytest.mark.slow
 def test_the_branch_is_red_beyond_a_limit_and_gets_its_colours_back(bpy, limits, beam):
     """Whatever it was coloured by; turning it on or off twice is nothing."""
     bpy.ops.limber.open_result(directory=str(beam.folder))

@@ -130,6 +130,7 @@ def test_reconstruct_hands_the_worker_what_the_user_chose(bpy, registered, tmp_p
                            str(tmp_path / "scan.xyz")]
 
 
+@pytest.mark.slow
 def test_open_result_and_play(bpy, registered, beam):
     """A branch folder is opened through the worker; play starts at the first frame."""
     assert bpy.ops.limber.open_result(directory=str(beam.folder)) == {"FINISHED"}
@@ -148,6 +149,7 @@ def test_open_result_refuses_other_folders(bpy, registered, tmp_path):
         bpy.ops.limber.open_result(directory=str(tmp_path))
 
 
+@pytest.mark.slow
 def test_open_result_of_a_damaged_folder(bpy, registered, beam):
     """The worker's complaint about a checksum reaches the user."""
     path = beam.folder / "plans" / "to-goal.csv"
@@ -156,6 +158,7 @@ def test_open_result_of_a_damaged_folder(bpy, registered, beam):
         bpy.ops.limber.open_result(directory=str(beam.folder))
 
 
+@pytest.mark.slow
 def test_play_says_when_the_frames_are_gone(bpy, registered, beam):
     """A cache that went missing is an error, not a branch that stands still."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
@@ -164,6 +167,7 @@ def test_play_says_when_the_frames_are_gone(bpy, registered, beam):
         bpy.ops.limber.play()
 
 
+@pytest.mark.slow
 def test_color_by_refuses_unknown(bpy, registered, beam):
     """Colouring by something that the branch does not have is an error."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
@@ -172,6 +176,7 @@ def test_color_by_refuses_unknown(bpy, registered, beam):
         bpy.ops.limber.color_by(scalar="stress")
 
 
+@pytest.mark.slow
 def test_check_worker(bpy, registered):
     """The worker that is found answers."""
     assert bpy.ops.limber.check_worker() == {"FINISHED"}
@@ -254,6 +259,7 @@ def test_keywords_are_the_scenes_settings(bpy, registered, beam, monkeypatch):
         bpy.ops.limber.import_pull(name="one")
 
 
+@pytest.mark.slow
 def test_a_stage_runs_and_its_outcome_stays(bpy, registered, branch_folder):
     """The worker makes a report; its state is done; a failure and a warning are kept to be read."""
     steps = importlib.import_module("limber_addon.panels.steps")

@@ -118,6 +118,7 @@ def test_every_panel_is_in_the_tab(bpy, panels):
     assert orders == sorted(set(orders))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "operators"), [
     ("scan", ["limber.import_cloud"]), ("skeleton", ["limber.reconstruct", "limber.skeleton"]),
     ("mesh", ["limber.reconstruct", "limber.mesh"]),
@@ -153,6 +154,7 @@ def test_the_expert_settings_are_shown_on_demand(bpy, panels):
     assert "contraction_points" in _draw_step(bpy, "skeleton").names("prop")
 
 
+@pytest.mark.slow
 def test_a_step_says_how_far_it_is(bpy, panels, branch_folder):
     """Not run, done, out of date by its input or its settings, failed; and what comes next."""
     module = importlib.import_module("limber_addon.panels.steps")
@@ -199,6 +201,7 @@ def test_an_empty_scene(bpy, panels):
     assert "Young: assumed, not measured" in _draw_step(bpy, "material").names("label")
 
 
+@pytest.mark.slow
 def test_an_opened_result(bpy, panels, beam):
     """With a result: its legend with units, play, and the energy of the frame."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
@@ -213,6 +216,7 @@ def test_an_opened_result(bpy, panels, beam):
     assert drawn.names("label") == ["Energy 10 mJ"]
 
 
+@pytest.mark.slow
 def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
     """The example: E with its interval, both paths with their energy, what is proven; graphs."""
     shutil.copytree(EXAMPLE, tmp_path / "example")
@@ -233,6 +237,7 @@ def test_paths_and_moduli_stand_side_by_side(bpy, panels, tmp_path):
     assert "limber.graph" in plan.names("operator") and "limber.graph" in estimate.names("operator")
 
 
+@pytest.mark.slow
 def test_where_to_start(bpy, panels, beam):
     """An empty scene offers the example, a scan, a folder; with a branch it makes way."""
     drawn = _draw(panels("start"), bpy.context)

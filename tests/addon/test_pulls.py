@@ -82,6 +82,7 @@ def test_what_was_measured_follows_the_frames(bpy, opened, tmp_path):
     assert scene is not None
 
 
+@pytest.mark.slow
 def test_it_is_hidden_and_gone_with_its_pull(bpy, opened, pulled, tmp_path):
     """A button hides it; another motion of the branch does not have it."""
     bpy.ops.limber.show(group="observed", hide=True)
@@ -120,6 +121,7 @@ def test_the_panel_plays_recordings(bpy, opened, pulled):
         bpy.ops.limber.replay_pull(pull="q")
 
 
+@pytest.mark.slow
 def test_a_pull_of_the_example_is_replayed(bpy, registered, tmp_path):
     """By the worker: the branch moves as the gripper did, with its measured points over it, and
     the next plan or motion is shown instead."""

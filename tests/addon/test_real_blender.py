@@ -60,6 +60,7 @@ def run(blender, environment, extension_zip):
     return run
 
 
+@pytest.mark.slow
 def test_it_is_enabled(run):
     """The installed extension is on: its operators and its preferences are there."""
     done = run("-b", "--python-exit-code", "9", "--python-expr", (
@@ -71,6 +72,7 @@ def test_it_is_enabled(run):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_command_is_the_workers(run, beam):
     """`blender -b --command limber ...`: help, a result as the last line, exit codes."""
     done = run("-b", "--command", "limber", "--help")
@@ -86,6 +88,7 @@ def test_command_is_the_workers(run, beam):
     assert "There is no folder" in json.loads(done.stdout.splitlines()[-1])["error"]
 
 
+@pytest.mark.slow
 def test_without_a_worker(run, has_worker):
     """No worker: exit code 3 and what to do about it."""
     if has_worker:
@@ -123,6 +126,7 @@ def test_the_worker_comes_along(blender, tmp_path):
     assert (tmp_path / "scan.branch" / "mesh.vtu").is_file()
 
 
+@pytest.mark.slow
 def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
     """`limber scene` by this Blender; the file opens in it and its frames are right."""
     from limber.cli import call
@@ -153,6 +157,7 @@ def test_scene_is_made_and_opens(blender, run, beam, monkeypatch, capsys):
         assert difference < 1e-6
 
 
+@pytest.mark.slow
 def test_interface(run, blender, environment, beam, tmp_path):
     """In a window, by events: the tab opens, a scan is imported and reconstructed by clicks, a job
     cancelled by a click, a result opened, all by the worker beside the interface, and played."""
@@ -179,6 +184,7 @@ def test_interface(run, blender, environment, beam, tmp_path):
         assert _colour_count(tmp_path / f"{name}.png") > 50, "a window, not a blank screen"
 
 
+@pytest.mark.slow
 def test_the_first_view(run, blender, environment, tmp_path):
     """Beside Blender's startup cube: example and scan are in sight, whole; undo shows the cube."""
     require_screen()
@@ -194,6 +200,7 @@ def test_the_first_view(run, blender, environment, tmp_path):
     assert _coloured_count(tmp_path / "branch.png") > 1000
 
 
+@pytest.mark.slow
 def test_a_picture_by_an_example(run, beam, tmp_path):
     """At factory start, beside the cube: the branch is in the picture; a failure has a code."""
     example = FOLDER.parents[1] / "addon" / "examples" / "colour_and_render.py"
@@ -215,6 +222,7 @@ def _coloured_count(path: Path, part: tuple[int, ...] | None = (200, 200, 800, 6
     return int((np.ptp(pixels, axis=2) > 90).sum())
 
 
+@pytest.mark.slow
 def test_grab(run, blender, environment, beam, tmp_path):
     """By mouse events: pressed and dragged the beam follows; kept, left, undone; Esc restores.
 
@@ -283,6 +291,7 @@ def _cropped(path: Path):
     return Image.open(path).convert("RGB").crop((0, 28, 1056, 718))
 
 
+@pytest.mark.slow
 def test_skeleton(run, blender, environment, tmp_path):
     """In Edit Mode: a node moved, a twig cut, one hung over; undone; applied by the worker."""
     require_screen()

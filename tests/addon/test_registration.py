@@ -38,6 +38,7 @@ def test_failed_registration_leaves_nothing(bpy, addon, monkeypatch):
     assert not _ours(bpy)
 
 
+@pytest.mark.slow
 def test_command_entry(registered, capfd):
     """`blender --command limber ARGUMENTS` is `limber ARGUMENTS`: output and exit code."""
     command = importlib.import_module("limber_addon.command")

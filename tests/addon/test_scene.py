@@ -111,6 +111,7 @@ def test_marks_stand_at_their_first_place_on_the_first_frame(bpy, addon, beam, t
         assert abs(thing.location.x) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_motion_starts_and_runs_as_it_is_told(bpy, registered, beam, positions):
     """At half its speed from frame 11 on: the surface and what is keyed with it stay together."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
@@ -196,6 +197,7 @@ def test_paths_are_relative(bpy, addon, beam, tmp_path):
         "//beam.branch/frames/to-goal.pc2")
 
 
+@pytest.mark.slow
 def test_path_becomes_relative_when_saved_later(bpy, registered, beam, positions, tmp_path):
     """Opened before the first save, saved beside the folder, both moved: it still plays."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
@@ -282,6 +284,7 @@ def test_command_says_what_is_missing(beam, tmp_path, monkeypatch, capsys):
     assert call(["scene", str(beam.folder), "-o", str(tmp_path / "file" / "x.blend")]) == 2
 
 
+@pytest.mark.slow
 def test_scene_script_reports_its_failure(bpy, beam, write_pc2, tmp_path):
     """Frames of another mesh end the process with code 3 and a reason, not with a still branch."""
     from limber.scene.data import scene_data
@@ -330,6 +333,7 @@ def test_the_robots_links_go_with_the_frames(bpy, addon, beam, tmp_path):
             np.testing.assert_allclose(ends, links[frame - 1, number:number + 2], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="kill -9")
 def test_a_killed_scene_leaves_no_blender(bpy, beam, tmp_path):
     """SIGKILL to `limber scene` while it renders: what it started ends within seconds."""

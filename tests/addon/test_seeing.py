@@ -220,6 +220,7 @@ def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
     assert bpy.ops.limber.play() == {"FINISHED"}
 
 
+@pytest.mark.slow
 def test_the_example_opens(bpy, registered, tmp_path):
     """The branch that comes along, in a copy: with all its results."""
     assert bpy.ops.limber.open_example(directory=str(tmp_path / "mine")) == {"FINISHED"}

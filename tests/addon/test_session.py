@@ -47,6 +47,7 @@ def until(session, is_there, seconds=200.0):
     raise TimeoutError(session.message)
 
 
+@pytest.mark.slow
 def test_a_branch_is_held_and_bent(started, beam):
     """The frame that answers a move has the grasp's place where it was sent, at some force."""
     session = started([sys.executable, "-m", "limber", "session", "--no-grasp", "--no-reduced",
@@ -68,6 +69,7 @@ def test_a_branch_is_held_and_bent(started, beam):
     assert not os.path.exists(session.hello["positions"])
 
 
+@pytest.mark.slow
 def test_another_mesh_is_refused(started, beam):
     session = started([sys.executable, "-m", "limber", "session", "--no-grasp",
                        str(beam.folder)], 17)

@@ -13,6 +13,7 @@ def opened(bpy, registered, beam):
     return importlib.import_module("limber_addon.branches").find_surface(bpy.context.scene)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [".abc", ".usdc"])
 def test_the_motion_is_in_the_file(bpy, opened, beam, tmp_path, kind):
     """Read back, the branch is at each frame where it was; what was selected still is."""
@@ -35,11 +36,13 @@ def test_the_motion_is_in_the_file(bpy, opened, beam, tmp_path, kind):
         np.testing.assert_allclose(places, beam.frames[number], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_kind_that_is_none_is_refused(bpy, opened, tmp_path):
     with pytest.raises(RuntimeError, match=r"name it \.abc"):
         bpy.ops.limber.export_motion(filepath=str(tmp_path / "motion.fbx"))
 
 
+@pytest.mark.slow
 def test_the_turntable_goes_round_and_sees_the_branch(bpy, opened):
     """Once round in its frames, at an even speed; each corner of the branch is in the picture."""
     from bpy_extras.object_utils import world_to_camera_view
@@ -62,6 +65,7 @@ def test_the_turntable_goes_round_and_sees_the_branch(bpy, opened):
             assert 0 < seen.x < 1 and 0 < seen.y < 1 and seen.z > 0
 
 
+@pytest.mark.slow
 def test_the_legend_is_that_of_the_colours_shown(bpy, opened):
     """Its scale follows the button; the bar has a row a stop, in the colours of the screen."""
     legend = importlib.import_module("limber_addon.overlays.legend")
@@ -98,6 +102,7 @@ def test_a_scan_keeps_its_colours_and_gives_way_to_its_branch(bpy, registered, t
     assert not cloud.hide_viewport
 
 
+@pytest.mark.slow
 def test_folder_and_file_move_together(bpy, opened, beam, tmp_path):
     """Saved, moved with its branch, opened there; saved again elsewhere: the folder is found."""
     from pathlib import Path
@@ -120,6 +125,7 @@ def test_folder_and_file_move_together(bpy, opened, beam, tmp_path):
     assert len([c for c in bpy.context.scene.collection.children if "limber_folder" in c]) == 1
 
 
+@pytest.mark.slow
 def test_a_branch_is_appended_to_another_file(bpy, opened, beam, tmp_path):
     """Its folder is named as the other file sees it, saved or not; before 4.3 by one button."""
     from pathlib import Path

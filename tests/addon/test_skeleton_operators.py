@@ -38,6 +38,7 @@ def _tip(folder):
     return int(np.flatnonzero(skeleton.branch == 1)[-1])
 
 
+@pytest.mark.slow
 def test_edits_reach_the_mesh_and_are_marked(bpy, opened):
     """A node moved, a radius set, a twig's end cut: the worker's skeleton has it; it is marked."""
     folder, skeleton = opened
@@ -70,6 +71,7 @@ def test_edits_reach_the_mesh_and_are_marked(bpy, opened):
     np.testing.assert_allclose(again.nodes, before.nodes, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_path):
     """What was moved stays where the same skeleton is opened again, and in the .blend."""
     folder, skeleton = opened
@@ -90,6 +92,7 @@ def test_edits_not_applied_outlive_opening_and_a_saved_file(bpy, opened, tmp_pat
         bpy.ops.limber.apply_skeleton()
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
     """A circle is the worker's error; the folder and what was marked stay."""
     folder, skeleton = opened
@@ -111,6 +114,7 @@ def test_what_does_not_fit_is_said_and_nothing_is_lost(bpy, opened):
     assert skeletons.nodes_of(skeleton()).marks.sum() == 0
 
 
+@pytest.mark.slow
 def test_loads_and_exports_have_a_button(bpy, opened, tmp_path):
     """A fruit and a cut at the 3D cursor: the answer stays with the button. A file is written."""
     folder, _ = opened

@@ -14,6 +14,7 @@ def _is_in_sight(cube):
     return not cube.hide_get() and not cube.hide_render
 
 
+@pytest.mark.slow
 def test_it_makes_way_for_a_branch(bpy, cube, beam, capfd):
     """Hidden in view and picture, and named; camera and light stay. Shown again, it stays."""
     assert bpy.ops.limber.open_result(directory=str(beam.folder)) == {"FINISHED"}

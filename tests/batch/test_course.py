@@ -57,6 +57,7 @@ def states(path: Path) -> list[list[str]]:
     return [[records.of(branch, task).status for task in branch.tasks] for branch in jobs.branches]
 
 
+@pytest.mark.slow
 def test_run_fail_mend_and_resume(orchard, capsys):
     """A broken branch fails alone; what is done is kept; --retry-failed brings the rest."""
     jobs = orchard / "jobs.toml"
@@ -94,6 +95,7 @@ def test_run_fail_mend_and_resume(orchard, capsys):
     assert "two target:flower failed" in told and "one virtual-pull:pull-2 done after" in told
 
 
+@pytest.mark.slow
 def test_a_killed_batch_goes_on(orchard, monkeypatch):
     """SIGKILL to the batch: nothing half made, a new run ends with what an undisturbed one has."""
     jobs = orchard / "jobs.toml"
@@ -188,6 +190,7 @@ def test_records_and_log_stay_short(orchard, monkeypatch):
     assert files[0].read_text().splitlines()[-1].endswith("one line 99 of %s text")
 
 
+@pytest.mark.slow
 def test_text_of_files_is_no_page_and_no_formula(orchard, capsys):
     """A branch named like a formula or a script is text in the table and on the page."""
     name = "=1+<b>"

@@ -50,6 +50,7 @@ def targets(orchard, name) -> list[str]:
     return [one["name"] for one in json.loads(branch.path("targets.json").read_text())["targets"]]
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_its_own_branch(orchard, batch, here, monkeypatch):
     flush = journal.flush_tree
     calls = []
@@ -89,6 +90,7 @@ def test_a_lost_branch_ends_alone(orchard, batch, here, monkeypatch):
     assert code == 0 and states == [["up to date", "done"], ["up to date", "up to date"]], states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("trouble", ["gone", "full"])
 def test_lost_results_stop_the_batch(orchard, batch, here, monkeypatch, trouble):
     """Nothing is written where they were; back again, what is stored is not done again."""

@@ -231,6 +231,7 @@ def test_no_file_that_a_link_names_is_put_to_an_address(away, memory, tmp_path):
         put_out(jobs, job)
 
 
+@pytest.mark.slow
 def test_a_batch_from_addresses_to_an_address(memory, tmp_path, capsys):
     """Scans and results in fsspec's memory; again from nothing here it repeats no stage."""
     for name in ("one", "two"):

@@ -34,6 +34,7 @@ def test_the_bending_modulus_is_the_cantilevers():
     assert 6.0 * 0.3**3 / (3 * young * moment) == pytest.approx(0.04, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_arm_stands_beside_the_branch_and_its_gripper_on_it():
     point, axis = np.array([0.05, -0.02, 0.34]), np.array([0.2, -0.1, 0.97])
     arm = arm_named("ur5e")

@@ -38,6 +38,7 @@ def shaken(small, small_pull):
     return forward
 
 
+@pytest.mark.slow
 def test_sensitivities_equal_central_differences(shaken):
     """Moduli, density and both dampings, through all time steps."""
     objective = Objective([shaken], ParameterSpace.separate(TRUE, EXTRA))
@@ -51,6 +52,7 @@ def test_sensitivities_equal_central_differences(shaken):
         assert np.linalg.norm(off) < 0.02 * np.linalg.norm(exact[:, column]) + 1e-3
 
 
+@pytest.mark.slow
 def test_inertia_gives_the_scale_without_force(shaken):
     """With the density known, motion alone tells how stiff the branch is."""
     objective = Objective([shaken], ParameterSpace.separate(replace(TRUE, young=2.0 * YOUNG)))

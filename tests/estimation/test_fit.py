@@ -42,6 +42,7 @@ def relative(values):
     return values.young / TRUTH - 1
 
 
+@pytest.mark.slow
 def test_sensitivities_equal_central_differences(small_bench, small_pull):
     """Every column of the Jacobian, for log E and Poisson's ratio, in both kinds of drive."""
     for drive in ("pose", "force"):
@@ -59,6 +60,7 @@ def test_sensitivities_equal_central_differences(small_bench, small_pull):
                 exact[:, column])
 
 
+@pytest.mark.slow
 def test_exact_data_give_the_truth(small_bench, small_pull):
     """From another mesh and a uniform start, without noise: within what the meshes differ."""
     found = small_bench.fit([measured(small_pull, 0, points=0, force=0)], SETTINGS)
@@ -67,6 +69,7 @@ def test_exact_data_give_the_truth(small_bench, small_pull):
     assert not found.warnings
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_and_noise_is_recognised(small_bench, noisy):
     """With noise as stated: the variance factor is near 1, all intervals hold the truth."""
     found = small_bench.fit([noisy], SETTINGS)
@@ -78,6 +81,7 @@ def test_intervals_hold_the_truth_and_noise_is_recognised(small_bench, noisy):
     assert np.all(TRUTH > found.values.young * (low / found.values.young) ** wide)
 
 
+@pytest.mark.slow
 def test_nelder_mead_finds_the_same_with_many_more_simulations(small_bench, noisy):
     """The paper's estimator ends at the loss of Gauss-Newton, after many more simulations."""
     settings = SETTINGS.model_copy(update={"key_frames": 4})
@@ -89,6 +93,7 @@ def test_nelder_mead_finds_the_same_with_many_more_simulations(small_bench, nois
     assert theirs.forward_count > 8 * ours.forward_count
 
 
+@pytest.mark.slow
 def test_outliers_hardly_matter_and_are_named(small_bench, noisy):
     """One point in twenty displaced by centimetres: the moduli stay, the outliers are named."""
     rng = np.random.default_rng(5)
@@ -150,6 +155,7 @@ def test_what_lies_beyond_the_grasp_is_linked(at_truth, objective):
     assert link_unresolved(at_truth, objective.space)[1] == []
 
 
+@pytest.mark.slow
 def test_a_pull_of_another_branch_shows(small_bench, noisy):
     """Points that move otherwise than this branch can: the misfit is said."""
     seen = noisy.observations
@@ -159,6 +165,7 @@ def test_a_pull_of_another_branch_shows(small_bench, noisy):
     assert any("pull of this branch" in message for message in found.warnings)
 
 
+@pytest.mark.slow
 def test_force_in_another_unit_shows(small_bench, noisy):
     """Forces in kilonewtons, taken for newtons, give an impossible modulus: named."""
     pull = replace(noisy, wrenches=noisy.wrenches * 1e-4, entry=noisy.entry.model_copy(
@@ -217,6 +224,7 @@ def test_a_running_fit_tells_how_well_it_knows_the_moduli(small_bench, noisy):
     assert np.log(factors) == pytest.approx(1.96 * np.sqrt(np.diag(covariance)), rel=0.1)
 
 
+@pytest.mark.slow
 def test_three_pulls_know_more_than_one(small_bench, small_pull):
     """The same pull measured three times narrows every interval by about the root of three."""
     names = [replace(measured(small_pull, seed), name=f"pull-{seed}") for seed in (1, 2, 3)]
@@ -232,6 +240,7 @@ def test_free_values_that_are_not_free(small_bench):
     assert space.unpack(np.log(TRUTH)).poisson == 0.31
 
 
+@pytest.mark.slow
 def test_held_out_pulls_are_scored(small_bench, small_pull):
     """Fitted on one pull, another is foretold to within its noise."""
     names = [replace(measured(small_pull, seed, points=5e-4, force=0.01), name=f"pull-{seed}")

@@ -10,6 +10,7 @@ from limber.estimation.online import follow
 from limber.recordings.recording import write_pull
 
 
+@pytest.mark.slow
 def test_rows_are_taken_as_they_are_written(tmp_path, plain_pull, monkeypatch):
     """A recorder that appends in pieces, cut inside lines: every frame comes once, in order."""
     monkeypatch.setattr(follow, "QUIET_SECONDS", 0.6)
@@ -66,6 +67,7 @@ def test_a_pull_that_is_being_recorded_is_found_where_it_grows(bare_branch):
         assert told() == bare_branch.folder / "pulls" / "live"
 
 
+@pytest.mark.slow
 def test_a_recording_that_ends_is_followed_to_its_last_frame(bare_branch, tmp_path, plain_pull,
                                                              monkeypatch):
     """Its files move into the branch then; slow preparations may even see nothing else of it."""

@@ -33,6 +33,7 @@ def noisy(small_pull):
     return driven(measured(small_pull, 3))
 
 
+@pytest.mark.slow
 def test_noise_of_the_force_is_no_modulus(small_bench, noisy):
     """2 % of force noise: every interval holds the truth; the inner moduli are known to 15 %; no
     misfit is left, whose share the force's errors were where it was taken as exact.
@@ -93,6 +94,7 @@ def test_a_stated_load_is_exact_and_a_jerky_force_gets_more_key_frames(noisy):
     assert len(course_of(replace(frames, wrenches=jerky), sigma, 4, 3).keys) == len(frames)
 
 
+@pytest.mark.slow
 def test_a_clamped_gripper_needs_its_torque(small, small_bench):
     """Its force and torque together bend the branch as its pose does; without torque: refused.
 
@@ -151,6 +153,7 @@ def test_response_of_a_small_motion(small_bench):
     assert np.linalg.norm(found - true) < 0.03 * np.linalg.norm(true)
 
 
+@pytest.mark.slow
 def test_nelder_mead_says_why_it_ended(small_bench, noisy):
     """Too few simulations, and a threshold under the noise: neither converged, each in words."""
     settings = SETTINGS.model_copy(update={"key_frames": 4})

@@ -1,6 +1,7 @@
 """Moduli with the form of their field integrated out, against the integral itself."""
 
 import numpy as np
+import pytest
 from scipy.optimize import least_squares, minimize
 
 from limber.estimation.field_form import YoungField
@@ -28,6 +29,7 @@ def two_moduli():
     return field, space, readings, wanted
 
 
+@pytest.mark.slow
 def test_the_step_leads_to_the_mode_of_the_integral():
     """Nearly there, and to a smaller step of the moduli than where all are likeliest together."""
     field, space, readings, wanted = two_moduli()

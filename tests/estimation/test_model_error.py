@@ -58,6 +58,7 @@ def test_a_refined_mesh_is_the_same_body(small_bench):
     assert base[:, 2].max() < 1e-3 and len(base) > (mesh.point_data["fixed"] == 1).sum()
 
 
+@pytest.mark.slow
 def test_the_mesh_error_foretells_how_a_much_finer_mesh_differs(small):
     """A mesh of few long elements is too stiff; by how much is told, to be corrected."""
     bench = Bench(small, slice_length=4.0, sides=6)

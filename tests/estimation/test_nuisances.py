@@ -107,6 +107,7 @@ def test_a_cell_that_is_off_does_not_move_the_moduli(found):
     assert found.fit.converged and found.uncertainty.variance_factor < 1.3
 
 
+@pytest.mark.slow
 def test_what_is_off_is_found_and_named(found):
     """Within its interval, and in a sentence that says how much."""
     errors = {each["name"]: each for each in found.cell_errors}
@@ -152,6 +153,7 @@ def test_a_force_that_leads_nowhere_says_how_well_it_is_known(small_bench, small
         fit_pulls(objective, objective.space.base, SETTINGS.model_copy(update={"young": 1e7}))
 
 
+@pytest.mark.slow
 def test_a_start_without_equilibrium_gives_way(small_bench, small_pull, monkeypatch):
     """The same stiffer and moduli that fall outwards are tried, from the force as it was read; the
     better one leads."""
@@ -196,6 +198,7 @@ def test_a_start_that_explains_the_pull_is_not_sought_elsewhere(small_bench, sma
     assert np.diff(np.log(start.young)) == pytest.approx(-FALL)
 
 
+@pytest.mark.slow
 def test_a_first_fit_that_explains_nothing_says_so(small_bench, small_pull):
     """Its force is not followed either: under the moduli it ran off to a branch folds up."""
     seen = small_pull.observations
@@ -208,6 +211,7 @@ def test_a_first_fit_that_explains_nothing_says_so(small_bench, small_pull):
         assert explains == is_good
 
 
+@pytest.mark.slow
 def test_a_force_that_misleads_a_first_fit_is_not_followed(small_bench, small_pull, monkeypatch):
     """Where its linearisation overshoots, the branch stays under the force that was read."""
     objective = objective_of(small_bench, small_pull)
@@ -234,6 +238,7 @@ def test_calibration_survives_a_pull_file(tmp_path, small_pull):
     assert read_entry(tmp_path / "pull.toml").calibration == entry.calibration
 
 
+@pytest.mark.slow
 def test_a_path_that_leads_says_so_and_widens_the_interval(small_bench, small_pull):
     """Without a measured force the frame counts as exact in the fit: a millimetre of it enters the
     interval, ten times less of it ten times less, and where it is known exactly there is no word.

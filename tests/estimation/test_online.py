@@ -65,6 +65,7 @@ def followed(reduced, full, pull, exact, repeat=1):
     return estimator, states
 
 
+@pytest.mark.slow
 def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
     """From few training grasps the reduced model alone misses; the full model sets it right, well
     within the interval, and the interval says beforehand that nobody has checked.
@@ -82,6 +83,7 @@ def test_it_ends_where_all_frames_together_do(bench, pull, batch, full):
     assert not states[1].enough
 
 
+@pytest.mark.slow
 def test_a_basis_for_other_moduli_is_made_on_the_way(bench, pull, batch, full):
     """Begun a factor of three too stiff, outside of what the training sampled."""
     estimator, _ = followed(reduced_around(full, 3 * TRUTH, 1.3), full, pull, Here(full))
@@ -91,6 +93,7 @@ def test_a_basis_for_other_moduli_is_made_on_the_way(bench, pull, batch, full):
     assert np.all(np.abs(np.log(estimator.young / batch)) < np.maximum(2 * deviation, 0.02))
 
 
+@pytest.mark.slow
 def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, full):
     """Standing still at the end narrows nothing: idle. Enough is said only where every modulus is
     known to 2 %, which another pull could not improve by more than that.
@@ -110,6 +113,7 @@ def test_more_of_the_same_is_called_idle_and_little_noise_enough(bench, pull, fu
     assert state.idle
 
 
+@pytest.mark.slow
 def test_no_frame_takes_longer_than_a_frame_may(pull, full, monkeypatch):
     """Far off the training states are sought from several starts: in time, or after the pull. A
     second frame is taken up where time is left alone.

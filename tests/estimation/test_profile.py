@@ -84,6 +84,7 @@ def test_where_any_stiffness_fits_neighbours_end_the_interval():
     assert np.array_equal(found.young_interval[0], drawn.sure(best).young_interval[0])
 
 
+@pytest.mark.slow
 def test_limits_of_a_pull_are_where_the_squares_have_risen(small_bench, small_pull):
     """With more noise than there is: at both limits of a wide modulus, all else fitted anew by
     scipy; and the objective is left as it was.

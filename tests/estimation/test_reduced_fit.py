@@ -39,6 +39,7 @@ def fit(bench, pulls, settings, **kept):
     return found
 
 
+@pytest.mark.slow
 def test_it_ends_where_the_full_model_ends(thick, noisy, tmp_path):
     """Moduli to 0.3 %, intervals to a few percent; the second time the basis is there, and no
     rough fit of the full model is needed: a few simulations are enough.
@@ -59,6 +60,7 @@ def test_it_ends_where_the_full_model_ends(thick, noisy, tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.slow
 def test_a_basis_around_wrong_moduli_is_made_again(thick, small_pull):
     """Started from a basis a factor of 4 off, the fit still ends at the full model's."""
     pull = measured(small_pull, 0, points=0, force=0)
@@ -74,6 +76,7 @@ def test_a_basis_around_wrong_moduli_is_made_again(thick, small_pull):
     assert np.abs(np.exp(found.evaluation.free) / full.values.young - 1).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_poisson_and_density_by_differences(thick, noisy):
     """Derivatives to what the reduced model has none of, against the full model's."""
     entry = noisy.entry.model_copy(update={"gravity_m_s2": (0.0, 0.0, -9.81)})
@@ -95,6 +98,7 @@ def test_poisson_and_density_by_differences(thick, noisy):
                 part * np.linalg.norm(exact)), (column, name)
 
 
+@pytest.mark.slow
 def test_a_correction_makes_up_for_a_poor_basis(thick, noisy, monkeypatch):
     """26 coordinates around other moduli are too few; after a correction positions and forces
     are the full model's there, and to second order near there.
@@ -119,6 +123,7 @@ def test_a_correction_makes_up_for_a_poor_basis(thick, noisy, monkeypatch):
         assert after < 0.1 * before
 
 
+@pytest.mark.slow
 def test_a_pull_of_three_frames_is_enough_for_a_basis(thick, small_pull):
     """Fewer poses than a basis has coordinates: it has others around them."""
     seen = small_pull.observations
@@ -136,6 +141,7 @@ def test_pulls_it_cannot_hold_are_refused(thick, noisy):
         Reduction(thick.objective([pull], SETTINGS).forwards)
 
 
+@pytest.mark.slow
 def test_other_control_points_make_another_basis(branch_folder):
     """Estimated again with other fractions: the basis for the first ones is not taken (it has
     another number of moduli), and the estimate is near the first where both have a point.

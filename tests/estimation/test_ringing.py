@@ -21,6 +21,7 @@ def record(rng, *, frequencies=(2.3, 7.9), damping=(0.02, 0.03), size=(1.0, 0.4)
     return times, found + noise * rng.standard_normal(found.shape)
 
 
+@pytest.mark.slow
 def test_two_vibrations_with_their_deviations():
     """Of 40 noisy records the first frequency lies within two deviations in about 95 %."""
     rng, inside = np.random.default_rng(8), 0

@@ -48,6 +48,7 @@ def test_thicker_all_along_is_softer_by_the_fourth_power(monkeypatch, fitted, sm
     assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_off_is_not_exact(monkeypatch, fitted, small):
     """0.1 mm aside in the middle shows in the moduli, 0.2 mm twice as much; nothing as nothing."""
     skeleton = small.skeleton
@@ -82,6 +83,7 @@ def test_the_largest_part_of_a_wide_interval_is_named():
     assert "more pulls" in told(0.3, 0.2)[0] and "more pulls" in told(0.3, None)[0]
 
 
+@pytest.mark.slow
 def test_a_pull_that_its_force_drives_is_no_exception(monkeypatch, small, small_bench, small_pull):
     """Its forces are unknowns with readings, eliminated: radii 1 % off are still 4 %."""
     pull = measured(small_pull, 3)
@@ -94,6 +96,7 @@ def test_a_pull_that_its_force_drives_is_no_exception(monkeypatch, small, small_
     assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_watched_path_and_an_open_field_are_no_exception(monkeypatch, small, small_bench,
                                                            small_pull):
     """As every recording of a robot is fitted: gripper and cell a little off, the form of the
@@ -117,6 +120,7 @@ def test_a_watched_path_and_an_open_field_are_no_exception(monkeypatch, small, s
     assert found == pytest.approx(0.04 * QUANTILE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_mass_of_twigs_enters_the_interval(small, small_bench, small_pull):
     """A hanging branch with 30 g at its tip: as by pulls of one that carries a tenth more."""
     bench, skeleton = small_bench, small.skeleton

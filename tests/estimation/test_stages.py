@@ -69,6 +69,7 @@ def test_estimate_from_the_command_line(branch_folder, capsys):
     assert "came without a deviation" in captions[0]
 
 
+@pytest.mark.slow
 def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
     """Cancelled in the middle: exit 130's error, estimate.json unfinished, mesh untouched; asked
     to, the next run takes the evaluations over.

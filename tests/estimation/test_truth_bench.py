@@ -1,6 +1,7 @@
 """How close estimates of the truth bench can come."""
 
 import numpy as np
+import pytest
 
 from benchmarks.paper_branches import measured
 from benchmarks.truth import _efficient
@@ -19,6 +20,7 @@ def test_moduli_that_err_together_count_as_one():
     assert _efficient([together, nothing]) == _efficient([together])
 
 
+@pytest.mark.slow
 def test_a_known_form_leaves_less_open():
     """Of one drawn branch and pull; less of each modulus and of any mixture of them."""
     truth = drawn_truth(np.random.default_rng(3))

@@ -42,6 +42,7 @@ def simulated(truth, **settings):
     return simulate_pull(truth, "pull-1", VirtualPullSettings(**(EXACT | settings)))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", ["pose", "force"])
 def test_a_fast_pull_gives_young_and_swings_on(truth, bench, drive, tmp_path):
     """Shaken by poses, or pulled and let go: written, read and fitted, the moduli come back."""

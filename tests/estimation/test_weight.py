@@ -75,6 +75,7 @@ def test_estimate_knows_that_the_branch_hangs(scanned, pull):
     assert np.abs(without / TRUTH - 1).max() > 5 * np.abs(with_weight / TRUTH - 1).max()
 
 
+@pytest.mark.slow
 def test_a_branch_too_soft_for_its_weight_is_estimated_without(scanned):
     """As other doors do: a warning, and the moduli of the pull as they are."""
     start, soft = subject(scanned), TRUTH / 300
@@ -127,6 +128,7 @@ def test_forward_derivatives_under_weight(scanned, pull):
             found.d_forces).max()
 
 
+@pytest.mark.slow
 def test_virtual_pull_takes_the_body_that_was_meshed(tmp_path):
     """After `limber mesh --up`: its own tetrahedra, under gravity as it was turned with them."""
     from trimesh.creation import box

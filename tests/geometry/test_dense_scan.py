@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from limber.geometry.cloud.cloud import Cloud
 from limber.geometry.cloud.preparation import Prepared, prepare
@@ -36,6 +37,7 @@ def _branch(count, rng):
     return points + rng.normal(scale=3e-4, size=points.shape)
 
 
+@pytest.mark.slow
 def test_a_dense_scan_takes_little_memory(tmp_path):
     """The leaf search once took pairs of all points, memory that grew with their density."""
     Cloud(_branch(COUNT, np.random.default_rng(0))).write_ply(tmp_path / "a.ply")
@@ -46,6 +48,7 @@ def test_a_dense_scan_takes_little_memory(tmp_path):
     assert abs(told["length"] - 1.29) < 0.02 and told["count"] == COUNT
 
 
+@pytest.mark.slow
 def test_every_point_of_a_dense_leaf_is_cut_off():
     """Leaves are looked for among few points, and all the others go with them."""
     rng = np.random.default_rng(0)

@@ -66,6 +66,7 @@ def test_twigs_are_missing_as_often_as_they_are_doubted():
     assert min((shape.radius / tree.radius)[:51].min() for shape in sure) > 0.6
 
 
+@pytest.mark.slow
 def test_new_scans_scatter_as_the_drawn_shapes_foretell():
     """20 scans with fresh noise, fitted: mean radius and axis scatter as the shapes of one do."""
     def means(shape: Skeleton) -> list[float]:

@@ -87,6 +87,7 @@ def test_gravity_turns_with_the_branch(generated):
     assert np.linalg.norm(result["gravity_m_s2"]) == pytest.approx(9.80665)
 
 
+@pytest.mark.slow
 def test_coffeetree(coffeetree, tmp_path):
     """The real branch: forks found, valid surface, a mesh of the surface's volume."""
     result = reconstruct(coffeetree, tmp_path / "c.branch")
@@ -107,6 +108,7 @@ def test_own_skeleton_skips_ours(generated, tmp_path):
     assert result["length_m"] == pytest.approx(branch.skeleton.length, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_left_out_twigs_become_masses(generated, tmp_path):
     """Twigs over the order leave the mesh, and their mass is written."""
     folder, _, full = generated
@@ -119,6 +121,7 @@ def test_left_out_twigs_become_masses(generated, tmp_path):
     assert rest == pytest.approx(whole, rel=0.04)
 
 
+@pytest.mark.slow
 def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
     """Their weight hangs on the base, and on the gripper that holds the branch where it is."""
     folder, _, full = generated
@@ -138,6 +141,7 @@ def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
     assert 0.02 < np.linalg.norm(held - bare) / (9.80665 * result["left_out_mass_kg"]) < 2.0
 
 
+@pytest.mark.slow
 def test_twigs_that_are_meshed_again_weigh_once(generated, tmp_path):
     """A later run that keeps all twigs takes their masses away."""
     folder, _, _ = generated
@@ -162,6 +166,7 @@ def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):
     Branch.open(folder / "g.branch")
 
 
+@pytest.mark.slow
 def test_batch_goes_on_after_a_bad_scan(generated, tmp_path):
     """One bad scan never stops the others."""
     folder, _, _ = generated
@@ -209,6 +214,7 @@ STEPS = ("laplacian", "contracting", "connecting", "fitting axes", "skeleton", "
          "reconstructed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", STEPS)
 def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
     """Stopped in any long step: Cancelled, and no half-made stage in the folder."""
@@ -231,6 +237,7 @@ def test_cancel_in_each_step_leaves_nothing(generated, tmp_path, step):
         assert not (target / "skeleton.swc").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_a_leafy_plants_leaves_are_cut_off(tomato_draws, seed):
     """Of few points of a seedling whose leaves outweigh its stem, too: a few fat rods that explain

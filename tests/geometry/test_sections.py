@@ -64,6 +64,7 @@ def test_drawn_ellipses_sag_as_slender_beams_do(tmp_path, on_edge):
     assert body.mesh.volumes.sum() == pytest.approx(body.surface.volume, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_own_sag_gives_the_modulus(tmp_path):
     """Held up first, then sagging under its own weight and the 30 g: E within 2 %, covered."""
     path = table(tmp_path / "beam.csv")

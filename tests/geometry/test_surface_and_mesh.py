@@ -32,6 +32,7 @@ def test_branch_surface_is_closed_and_of_the_right_volume(y_skeleton):
     assert surface.volume == pytest.approx(round_volume, rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fork_count", [1, 10])
 def test_smoothed_forks_are_less_sharp_and_sound(fork_count):
     """Fillets: few creases are left; the surface is valid; volume within 2 %, not less."""

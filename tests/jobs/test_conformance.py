@@ -153,6 +153,7 @@ def assert_ended(outcome: Outcome) -> None:
     assert not [p for p in alive if p.status() != psutil.STATUS_ZOMBIE]
 
 
+@pytest.mark.slow
 def test_progress_is_relayed_and_the_result_returned(runner):
     """Fractions come in order, with their message; the result is the job's own."""
     outcome = runner.run("steps")
@@ -177,6 +178,7 @@ def test_an_error_keeps_its_words(runner):
     assert_ended(outcome)
 
 
+@pytest.mark.slow
 def test_a_crash_is_an_error_and_not_the_end(runner):
     """It is told as one, with the exit code; the next job runs."""
     outcome = runner.run("crash")
@@ -192,6 +194,7 @@ def test_cancel_ends_a_job_that_reports(runner):
     assert time.monotonic() - started < 20
 
 
+@pytest.mark.slow
 def test_cancel_ends_a_job_that_hangs(runner):
     """It ignores being asked: after the grace it is killed."""
     started = time.monotonic()
@@ -201,6 +204,7 @@ def test_cancel_ends_a_job_that_hangs(runner):
     assert time.monotonic() - started < 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("behaviour", "limits", "said"), [
     ("hang", Limits(seconds=1.0), "was stopped after 1 s"),
     ("greedy", Limits(memory_mb=300.0), "Its limit is 300 MB")])
@@ -226,6 +230,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize("behaviour", ["patient", "hang"])
 def test_a_killed_parent_leaves_nothing(runner, behaviour: str, tmp_path):

@@ -58,6 +58,7 @@ def half(progress: Progress) -> int:
     return 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_order(workers: int, monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "2")
@@ -98,6 +99,7 @@ def test_a_wrong_budget_is_refused(monkeypatch, text: str):
         core_budget()
 
 
+@pytest.mark.slow
 def test_the_first_error_stops_the_others_and_keeps_what_it_carries():
     started = time.monotonic()
     with Pool(2) as pool, pytest.raises(ConvergenceError, match=r"diverged\. Too far") as error:
@@ -132,6 +134,7 @@ def test_a_failed_beginning_is_the_error_of_every_task():
                 pool.map(late_square, [(5,), (5,)])
 
 
+@pytest.mark.slow
 def test_progress_tells_share_count_and_remaining_time(monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "2")
     seen = []
@@ -144,6 +147,7 @@ def test_progress_tells_share_count_and_remaining_time(monkeypatch):
     assert remaining and remaining[-1] <= remaining[0] < 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_cancel_reaches_the_tasks(workers: int, monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "2")

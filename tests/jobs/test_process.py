@@ -25,6 +25,7 @@ def stand_in(monkeypatch, tmp_path):
     return use
 
 
+@pytest.mark.slow
 def test_real_command_returns_its_result():
     """`limber doctor` run as a process gives its JSON result."""
     result = process.run_stage(["doctor"])
@@ -75,6 +76,7 @@ def test_cancel_ends_the_child(stand_in):
     assert not [words for words in commands if "stage.py" in " ".join(words)]
 
 
+@pytest.mark.slow
 def test_missing_branch_folder_is_an_input_error(tmp_path):
     """Through the real command line: exit code 2 with what to do becomes InputError."""
     with pytest.raises(InputError, match="limber reconstruct") as error:

@@ -6,6 +6,7 @@ import pytest
 from benchmarks.mechanics_exact import _exact_potential, _manufactured_potential
 
 
+@pytest.mark.slow
 def test_energy_converges_at_fourth_order():
     """The total potential's error falls by nearly 16 as the elements are halved."""
     exact = _exact_potential()

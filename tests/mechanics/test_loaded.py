@@ -75,6 +75,7 @@ def test_goes_to_another_process(loaded):
     assert one.energy == other.energy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["pinned", "clamped"])
 def test_a_grasp_is_a_place_whatever_the_mesh(mode):
     """Centres are the place asked for, and energies of unlike meshes agree where patches differ."""

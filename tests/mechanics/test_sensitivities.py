@@ -90,6 +90,7 @@ def test_static_derivatives(mesh, weights, mode, material):
                 force, rel=1e-4, abs=1e-5 * np.abs(force).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "material"), CASES)
 def test_dynamic_derivatives(mesh, weights, mode, material):
     """The same along a motion, all frames, with density and both damping factors."""

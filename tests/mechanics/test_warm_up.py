@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = """
 import sys
 import numpy as np
@@ -39,6 +41,7 @@ print([name for name in after if after[name] != before.get(name)])
 """
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_after_the_warm_up():
     """Statics, motion and derivatives, all materials and elements, read-only arrays too: the
     kernels have no more signatures than the warm-up gave them."""

@@ -48,6 +48,7 @@ def test_points_are_found_to_a_fraction_of_a_millimetre(scene, tracked):
     assert all(frame.visible.all() and frame.inlier_share > 0.8 for frame in tracked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flying", [0.0, 0.05, 0.1])
 def test_covariance_matches_the_errors(scene, flying):
     """Squared errors over their covariance average near 3 (the dimension), whatever share of the
@@ -68,6 +69,7 @@ def test_covariance_matches_the_errors(scene, flying):
     assert 1.0 < np.mean(squares) < 5.0
 
 
+@pytest.mark.slow
 def test_hidden_part_is_not_called_visible_and_says_how_unsure(scene, tracked):
     """With the lower half cut away, its points are invisible and their covariance grows."""
     cloud = cloud_of(scene, 0.5, np.random.default_rng(1))

@@ -60,6 +60,7 @@ def test_bound_is_below_and_plan_within_a_percent_of_an_independent_optimum(acro
     assert found.cost == pytest.approx(found.certificate.upper)
 
 
+@pytest.mark.slow
 def test_gradient_of_the_subsolution_stays_below_the_cost_by_brute_force(across, monkeypatch):
     """At random points of open cells |grad u| <= c, with c from the field and not from the grid."""
     problem, found = across
@@ -121,6 +122,7 @@ def _spline_slope(u, cells, place):
         for component in range(3)], axis=1)
 
 
+@pytest.mark.slow
 def test_a_limit_along_the_branch_binds_path_and_bound(ridge_field, across):
     """The force along the branch stays below its limit; the bound stays below the dearer path."""
     _, free = across
@@ -134,6 +136,7 @@ def test_a_limit_along_the_branch_binds_path_and_bound(ridge_field, across):
     assert found.cost > free.cost and found.certificate.lower <= found.cost
 
 
+@pytest.mark.slow
 def test_a_path_is_led_around_an_obstacle(ridge_field, across):
     """With a ball in the way of the free path: by the field it stays outside, for more cost."""
     _, free = across
@@ -151,6 +154,7 @@ def test_a_path_is_led_around_an_obstacle(ridge_field, across):
     assert found.certificate.lower <= found.cost and found.cost > free.cost
 
 
+@pytest.mark.slow
 def test_without_deformation_the_bound_is_the_distance(well_field):
     """Length alone: the best cost is the straight distance to the goal's face."""
     problem = problem_on(well_field, deformation=0.0)
@@ -162,6 +166,7 @@ def test_without_deformation_the_bound_is_the_distance(well_field):
     assert found.cost == pytest.approx(best, rel=0.002)
 
 
+@pytest.mark.slow
 def test_from_the_rest_pose_and_for_the_tip(ridge_field):
     """A bound holds for a goal of the tip too, and is close."""
     wanted = ridge_field.tip(np.array([GOAL.position]))[0]
@@ -174,6 +179,7 @@ def test_from_the_rest_pose_and_for_the_tip(ridge_field):
     assert found.certificate.gap < 0.05
 
 
+@pytest.mark.slow
 def test_field_error_lowers_the_bound(across):
     """What the energy may be wrong by is taken off the bound, about its share of the cost."""
     problem, found = across
@@ -183,6 +189,7 @@ def test_field_error_lowers_the_bound(across):
     assert found.certificate.lower - unsure.certificate.lower == pytest.approx(off, rel=0.3)
 
 
+@pytest.mark.slow
 def test_no_path_is_proven_where_a_limit_separates(well_field):
     """A wall of refused poses between start and goal: that there is no path is proven, and said."""
     start, goal = np.array([-0.12, 0.0, 0.0]), GraspGoal((0.12, 0.0, 0.0), 0.01)
@@ -193,6 +200,7 @@ def test_no_path_is_proven_where_a_limit_separates(well_field):
         plan_gentle(problem_on(walled, start=start, goal=goal))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong_grids", [1, 5])
 def test_a_grid_too_coarse_for_a_valley_proves_nothing(well_field, monkeypatch, wrong_grids):
     """The next grid is asked; and a path that keeps the limits is a better proof than any."""
@@ -218,6 +226,7 @@ def _wall():
     return np.stack([0 * y, y, z], axis=-1).reshape(-1, 3)
 
 
+@pytest.mark.slow
 def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
     """With a limit on force that binds, the refined path keeps it and gets close to it."""
     free = plan_gentle(problem_on(ridge_field))
@@ -255,6 +264,7 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
         assert limits.push(path) > 0.1
 
 
+@pytest.mark.slow
 def test_costs_of_two_seeds_compare(ridge_field):
     """Scales and the plan's cost do not depend on the seed; D-RRT* is never below the bound."""
     found = [plan_pair(ridge_field, START, GOAL, PlanSettings(
@@ -270,6 +280,7 @@ def test_costs_of_two_seeds_compare(ridge_field):
         "D-RRT*, not smoothed"}
 
 
+@pytest.mark.slow
 def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
     """Within 3 % of the shortest length: kept, dearer than without, and no bulge that is as short
     has less energy than the dual's bound says."""
@@ -294,6 +305,7 @@ def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
             assert ridge_field.energy(middles) @ pieces >= held.energy_bound
 
 
+@pytest.mark.slow
 def test_a_length_is_kept_as_a_limit(ridge_field):
     """From the path round the ridge: just as long as allowed, and gentler than the shortest."""
     problem = problem_on(ridge_field)

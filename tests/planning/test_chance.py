@@ -102,6 +102,7 @@ def test_poses_are_asked_where_a_limit_may_break(bent):
     assert len(chosen) >= 10 and chosen.min() >= 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("settings", "words"), [
     ({"confidence": 0.95}, "without a limit"),
     ({"confidence": 0.95, "max_force": 5.0}, "nothing is estimated"),

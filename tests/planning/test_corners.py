@@ -73,6 +73,7 @@ def test_a_hull_is_as_far_from_zero_as_its_nearest_point():
     assert (nearest > 1.0).sum() > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.02, 1.5])
 def test_no_allowed_pose_lies_in_a_closed_cell_nor_costs_less_than_is_claimed(
         bowing_field, share, monkeypatch):
@@ -117,6 +118,7 @@ def claimed_rate(ground, cells, part):
     return np.where(level, ground.floor, np.maximum(value, ground.floor))
 
 
+@pytest.mark.slow
 def test_no_proof_stands_against_a_path(bowing_field):
     """With a force just enough a path exists, and no cells say otherwise; with one too low for the
     goal they do."""

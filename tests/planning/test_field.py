@@ -108,6 +108,7 @@ def test_region_along_a_shell():
     assert region.contains(on_top).all(), "facets of points themselves would cut them off"
 
 
+@pytest.mark.slow
 def test_boxes_surely_outside_hold_nothing_that_is_trusted():
     """And nearly all that hold nothing are told: those of which the highest plane, or a refused
     pose, may speak for all."""

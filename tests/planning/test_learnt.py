@@ -76,6 +76,7 @@ def test_the_full_model_solves_what_is_doubted(learnt, places):
     assert not taken(wrong, found).reduced
 
 
+@pytest.mark.slow
 def test_no_state_is_jumped_to(learnt):
     """Led from one side to the other below its rest the branch stays in a shape of more energy than
     the one that Newton's iteration falls into: the full model finds it."""
@@ -88,6 +89,7 @@ def test_no_state_is_jumped_to(learnt):
     assert full[1].converged and not isinstance(full[1], CorrectedResult)
 
 
+@pytest.mark.slow
 def test_a_field_says_which_model_it_came_from(small_model, small_mesh, small_skeleton, tmp_path,
                                                monkeypatch):
     """Sampled on a model that is learnt once; samples that are added later are the full model's."""

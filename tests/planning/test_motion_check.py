@@ -52,6 +52,7 @@ def peak_force(small_model, path, pace):
     return np.linalg.norm(found.reaction_force, axis=1).max()
 
 
+@pytest.mark.slow
 def test_a_slow_motion_is_as_standing_still(small_model, bent):
     """At 5 mm/s inertia adds under a percent to any limit's value, and nothing is slowed down."""
     standing = bent.ahead.force_sizes.max()
@@ -62,6 +63,7 @@ def test_a_slow_motion_is_as_standing_still(small_model, bent):
     assert found.peaks["strain"] == pytest.approx(bent.ahead.strains.max(), rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_motion_that_inertia_takes_over_a_limit_is_slowed_until_it_holds(heavy, bent):
     """Fast, another scheme finds more force than is allowed; at the pace that was found, not."""
     standing, brisk = bent.ahead.force_sizes.max(), peak_force(heavy, bent, BRISK)
@@ -83,6 +85,7 @@ def test_what_no_pace_keeps_is_broken_with_its_place(small_model, bent):
     assert "force in motion" in found.broken[0] and "at (" in found.broken[0]
 
 
+@pytest.mark.slow
 def test_an_obstacle_is_met_in_motion(small_model, bent):
     """A post where the tip comes to: named with its depth; one that is farther off is not met."""
     tip = bent.solved.tips[-1]
@@ -93,6 +96,7 @@ def test_an_obstacle_is_met_in_motion(small_model, bent):
         assert any("inside the post" in words for words in found.broken) == met
 
 
+@pytest.mark.slow
 def test_a_plan_that_inertia_breaks_is_refused(planned_branch, tmp_path, monkeypatch):
     """With exit code 3, where and what, however slow it was tried; and nothing is written."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")

@@ -51,6 +51,7 @@ def problem_on(field, **limits):
     return GentleProblem(field, limited, weights, field.rest.copy(), GOAL, beyond=limited)
 
 
+@pytest.mark.slow
 def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_field):
     """In a valley a twentieth of a millimetre wide, where the goal asks for a force near the limit;
     poses drawn in the goal say of neither that it can be kept."""
@@ -67,6 +68,7 @@ def test_a_force_just_too_low_is_proven_and_one_just_enough_has_a_path(shell_fie
         plan_gentle(none)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [1.02, 1.2])
 def test_a_chord_far_over_a_limit_is_refined_into_the_valley(shell_field, share):
     """From a chord of the shell with many times the force that is allowed: the path keeps the limit
@@ -82,6 +84,7 @@ def test_a_chord_far_over_a_limit_is_refined_into_the_valley(shell_field, share)
     assert cost == problem.cost(path) <= 1.002 * refine(easy.points, problem)[1] < np.inf
 
 
+@pytest.mark.slow
 def test_the_easiest_way_goes_round_what_is_dearest(ridge_field):
     """Its worst force is less than the straight line's, and no more than a free path's; with a
     limit above it nothing is over."""
@@ -119,6 +122,7 @@ def test_poses_are_asked_where_the_fields_error_leaves_it_in_doubt(narrow, small
     assert asked_in_doubt(field, small_model, field.rest, goal, Limits(force=0.1 * held)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 @pytest.mark.parametrize("blind", [1, 4])
 def test_a_plan_that_a_wrong_field_excludes_is_made_with_more_poses(

@@ -97,6 +97,7 @@ def test_a_few_simulated_frames_tell_as_much_as_all_recorded(subject, monkeypatc
     assert (more > 1.0).all() and (more < 4.0).all()
 
 
+@pytest.mark.slow
 def test_a_new_pull_has_as_many_frames_as_the_last(small_pull):
     """Its cell too; a swing goes on for longer than a pull."""
     cell = Cell.of(small_pull)
@@ -153,6 +154,7 @@ def test_a_pull_is_worth_it_where_it_changes_what_a_plan_may_do(value, now, afte
     assert found is worth and words in why
 
 
+@pytest.mark.slow
 def test_the_stage_writes_the_best_pull_and_answers_for_a_plan(planned_branch, tmp_path):
     """Best first; a plan without limits needs no other pull; wrong places are refused."""
     folder = shutil.copytree(planned_branch, tmp_path / "copy.branch")

@@ -33,6 +33,7 @@ def cell_file(folder, **content):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     """With singularity and joint margins in the file; its force limit holds."""
@@ -51,6 +52,7 @@ def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
     assert points["x_m"][-1] == pytest.approx(plan.motion.poses[-1, 0], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_cell_that_allows_too_little_force_is_named(copied):
     """The cell's force limit, not a vague word: the goal alone needs more."""
@@ -60,6 +62,7 @@ def test_a_cell_that_allows_too_little_force_is_named(copied):
                    cell_file=weak, workers=1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_robot_too_far_away_refuses_the_plan(copied):
     far = cell_file(copied, base={"pose": (3.0, 0.1, 0.0, 0, 0, 0.4)})
@@ -80,6 +83,7 @@ def test_a_branch_that_meets_an_obstacle_refuses_the_plan(copied):
                    cell_file=blocked, workers=1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_branch_is_led_around_an_obstacle(copied):
     """A post where the free way takes the tip: planned anew, the motion keeps clear of it; one that

@@ -132,6 +132,7 @@ def test_folder_can_be_read_again_and_is_not_done_twice(copied):
             again.digest("plans/there.json")) == before
 
 
+@pytest.mark.slow
 def test_same_seed_same_plan(copied):
     """Run again by force, the planner's path is the same to the bit."""
     before = read_plan(copied)
@@ -154,6 +155,7 @@ def test_other_modulus_makes_the_field_stale(copied):
         plan_paths(copied, PlanSettings(**QUICK), name="other")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_refusals_leave_the_folder_as_it_was(copied):
     """Goals out of reach, over a limit, doubled, or a cancel: an error each, no file changed."""
@@ -180,6 +182,7 @@ def test_refusals_leave_the_folder_as_it_was(copied):
     assert sorted(p.name for p in copied.rglob("*") if p.name != ".lock") == before
 
 
+@pytest.mark.slow
 def test_stopped_while_the_bound_closes_the_best_so_far_is_kept(copied, monkeypatch):
     """Checked on the full model as any other; the next run is made, not taken for done. A finished
     plan of the name stays."""
@@ -227,6 +230,7 @@ def test_a_goal_drawn_from_the_papers_hemisphere(copied):
         drawn(1, max_energy=1e-6)
 
 
+@pytest.mark.slow
 def test_limits_hold_on_the_full_model(copied):
     """Caps between those that the ends need and those that the free plan takes hold at every pose
     of the motion, approach and return included. In time: test_motion_check and test_plan_cell."""
@@ -249,6 +253,7 @@ def test_limits_hold_on_the_full_model(copied):
     assert done["margins"]["force"] >= 0.0 and done["rounds"][-1]["broken"] == []
 
 
+@pytest.mark.slow
 def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypatch):
     """A field that promises half the force: the plan is refused with its place, exit code 3, and
     nothing is written; with the states found added to the field it is planned anew."""
@@ -280,6 +285,7 @@ def test_a_field_too_coarse_for_the_asked_bound_is_told():
     assert _doubts(summary, 6.0) == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_bound")
 def test_tip_goal_puts_the_real_tip_there(copied):
     """With a goal for the tip, the full model's tip ends within the tolerance."""
@@ -308,6 +314,7 @@ def test_command_prints_its_result(copied, capsys):
     assert call(["plan", str(copied), "--name", "../evil"]) == 2
 
 
+@pytest.mark.slow
 def test_figures_draw(planned_branch, tmp_path):
     """The report's figures can be drawn, each with a caption."""
     for number, (figure, caption) in enumerate(report_figures(Branch.open(planned_branch),

@@ -35,6 +35,7 @@ def measured(field, points):
                         np.linalg.norm(field.force(points), axis=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_deformation_aware_path_goes_round_the_ridge(ridge_field, engine):
     """D-RRT* saves at least 40 % of the energy of the baseline for at most 25 % more length."""
@@ -62,6 +63,7 @@ def test_baseline_is_the_straight_line(well_field, engine):
     assert measured(well_field, found.points).length_m < 1.02 * straight
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_seed_decides_the_path(ridge_field, engine):
     """The same seed gives the same path to the bit; another seed another tree."""
@@ -83,6 +85,7 @@ def test_cost_falls_as_the_tree_grows(ridge_field, engine):
     assert costs[-1] == pytest.approx(found.tree_cost, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_limit_is_kept_all_along(ridge_field):
     """With a cap on energy even the shortest path stays below it, going round."""
     cap = 0.15

@@ -74,6 +74,7 @@ def test_samples_hold_what_was_asked(small_model, some):
     assert (samples.energies[1:] > 0).all() and (samples.min_det_f > 0.5).all()
 
 
+@pytest.mark.slow
 def test_force_is_the_gradient_of_the_energy(small_model, some, small_mesh, small_skeleton):
     """Central differences of the solved energy give the gripper's force, with and without weight.
 
@@ -105,6 +106,7 @@ def test_firm_grasp_at_the_natural_rotation_costs_no_more(small_model, some):
         assert small_model.energy(held) == pytest.approx(small_model.energy(loose), rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_changes_no_digit(small_model, some, monkeypatch):
     """One process and two: the same samples, bit for bit."""
     monkeypatch.setenv("LIMBER_CORES", "2")
@@ -121,6 +123,7 @@ def test_the_number_of_processes_is_no_setting_of_a_result():
     assert "workers" not in EnergySettings.model_fields
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_cancel_ends_sampling(small_model, some, workers):
     """A cancel is obeyed between poses, in this process and across processes."""
@@ -140,6 +143,7 @@ def test_grasp_moves_on_a_sphere_by_itself(small_model):
     assert 0.6 < valley.radius / small_model.reach.chord < 0.95
 
 
+@pytest.mark.slow
 def test_rest_lies_inside_the_sampled_region(small_model):
     """Samples lie beyond rest on all sides, and so do those of the shell about it."""
     sampled = sample_field(small_model, EnergySettings(samples=60), workers=1)

@@ -92,6 +92,7 @@ def pulled(bag: Written, *, wrench="/wrench", pose="/pose", shift=0.0):
             bag.pose(pose, time, [way, 0.0, 0.5])
 
 
+@pytest.mark.slow
 def test_a_pull_comes_back_as_it_was(mcap, bare_folder, plain_pull):
     """Poses, wrenches and markers through MCAP; frames need no option."""
     result = import_pull(bare_folder, mcap, "again", ImportSettings())
@@ -106,6 +107,7 @@ def test_a_pull_comes_back_as_it_was(mcap, bare_folder, plain_pull):
     assert read_bag(bare_folder.parent / "out.mcap").of("wrench")[0].values.shape == (201, 6)
 
 
+@pytest.mark.slow
 def test_a_rosbag2_folder_is_read_as_well(mcap, tmp_path, bare_folder, plain_pull):
     """The same messages as ROS 2's own recorder leaves them: a folder with SQLite."""
     from rosbags.highlevel import AnyReader
@@ -121,6 +123,7 @@ def test_a_rosbag2_folder_is_read_as_well(mcap, tmp_path, bare_folder, plain_pul
     assert np.allclose(pull.wrenches, plain_pull.wrenches, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_depth_images_come_with_their_camera(tmp_path, bare_folder, plain_pull):
     """In another scale, the same depths; the camera where TF has it."""
     folder = tmp_path / "depth_pull"
@@ -165,6 +168,7 @@ def test_a_sensors_own_frame_is_turned_by_tf(tmp_path, bare_folder):
     assert pull.entry.observation == "none"
 
 
+@pytest.mark.slow
 def test_joint_angles_need_the_cell(tmp_path, bare_folder):
     """In any order, with a robot's own names; the base's pose in the branch's frame is the
     cell's."""
@@ -204,6 +208,7 @@ def test_what_a_bag_lacks_is_said(tmp_path, bare_folder, made, told):
     assert not (bare_folder / "pulls" / "bad" / "pull.toml").exists()
 
 
+@pytest.mark.slow
 def test_what_was_asked_can_be_answered(tmp_path, bare_folder):
     with Written(tmp_path / "two.mcap") as bag:
         pulled(bag, shift=3600.0)
@@ -214,6 +219,7 @@ def test_what_was_asked_can_be_answered(tmp_path, bare_folder):
     assert np.allclose(pull.wrenches[:, 0], 50 * pull.poses[:, 0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_damaged_bags_are_refused_or_read_never_crash(mcap, tmp_path, bare_folder):
     """Five ways of spoiling bytes: an answer in words each time, in seconds."""
     whole = mcap.read_bytes()
@@ -274,6 +280,7 @@ def test_drop_a_bag_get_a_modulus(branch_folder, tmp_path, monkeypatch):
         assert getattr(again.entry, part) == getattr(pull.entry, part), part
 
 
+@pytest.mark.slow
 def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, bare_folder):
     from limber.progress import Progress
     from limber.recordings.calibration import CalibrationEntry
@@ -300,6 +307,7 @@ def test_how_well_the_robot_is_known_comes_from_its_cell_or_is_said(tmp_path, ba
     assert entry.calibration.force_bias_sigma_n == CalibrationEntry().force_bias_sigma_n
 
 
+@pytest.mark.slow
 def test_a_broken_description_in_a_bag_costs_only_itself(mcap, tmp_path, bare_folder, plain_pull,
                                                           monkeypatch):
     from limber.progress import Progress

@@ -185,6 +185,7 @@ def test_masks_of_a_yolo_model_of_ones_own(bare_folder, source, monkeypatch, cap
     assert "ultralytics" in json.loads(capsys.readouterr().out.strip().splitlines()[-1])["error"]
 
 
+@pytest.mark.slow
 def test_a_swing_by_its_own_weight_needs_no_grasp_point(branch_folder, tmp_path):
     """No load hangs anywhere: the place that is seen to swing farthest stands for it."""
     nodes = load_mesh(Branch.open(branch_folder)).nodes

@@ -187,6 +187,7 @@ def test_what_holds_an_estimate_back_is_read_first(meshed: Branch):
     assert html.index("calibrate it") < html.index("Summary</h2>") and "14.0 %" in html
 
 
+@pytest.mark.slow
 def test_named_targets_stand_in_figure_and_table(tmp_path):
     """The place of a flower is a row of the scan's table."""
     import shutil
@@ -204,6 +205,7 @@ def test_named_targets_stand_in_figure_and_table(tmp_path):
     assert "Named targets" in html and ">flower<" in html and f"{tip[2]:.3f}" in html
 
 
+@pytest.mark.slow
 def test_cylinder_model_stands_beside_calipers(tmp_path):
     """Orders, diameters, how radii are known, doubt; a caliper's value, and one off the branch."""
     tree = Skeleton.from_edges(

@@ -193,6 +193,7 @@ def planned_folder(branch_template, tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_dry_run_moves_nothing_and_says_what_it_would_do(planned_folder, tmp_path):
     """Nobody listens at the address: a dry run needs no robot."""
     cell = standing_at(Branch.open(planned_folder), "127.0.0.97", fraction=FRACTION)
@@ -265,6 +266,7 @@ def test_a_gripper_that_would_meet_an_obstacle_is_refused_at_once(planned_folder
                 ExecuteOptions())
 
 
+@pytest.mark.slow
 def test_what_does_not_belong_together_is_refused(planned_folder, tmp_path):
     branch = Branch.open(planned_folder)
     cell = standing_at(branch, "127.0.0.97", fraction=FRACTION)

@@ -277,6 +277,7 @@ def test_a_target_that_is_no_pose_stops(bench, target):
     assert bench.guard.state == State.STOPPED
 
 
+@pytest.mark.slow
 @given(st.lists(st.sampled_from(["good", "bad", "soft", "begin", "end", "resume", "acknowledge",
                                  "silence", "event"]), max_size=30))
 @settings(max_examples=200, deadline=None)

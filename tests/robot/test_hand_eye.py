@@ -54,6 +54,7 @@ def test_exact_views_give_the_frames_to_round_off(camera_on, camera, board):
     assert marker.board[:3] == pytest.approx(board[:3], abs=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera_on", ["stand", "gripper"])
 def test_the_base_is_off_by_about_what_is_said(camera_on):
     """Noise of 0.3 mm and 2 mrad in 10 views: over 12 draws, in deviations as they should be."""

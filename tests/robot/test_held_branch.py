@@ -169,6 +169,7 @@ def pulled_aside(held, flange, steps):
     return moved
 
 
+@pytest.mark.slow
 def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
     """After a way of 30 mm the wrench at the flange is that of an own solution there."""
     flange = Controller("ur5e").flange
@@ -206,6 +207,7 @@ def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
     assert held.wrench(moved, 0.002) == pytest.approx(np.zeros(6))
 
 
+@pytest.mark.slow
 def test_the_camera_sees_the_bent_branch(held, beam):
     """Between solutions it takes a picture: at rest the beam's own surface, then one moved."""
     flange = Controller("ur5e").flange
@@ -245,6 +247,7 @@ def test_views_stand_around_and_look_at_the_middle():
         assert camera.to_camera(middle[None])[0] == pytest.approx([0, 0, 0.6], abs=1e-12)
 
 
+@pytest.mark.slow
 def test_sliding_in_the_grip_lets_the_force_fall(held):
     flange = Controller("ur5e").flange
     held.wrench(flange, 0.002)
@@ -256,6 +259,7 @@ def test_sliding_in_the_grip_lets_the_force_fall(held):
     assert 0.3 * before < after < 0.7 * before
 
 
+@pytest.mark.slow
 def test_a_picture_that_comes_between_two_questions_is_not_lost(held, monkeypatch):
     """It was thrown away as a late solution, one scan in ten, and the camera waited for ever."""
     flange, asked = Controller("ur5e").flange, itertools.count()
@@ -271,6 +275,7 @@ def test_a_picture_that_comes_between_two_questions_is_not_lost(held, monkeypatc
     assert held.picture is not None
 
 
+@pytest.mark.slow
 def test_what_gives_way_is_in_series_with_the_branch(held):
     """A wrench F at compliance C is that of the branch C F nearer to its rest."""
     flange = Controller("ur5e").flange
@@ -286,6 +291,7 @@ def test_what_gives_way_is_in_series_with_the_branch(held):
     assert np.linalg.norm(felt) < np.linalg.norm(solution.wrench_at(patch, 0.0))
 
 
+@pytest.mark.slow
 def test_what_is_seen_stays_behind_by_what_gives_way(held):
     """Solved with the piece C F behind the gripper, the points are seen where they were solved."""
     flange = Controller("ur5e").flange
@@ -300,6 +306,7 @@ def test_what_is_seen_stays_behind_by_what_gives_way(held):
     assert held.points == pytest.approx(solution.points, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_closing_on_nothing_is_told(held):
     far = Controller("ur5e").flange.copy()
     far[2, 3] += 0.3

@@ -18,6 +18,7 @@ print(before, len(gc.get_objects()))
 """
 
 
+@pytest.mark.slow
 def test_a_search_for_garbage_no_longer_goes_through_what_is_loaded():
     """Else one takes longer than a loop may be silent, some minutes into a motion."""
     counted = subprocess.run([sys.executable, "-c", _COUNTED], capture_output=True, text=True,
@@ -36,6 +37,7 @@ print(kept, lines["VmLck"].split()[0], lines["VmSize"].split()[0])
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is locked on Linux only")
 def test_what_is_loaded_stays_in_memory():
     """Else the first motion after a minute's rest waits for the disk."""
@@ -77,6 +79,7 @@ time.sleep(60)
 """
 
 
+@pytest.mark.slow
 def test_a_driver_that_is_stuck_ends_when_nobody_gives_it_orders():
     """Its recorder was killed and its robot closed: it kept a processor busy for minutes."""
     ended = subprocess.run([sys.executable, "-c", _STUCK], stdin=subprocess.DEVNULL, timeout=30,

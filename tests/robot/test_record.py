@@ -71,6 +71,7 @@ def test_nothing_moves_without_a_typed_name(branch_folder, tmp_path, worker_addr
             record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm=confirm))
 
 
+@pytest.mark.slow
 def test_a_recording_that_never_began_leaves_nothing(branch_folder, tmp_path):
     """Nobody answers at the address: the name stays free, nothing is told to be cut off."""
     path = cell_file(standing_at(Branch.open(branch_folder), "127.0.0.98"), tmp_path)

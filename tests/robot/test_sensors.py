@@ -132,6 +132,7 @@ def test_a_touched_gripper_is_not_tared():
         chain.end_tare()
 
 
+@pytest.mark.slow
 def test_a_reading_at_the_end_of_the_range_is_no_number_to_trust():
     chain = WrenchChain(cell_with(force_range_n=50.0))
     now, _ = chain.wrench(sample_at(np.zeros(6)), reading_of(np.r_[50.0, np.zeros(5)]))

@@ -121,6 +121,7 @@ def test_out_of_reach_is_a_protective_stop_not_a_motion(registers):
     assert registers.controller.pose == pytest.approx(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("event", ["protective_stop", "emergency_stop", "local", "dashboard"])
 def test_every_stop_brings_the_arm_to_rest(registers, event):
     """From 0.1 m/s within 20 ms and 1 mm; nothing moves afterwards, whatever is written."""

@@ -83,6 +83,7 @@ def test_loads_are_not_answered_by_a_model_that_does_not_know_them(session):
     assert at(session, 0.01).status == Status.reduced
 
 
+@pytest.mark.slow
 def test_a_second_session_does_not_learn_again(session, branch_folder, cache):
     """It finds the model, and answers the same."""
     first = at(session, 0.015, 0.004)
@@ -94,6 +95,7 @@ def test_a_second_session_does_not_learn_again(session, branch_folder, cache):
         assert frame.energy == pytest.approx(first.energy, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_damaged_cache_is_said_and_learnt_again(branch_folder, tmp_path):
     """A broken file costs a warning and the time to learn, not the session."""
     options = {"mode": "pinned", "cache_folder": tmp_path, **SMALL}

@@ -138,6 +138,7 @@ def test_what_cannot_be_done_is_refused(session, command, fields, words):
     assert session.request("hello", protocol=PROTOCOL)["event"] == "reply"
 
 
+@pytest.mark.slow
 def test_grasps_do_not_overlap(session):
     """One node cannot follow two grippers."""
     session.release()
@@ -148,6 +149,7 @@ def test_grasps_do_not_overlap(session):
     session.release()
 
 
+@pytest.mark.slow
 def test_another_protocol_is_refused_by_the_client(branch_folder, monkeypatch):
     """A session of another version is not talked to, and both versions are named."""
     monkeypatch.setattr(client, "PROTOCOL", PROTOCOL + 1)
@@ -242,6 +244,7 @@ def test_no_mutation_of_a_command_ends_a_session(process, command, changes):
     assert process.answers()[-1]["event"] == "reply"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [
     b'{"command": "move", "id": 1e400, "pose": [0, 0, 0.14, 0, 0, 0]}',
     b"[" * 200_000, b"\xff\xfe\xfa", b"x" * (3 << 20),
@@ -263,6 +266,7 @@ def test_an_endless_line_takes_no_memory(process):
     assert grown < 40 << 20
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="SIGSTOP and pipes as on POSIX")
 def test_the_session_ends_with_a_client_that_was_killed(branch_folder, tmp_path):
     """A client killed in the middle of a move leaves no process and no file."""
@@ -285,6 +289,7 @@ def test_the_session_ends_with_a_client_that_was_killed(branch_folder, tmp_path)
     assert not os.path.exists(path.strip())
 
 
+@pytest.mark.slow
 def test_the_command_is_a_session(branch_folder, tmp_path):
     """`limber session` speaks the protocol; a folder that is none ends it with code 2."""
     command = [sys.executable, "-m", "limber", "session"]
@@ -300,6 +305,7 @@ def test_the_command_is_a_session(branch_folder, tmp_path):
     assert json.loads(done.stdout)["event"] == "failed"
 
 
+@pytest.mark.slow
 def test_named_targets_are_followed(branch_folder, tmp_path):
     """A target of the folder is in each frame, where the surface about it has gone."""
     folder = tmp_path / "beam.branch"

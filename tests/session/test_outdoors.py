@@ -117,6 +117,7 @@ def test_gusts_in_a_session(with_axes):
         protocol.parse_command(_GUSTY.replace(b'"id": 8', b'"gust": 0.3'))
 
 
+@pytest.mark.slow
 def test_what_loads_do_is_told(with_axes):
     """As `limber load` tells it, of the branch as it is now; one question at a time."""
     held = load_held(with_axes, SessionSettings())

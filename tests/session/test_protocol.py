@@ -61,6 +61,7 @@ def test_what_is_no_command_is_refused_with_its_reason(line, words):
         parse_command(line)
 
 
+@pytest.mark.slow
 @given(st.sampled_from(GOOD), st.sampled_from(["command", "id", "pose", "grasp", "on", "loads"]),
        VALUES)
 @settings(max_examples=300, deadline=None)
@@ -86,6 +87,7 @@ def test_bytes_of_any_kind_are_refused(line):
         parse_command(line)
 
 
+@pytest.mark.slow
 @given(st.lists(st.binary(max_size=30), max_size=12), st.data())
 @settings(max_examples=200, deadline=None)
 def test_lines_do_not_depend_on_how_they_are_cut(lines, data):

@@ -118,6 +118,7 @@ def test_what_is_not_understood_is_named_and_survived(session):
     assert session.wait(session.move(moved(session, y=0.01))) is not None
 
 
+@pytest.mark.slow
 def test_motion_goes_on_and_comes_to_rest(session):
     """In dynamics frames keep coming, time advances, and the branch swings after a move."""
     session.wait(session.move(moved(session)))
@@ -133,6 +134,7 @@ def test_motion_goes_on_and_comes_to_rest(session):
     assert second.kinetic_energy < 0.01 * second.energy
 
 
+@pytest.mark.slow
 def test_a_strange_client_needs_no_limber(branch_folder):
     """A program that knows only JSON and the file's layout gets positions; leaving ends it all."""
     process = subprocess.Popen(
@@ -164,6 +166,7 @@ def test_a_strange_client_needs_no_limber(branch_folder):
     assert not Path(hello["positions"]).exists()
 
 
+@pytest.mark.slow
 def test_the_session_dies_alone_and_its_client_says_so(branch_folder):
     """A killed session is an error at the next call, and leaves no file and no trainer."""
     session = InteractiveSession(branch_folder, **SMALL)
@@ -180,6 +183,7 @@ def test_the_session_dies_alone_and_its_client_says_so(branch_folder):
     assert not left
 
 
+@pytest.mark.slow
 def test_no_branch_no_session(tmp_path):
     """A folder that is none gives the reason."""
     with pytest.raises(WorkError, match=r"no folder|branch folder"):

@@ -23,6 +23,7 @@ def tip():
     return tuple(map(float, skeleton.nodes[skeleton.main_path()[-1]]))
 
 
+@pytest.mark.slow
 def test_a_fruit_with_interval_and_limit(tip):
     """It sags within the interval of the estimate, and bears the load so many times."""
     result = load(EXAMPLE, LoadSettings(fruit=((*tip, 0.005),), limit_load=True, most=100.0))
@@ -41,6 +42,7 @@ def test_a_fruit_with_interval_and_limit(tip):
     assert max(strains) <= result["greatest_strain"]
 
 
+@pytest.mark.slow
 def test_the_limit_is_where_the_strain_is(tip):
     """At that share of a load that is too much the greatest strain is the limit's."""
     branch = Branch.open(EXAMPLE)
@@ -62,6 +64,7 @@ def test_a_load_is_needed_and_lies_on_the_branch(tip):
             load(EXAMPLE, settings)
 
 
+@pytest.mark.slow
 def test_gusts_bend_it_further_than_an_even_wind(tmp_path):
     """Their peak is the rest under so many times the mean load; a record of even wind adds none."""
     even = load(EXAMPLE, LoadSettings(wind=(6.0, 0.0, 0.0)))
@@ -97,6 +100,7 @@ def test_gusts_that_make_no_sense(tmp_path, content, settings, told):
         load(EXAMPLE, LoadSettings(**settings, **({"gust_record": record} if content else {})))
 
 
+@pytest.mark.slow
 def test_a_kept_load_stands_in_report_and_scene(tmp_path):
     """Its table and picture on the page, its frames in the scene; a damaged file is named."""
     from limber.report.loads import read_load

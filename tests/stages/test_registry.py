@@ -118,6 +118,7 @@ def test_help_hides_what_is_for_experts(capsys):
     assert "--newmark-beta" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_schema_commands_print_json():
     """`limber schema` has what `limber STAGE --schema` has of each stage."""
     def printed(*arguments):

@@ -61,6 +61,7 @@ def test_a_kept_skeleton_given_back_is_used_as_it_is(made, tmp_path) -> None:
     assert again["mesh_volume_m3"] == pytest.approx(result["mesh_volume_m3"], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_edits_outlive_a_new_reconstruct(made, tmp_path) -> None:
     """The mesh follows an edit; the folder keeps it; a misfit is told; an empty list undoes it."""
     folder, result = made
@@ -133,6 +134,7 @@ reconstruct(scan, target, ReconstructSettings.model_validate_json(sys.argv[3]))
 """
 
 
+@pytest.mark.slow
 def test_one_killed_after_its_skeleton_goes_on_from_there(made, tmp_path, monkeypatch) -> None:
     """kill -9 between skeleton and mesh: nothing is sought again, and every byte is the same."""
     folder, result = made
@@ -194,6 +196,7 @@ def test_a_search_comes_back_to_its_last_bit(tmp_path) -> None:
             FoundSkeleton.read(path)
 
 
+@pytest.mark.slow
 def test_a_failed_mesh_leaves_the_skeleton(made, tmp_path, monkeypatch, capsys) -> None:
     """The kept skeleton is there, listed, and said to be without a mesh; then it is mended."""
     folder, result = made

@@ -33,6 +33,7 @@ def written(path: Path, frequency: float, damping: float = 0.03) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_stiffer_branch_rings_faster(branch, tmp_path):
     """A record of the branch with 1.5 times its modulus gives that factor, and keeps it."""
     model = load_branch(branch).model
@@ -56,6 +57,7 @@ def test_a_stiffer_branch_rings_faster(branch, tmp_path):
         vibration_rows(now.path("vibration.json"))
 
 
+@pytest.mark.slow
 def test_import_pull_takes_a_record_of_a_swing(branch, tmp_path, capsys):
     """Other names and units of time, a counter and a gap beside the readings: the same modulus."""
     record = written(tmp_path / "ring.csv", 2.5)
@@ -72,6 +74,7 @@ def test_import_pull_takes_a_record_of_a_swing(branch, tmp_path, capsys):
     assert told["young_pa"] == pytest.approx(plain["young_pa"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_heavy_sensor_is_reckoned_with(branch, tmp_path):
     """The same record with a mass at the tip means stiffer wood."""
     tip = load_mesh(branch).nodes[load_mesh(branch).nodes[:, 2].argmax()]

@@ -67,6 +67,7 @@ def fresh(tmp_path: Path):
     return make
 
 
+@pytest.mark.slow
 def test_a_kill_at_every_step_of_a_stage_leaves_the_folder_before_or_after(fresh):
     """At each change of a name: opened again all files are of one run; no litter after the next."""
     found = []
@@ -90,6 +91,7 @@ def test_a_kill_at_every_step_of_a_stage_leaves_the_folder_before_or_after(fresh
     assert len(found) >= 8
 
 
+@pytest.mark.slow
 def test_a_kill_at_every_step_of_create_leaves_a_folder_that_opens(tmp_path: Path):
     """New or empty before: what is there afterwards can be made a branch folder again, or is one.
     """
@@ -109,6 +111,7 @@ def test_a_kill_at_every_step_of_create_leaves_a_folder_that_opens(tmp_path: Pat
         assert deadly > 1
 
 
+@pytest.mark.slow
 def test_a_commit_that_another_program_left_half_done_comes_first(fresh):
     """An opener from before the kill, who never looked at the journal, still loses nothing."""
     folder = fresh("left")

@@ -48,6 +48,7 @@ def write(branch: Branch, number: int) -> None:
         stage.path("deep/y.txt").write_text(str(number))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("code", "names"), [(errno.ENOSPC, _WRITING), (errno.ESTALE, _ALL)])
 def test_at_every_step_the_folder_is_left_before_or_after(tmp_path, monkeypatch, code, names):
     """The error is in words, the folder whole, the right to write free again."""
@@ -117,6 +118,7 @@ def test_what_a_failed_writer_has_open_is_closed(tmp_path):
     assert caught.value.__cause__ is not None and held[0]() is None
 
 
+@pytest.mark.slow
 def test_a_native_writer_on_a_full_disk(tmp_path):
     """It says in its own words what happened; others of its errors stay what they are."""
     branch = Branch.create(tmp_path / "a.branch")

@@ -37,6 +37,7 @@ def test_lines_come_back_in_order_and_are_gone_on_with(tmp_path: Path):
     assert lines == [f"{part},{line},µ" for part in range(2) for line in range(1000)]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_kill_9_loses_at_most_a_second(tmp_path: Path):
     """A writer at 500 lines a second is killed: all but its last second is there, and whole."""

@@ -38,6 +38,7 @@ def test_pcd(tmp_path, form):
         read_points(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_las(tmp_path, suffix):
     """Read as written; with a mangled count refused by the header alone."""
@@ -55,6 +56,7 @@ def test_las(tmp_path, suffix):
         read_points(path)
 
 
+@pytest.mark.slow
 def test_a_reader_apart_tells_what_went_wrong(tmp_path):
     """An error of a package in the other process arrives as one of ours."""
     path = tmp_path / "a.laz"

@@ -64,6 +64,7 @@ def test_leaves_are_told_from_stems(seedling) -> None:
     assert sum(leaf.area for leaf in leaves) == pytest.approx(area, rel=0.3)
 
 
+@pytest.mark.slow
 def test_leaves_are_the_same_however_the_file_is_sorted_and_turned(seedling) -> None:
     """Shuffled, turned and moved: the same points lie on leaves."""
     _, points, _, _ = seedling
@@ -101,6 +102,7 @@ def test_rims_of_leaves_go_with_them_and_stems_stay() -> None:
     assert found[3980:].tolist() == [True, True, False]
 
 
+@pytest.mark.slow
 def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> None:
     """Stems found, none in leaves; leaves weigh on the model, also after edits."""
     branch, points, on_leaf, area = seedling
@@ -124,6 +126,7 @@ def test_a_leafy_plant_is_its_stems_with_the_leaves_mass(seedling, tmp_path) -> 
         pytest.approx(result["leaf_mass_kg"]))
 
 
+@pytest.mark.slow
 def test_leaves_are_not_cut_off_unasked(seedling, tmp_path) -> None:
     """Over a tenth of the points: refused, with the share and a place in the file's coordinates."""
     _, points, on_leaf, _ = seedling
@@ -185,6 +188,7 @@ def test_twigs_that_fork_in_one_plane_are_no_leaf(seed: int, spacing: float) -> 
     assert find_leaves(_spray(seed, spacing)) == []
 
 
+@pytest.mark.slow
 def test_a_stem_seen_from_one_side_is_no_leaf() -> None:
     """Its skeleton shows it round, though half of its points lie on a strip that is flat."""
     rng = np.random.default_rng(0)

@@ -83,6 +83,7 @@ def test_ground_and_walls_are_cut_out(turned):
     assert len(prepare(both, 1.0, PreparationSettings(keep_sheets=True)).cloud) == len(both)
 
 
+@pytest.mark.slow
 def test_branches_are_no_sheets():
     """Stout, one-sided, noisy, sparse and flat-grown plants lose nothing."""
     for spec in ({"radius_root": 0.04, "length": 0.3}, {"view": "one-sided", "radius_root": 0.03},

@@ -79,6 +79,7 @@ def test_a_pinched_stretch_starts_as_thick_as_what_is_beyond() -> None:
     np.testing.assert_array_equal(unpinched(tip, points).radius, tip.radius)
 
 
+@pytest.mark.slow
 def test_a_scan_with_holes_keeps_its_volume() -> None:
     """One of the bench's cases, seen from one side: it had lost 7 % of its cylinders' volume."""
     case = one_sided_case(1604433927049)

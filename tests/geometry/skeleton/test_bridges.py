@@ -110,6 +110,7 @@ def test_a_twig_at_a_stems_end_does_not_close_it() -> None:
     assert found.direction[found.node == 0][0] == pytest.approx([0, 0, -1])
 
 
+@pytest.mark.slow
 def test_a_stem_goes_on_past_a_twig_at_its_end() -> None:
     """One of the bench's cases, seen from one side: the main axis had gone 5 radii aside, up a twig
     that came to the upper stem's end first."""
@@ -163,6 +164,7 @@ def test_what_hangs_beside_a_longer_axis_has_neither_its_thickness_nor_its_direc
     assert ends.direction[ends.node == 60][0] == pytest.approx([0, 0, 1], abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_knob_of_the_stem_is_no_foot_of_a_twig() -> None:
     """Seen from one side: a twig had been led to a knob at the next fork, since the stem is thick,
     and not to where its own line meets the stem, at half the price: two forks were false."""

@@ -37,6 +37,7 @@ def test_pieces_are_bridged_to_one_tree() -> None:
     assert len(graph.bridges) == 1 and (graph.owner >= 0).all()
 
 
+@pytest.mark.slow
 def test_sparse_scans_are_told_from_others() -> None:
     """A well scanned branch is contracted as ever; a crown whose twigs are lines is not."""
     branch = generate_branch(31).cloud.points
@@ -55,6 +56,7 @@ def test_crown_of_thin_twigs_is_found() -> None:
     assert explained(points, found) > 0.95
 
 
+@pytest.mark.slow
 def test_axes_follow_curved_leaves() -> None:
     """A leaf's axis runs along its midrib to its end, and the stem's stays in the stem."""
     points, ribs = curved_leaves()
@@ -66,6 +68,7 @@ def test_axes_follow_curved_leaves() -> None:
     assert found.radius.max() < 0.004
 
 
+@pytest.mark.slow
 def test_last_digits_of_a_solve_do_not_choose_the_skeleton(monkeypatch) -> None:
     """Errors as large as libraries' rounding, in each round of the fit: the same to the last bit.
 
@@ -89,6 +92,7 @@ def test_last_digits_of_a_solve_do_not_choose_the_skeleton(monkeypatch) -> None:
     assert found[0].skeleton.nodes.tobytes() == found[1].skeleton.nodes.tobytes()
 
 
+@pytest.mark.slow
 def test_a_shuffled_leafy_scan_has_the_same_skeleton() -> None:
     """Points in another order: the same axes to the last bit."""
     points, _ = curved_leaves(7000)

@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pytest
 
 from limber.geometry.skeleton.contraction import pieces
 from limber.geometry.skeleton.contraction.pieces import join_pieces
@@ -42,6 +43,7 @@ def _joined(twigs, seed=0):
                        bridge_limit=0.3, up=Z, join_plants=True)
 
 
+@pytest.mark.slow
 def test_a_crown_of_many_pieces_is_joined_in_seconds():
     """Every trial without a bridge once joined all pieces again, pricing all of them each time."""
     _joined(2)  # compiles
@@ -51,6 +53,7 @@ def test_a_crown_of_many_pieces_is_joined_in_seconds():
     assert state.label.max() == 0 and len(state.bridges) == 47
 
 
+@pytest.mark.slow
 def test_what_is_remembered_changes_nothing(monkeypatch):
     """Rounds taken over and ends known from before give what joining all anew gives."""
     states = [_joined(8, seed) for seed in range(4)]

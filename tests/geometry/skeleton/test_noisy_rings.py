@@ -28,6 +28,7 @@ def _axis(radius: float) -> Skeleton:
     return Skeleton.from_edges(nodes, np.arange(40) - 1, np.full(40, radius))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [False, True])
 @pytest.mark.parametrize("share", [0.1, 0.25, 0.4])
 def test_radius_under_noise_has_no_bias(half: bool, share: float) -> None:
@@ -67,6 +68,7 @@ def test_points_lie_at_their_aims_on_average(radius: float) -> None:
     assert average((distance[:, None] - near.axis) * out) == pytest.approx(0, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [False, True])
 def test_noise_of_half_the_radius_is_told_whole(half: bool) -> None:
     """Points over a radius off are left out; without those it came out 10 % too small."""
@@ -134,6 +136,7 @@ def _twig_beside_a_stem(radius: float, noise: float, half: bool, per_radius: flo
             points + rng.normal(0, noise, points.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("half", [False, True])
 @pytest.mark.parametrize("noise", [0.001, 0.002, 0.003])
 @pytest.mark.parametrize("per_radius", [3, 8])
@@ -151,6 +154,7 @@ def test_a_twig_of_few_points_is_as_thick_as_it_is(half, noise, per_radius) -> N
     assert np.mean(held) > 0.7
 
 
+@pytest.mark.slow
 def test_twigs_as_thin_as_the_noise_do_not_take_it_for_radius() -> None:
     """One of the bench's cases: by their nearest places alone twigs came out half as thick again,
     and its volume by 32 % too large."""
@@ -194,6 +198,7 @@ def test_sides_are_told_apart() -> None:
     assert size.max() <= 1 + 1e-9 and size.min() > 0.3
 
 
+@pytest.mark.slow
 def test_half_a_noisy_ring_is_not_taken_for_a_thinner_whole_one() -> None:
     """Noise of half the radius, and the axis at first in the middle of the points that one side
     shows: points lie all around it, and only how they scatter tells that it is half a ring."""
@@ -219,6 +224,7 @@ def test_a_side_that_was_told_is_kept() -> None:
     assert kept.seen is told.seen
 
 
+@pytest.mark.slow
 def test_a_flat_stem_is_not_taken_for_half_a_ring(monkeypatch) -> None:
     """An elliptic section, 1.7 times as wide as thick, with noise of 0.4 of its radius: as flat as
     an arc, but not bent. Taken for one, it would come out thicker."""
@@ -231,6 +237,7 @@ def test_a_flat_stem_is_not_taken_for_half_a_ring(monkeypatch) -> None:
     assert half > 1.05 * whole
 
 
+@pytest.mark.slow
 def test_scatter_that_is_known_to_be_along_the_sight_moves_no_radius() -> None:
     """A camera's scatter of 1.4 radii, and a fit that starts thin.
 

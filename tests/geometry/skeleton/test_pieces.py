@@ -51,6 +51,7 @@ def _line(start, end, count):
     return np.linspace(np.array(start, float), np.array(end, float), count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance", [0.07, 0.1, 0.25])
 def test_two_plants_are_refused_however_near(distance):
     """Two stems side by side: refused, although their gap is short enough for a bridge."""
@@ -59,6 +60,7 @@ def test_two_plants_are_refused_however_near(distance):
         skeletonise(cloud)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", [_plant(0.1, seed=5), _plant(0.9, seed=5) + [0, 0, 0.4]])
 def test_places_are_told_in_the_coordinates_of_the_file(second):
     """Two plants, near or far apart, in millimetres far from the origin."""
@@ -85,6 +87,7 @@ def test_warnings_have_places_in_the_coordinates_of_the_file():
     assert "origin" not in text and text.count("(5.0") + text.count("(4.9") == 2
 
 
+@pytest.mark.slow
 def test_largest_of_two_plants():
     """On request the larger one alone, with what was left away told."""
     cloud = np.vstack([_plant(0), _plant(0.1, height=0.4, seed=5)])
@@ -94,6 +97,7 @@ def test_largest_of_two_plants():
     assert any("left away" in text for text in result.warnings)
 
 
+@pytest.mark.slow
 def test_two_plants_joined_on_request():
     """Also on request they are bridged, and the second base is told."""
     cloud = np.vstack([_plant(0), _plant(0.08, seed=5)])
@@ -120,6 +124,7 @@ def test_a_stray_clump_is_left_away():
     assert joined.label[0] == joined.label[-1] != joined.label[60]
 
 
+@pytest.mark.slow
 def test_the_root_belongs_to_the_plant():
     """A stray clump below the stem is reported, and draws neither root nor bridge."""
     stray = np.random.default_rng(1).normal(0, 0.006, (60, 3)) + [0.16, 0, -0.12]

@@ -21,6 +21,7 @@ def test_rods_that_leaves_became_show_nothing_round() -> None:
     assert not shows_round(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["rough ball", "half ball", "heap", "can"])
 def test_what_has_no_axis_is_refused(shape: str) -> None:
     """Balls, seen whole or from one side, a filled box and a can are no branches."""

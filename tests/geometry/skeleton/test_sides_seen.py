@@ -58,6 +58,7 @@ def test_where_all_axes_are_parallel_the_view_does_not_turn_along_them() -> None
     assert np.degrees(seen.limit) == pytest.approx(np.degrees(1.47), abs=2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [901100, 901103])
 def test_radii_of_one_side_are_not_too_thick(seed: int) -> None:
     """Two of the bench's development cases, whose volume came out 4 to 6 % too large with the

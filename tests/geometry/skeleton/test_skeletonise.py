@@ -26,6 +26,7 @@ def _tube(start, end, radius, count):
         np.cos(angle) * side + np.sin(angle) * np.cross(axis, side)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("view", "radius_limit"), [("round", 0.08), ("one-sided", 0.12)])
 def test_generated_truth_is_found_again(view, radius_limit):
     """Axes, radii and forks of a noisy scan, as near as the issue asks."""
@@ -41,6 +42,7 @@ def test_generated_truth_is_found_again(view, radius_limit):
     assert result.noise == pytest.approx(0.001, rel=0.25)
 
 
+@pytest.mark.slow
 def test_a_foot_does_not_reach_out_of_the_points():
     """One of the bench's cases: its first two nodes had been left a radius below all points."""
     case = round_case(905117005)
@@ -48,6 +50,7 @@ def test_a_foot_does_not_reach_out_of_the_points():
     assert np.linalg.norm(root - case.truth.nodes[0]) < 0.5 * case.truth.radius[0]
 
 
+@pytest.mark.slow
 def test_attraction_may_grow():
     """As neighbourhoods shrink: other points, and the same axes on a scan from all around."""
     branch = generate_branch(8, fork_count=3)
@@ -60,6 +63,7 @@ def test_attraction_may_grow():
     assert (scored["forks_found"], scored["forks_false"]) == (3, 0)
 
 
+@pytest.mark.slow
 def test_radius_uncertainty_is_about_the_error(forked_branch):
     """The stated standard deviation is of the size of the true error."""
     result = skeletonise(forked_branch.cloud.points, root=forked_branch.skeleton.nodes[0])
@@ -71,6 +75,7 @@ def test_radius_uncertainty_is_about_the_error(forked_branch):
     assert 0.2 < np.median(error) / np.median(found.radius_sigma) < 5
 
 
+@pytest.mark.slow
 def test_gap_is_bridged_and_reported():
     """A stem cut in two by a gap comes out in one piece, and the gap is told."""
     stem = np.vstack([_tube([0, 0, 0], [0, 0, 0.3], 0.01, 2500),
@@ -81,6 +86,7 @@ def test_gap_is_bridged_and_reported():
     assert len(result.bridges) == 1 and "gap" in result.warnings[0]
 
 
+@pytest.mark.slow
 def test_gap_over_the_limit_is_split():
     """With no bridging allowed the smaller piece is left away, and that is told."""
     stem = np.vstack([_tube([0, 0, 0], [0, 0, 0.6], 0.01, 4000),
@@ -90,6 +96,7 @@ def test_gap_over_the_limit_is_split():
     assert result.skeleton.length < 0.66
 
 
+@pytest.mark.slow
 def test_closed_loop_is_opened_and_reported():
     """Where branches touch, the tree is cut and the loop's length told."""
     around, about = RNG.uniform(0, 2 * np.pi, (2, 6000))
@@ -122,6 +129,7 @@ def test_no_branch_is_refused_with_the_reason(points, complaint):
         skeletonise(points)
 
 
+@pytest.mark.slow
 def test_foliage_degrades_and_is_told():
     """Leaves on a stem: a skeleton still, and a warning."""
     leaves = [np.array([0, 0.05 * (-1)**k, 0.1 + 0.08 * k]) + RNG.normal(0, 0.025, (600, 3)) * [
@@ -157,6 +165,7 @@ def test_thinning_keeps_the_limit_and_the_extent():
     assert np.ptp(points[chosen][:, 2]) > 0.99
 
 
+@pytest.mark.slow
 def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch):
     """One solve for nodes far apart gives the same deviations as one solve for each node."""
     points, root = forked_branch.cloud.points, forked_branch.skeleton.nodes[0]
@@ -169,6 +178,7 @@ def test_radius_uncertainty_by_far_apart_probes(monkeypatch, forked_branch):
     assert not np.allclose(near.radius_sigma, exact.radius_sigma, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_points_changes_nothing() -> None:
     """The same scan shuffled gives the same skeleton, and points keep their own node."""
     points = generate_branch(12, length=0.4, fork_count=1, point_spacing=0.003).cloud.points
@@ -178,6 +188,7 @@ def test_the_order_of_the_points_changes_nothing() -> None:
     np.testing.assert_array_equal(again.node_of_point, first.node_of_point[order])
 
 
+@pytest.mark.slow
 def test_a_scan_moved_and_turned_gives_the_same_skeleton() -> None:
     """Of thin branches in as much noise, where each choice leads to others, down to rounding."""
     rng = np.random.default_rng(5)

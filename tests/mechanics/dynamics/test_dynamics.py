@@ -37,6 +37,7 @@ def tip_of(mesh):
     return Grasp.of_nodes(mesh, np.flatnonzero(mesh.nodes[:, 2] > LENGTH - 1e-9), "pinned")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lumped", [False, True])
 def test_free_vibration_keeps_frequency_and_energy(mesh, lumped):
     """1,000 undamped steps: the beam's first frequency and the energy stay within 1 %."""
@@ -174,6 +175,7 @@ def test_rigid_turn_is_not_braked(mesh):
     assert np.abs(model.internal(turned, viscous=viscous).force).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_torn_motion_stops_with_good_frames(mesh):
     """A grasp torn away: not converged, the frames before are kept and finite."""
     model = make_model(mesh, damping=RayleighDamping(0.5, 0.002))

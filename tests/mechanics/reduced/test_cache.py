@@ -106,6 +106,7 @@ def test_the_least_used_go_where_room_is_short(learnt, tmp_path):
     assert [path.name for path in tmp_path.glob("*.npz")] == [last.name]
 
 
+@pytest.mark.slow
 def test_two_at_once_learn_once(branch, learnt, tmp_path, monkeypatch):
     """The second waits for the first instead of learning beside it."""
     count = []

@@ -258,6 +258,7 @@ def test_a_search_ends_with_its_iterations(trained, grasp):
     assert not shorter.converged and shorter.iterations == first.iterations - 1
 
 
+@pytest.mark.slow
 def test_file_holds_the_model(trained, grasp, tmp_path):
     """Written and read again it gives the same answer; another file is refused."""
     reduced, _ = trained

@@ -65,6 +65,7 @@ def test_motion_agrees_with_the_full_model(model, grasp, trained):
     assert wrong.max() < 0.05 * np.abs(full.reaction_force).max()
 
 
+@pytest.mark.slow
 def test_second_order_in_the_step(grasp, trained):
     """Halving the step quarters the error (a bent branch on, so that nothing buckles)."""
     reduced, ends = trained[0], []
@@ -133,6 +134,7 @@ def test_measured_error_is_the_error(model, grasp, trained):
         assert checked(state, estimate, position_tolerance=0.1, energy_tolerance=1.0).trusted
 
 
+@pytest.mark.slow
 def test_good_states_are_answered_reduced(model, grasp, trained):
     """Within the training the reduced answer stands, and the check agrees."""
     answer = refreshing(model, grasp, trained).solve(
@@ -140,6 +142,7 @@ def test_good_states_are_answered_reduced(model, grasp, trained):
     assert answer.source == "reduced" and answer.estimate.certain
 
 
+@pytest.mark.slow
 def test_it_learns_what_it_did_not_know(model, grasp):
     """Trained on small grasps, a large one is answered by the full model, then by the new basis."""
     small = TrainingSettings(grasp_count=16, young_spread=1.0, reach=0.1, vibration_every=8,

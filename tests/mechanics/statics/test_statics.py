@@ -98,6 +98,7 @@ def polygon_inertia(mesh):
     return (cross * (ring[:, 0]**2 + ring[:, 0] * after[:, 0] + after[:, 0]**2)).sum() / 12
 
 
+@pytest.mark.slow
 def test_work_of_the_gripper_is_the_energy(beam, slender_beam):
     """The clamped gripper's force and torque, summed along its path, give the strain energy."""
     grasp = Grasp.at(slender_beam, [0, 0, 0.5], 0.01, "clamped")
@@ -116,6 +117,7 @@ def test_work_of_the_gripper_is_the_energy(beam, slender_beam):
     assert simpson == pytest.approx(results[-1].strain_energy, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_force_and_pose_are_dual(beam, slender_beam):
     """The reaction at a pinned pose, applied as a force, gives the same shape."""
     grasp = Grasp.at(slender_beam, [0, 0, 0.45], 0.012, "pinned")
@@ -145,6 +147,7 @@ def test_result_does_not_depend_on_the_path():
         assert other.displacement == pytest.approx(once.displacement, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["pinned", "clamped"])
 def test_a_guess_of_the_end_saves_the_way(beam, slender_beam, mode):
     """Near the end, or far off it: the state is the one that the way leads to, its pose the asked
@@ -361,6 +364,7 @@ def test_a_saddle_is_not_passed_off_as_an_equilibrium(column):
     assert not result.converged or np.abs(result.displacement[:, :2]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_bow_that_turned_over_is_said_to_have_another_state(column):
     """A bow pushed through by a force stays so when let go; a column that buckled comes back."""
     mesh, top = column
@@ -399,6 +403,7 @@ def test_dead_load_beyond_buckling(column):
     assert np.linalg.norm(moved[:2]) == pytest.approx(2 * k / (np.pi / 2 * np.sqrt(1.1)), rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("move", [[0, 0, -0.015], [0, 0, -0.021], [0.01, 0.01, -0.015]])
 def test_neo_hookean_bears_strong_compression(move):
     """A block pressed to 30 % of its height, or aslant to half of it, finds a stable balance."""
@@ -412,6 +417,7 @@ def test_neo_hookean_bears_strong_compression(move):
     assert result.residual_history[-1] < 1e-6
 
 
+@pytest.mark.slow
 def test_soft_stvk_points_to_the_other_material():
     """Where St. Venant-Kirchhoff gives way the message says so, and what bears it."""
     mesh = box_mesh((0.01, 0.01, 0.03), (2, 2, 6))
