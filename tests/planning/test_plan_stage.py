@@ -278,11 +278,23 @@ def test_plan_that_breaks_a_limit_on_the_full_model_is_refused(copied, monkeypat
 
 def test_a_field_too_coarse_for_the_asked_bound_is_told():
     """With both numbers and what to change; one that is fine enough is not."""
-    summary = {"baseline": {"field_energy_error": 0.1}, "plan": {"field_energy_error": 0.05},
-               "certificate": {"gap_percent": 1.0}}
+    summary = {"baseline": {"field_energy_error": 0.1, "length_m": 0.1},
+               "plan": {"field_energy_error": 0.05, "length_m": 0.11},
+               "certificate": {"gap_percent": 1.0}, "planner": "eikonal"}
     told = _doubts(summary, 3.0)
     assert len(told) == 1 and "5 %" in told[0] and "over the 3 %" in told[0]
     assert _doubts(summary, 6.0) == []
+
+
+def test_a_shortest_path_that_is_longer_is_named():
+    """Its percentages would praise the gentle path for what RRT* did not find."""
+    summary = {"baseline": {"field_energy_error": 0.0, "length_m": 0.028},
+               "plan": {"field_energy_error": 0.0, "length_m": 0.0024},
+               "certificate": {"gap_percent": 411.0}, "planner": "eikonal"}
+    wide, longer = _doubts(summary, 6.0)
+    assert "411.0 % more" in wide and "eikonal" not in wide
+    assert "longer than the gentle one" in longer
+    assert "eikonal" in _doubts(summary | {"planner": "d-rrt-star"}, 6.0)[0]
 
 
 @pytest.mark.slow

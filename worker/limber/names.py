@@ -81,5 +81,5 @@ def is_link(path: Path) -> bool:
 
 def _link_error(path: Path) -> InputError:
     return InputError(f"{path} is a link.",
-                      "It may lead out of its folder, where nothing shall be read or written.",
+                      "It may lead out of its folder, where nothing may be read or written.",
                       "Put a copy of what it leads to in its place, or remove it.")

@@ -41,7 +41,8 @@ _RESERVE = 1.01  # on what limits are tightened by: the risk changes a little wi
 _OWN = 0.003  # [m] of the surface about a target that does not hide it
 _CHANGES = ("energy_saved_percent", "peak_energy_saved_percent", "length_added_percent")
 _STILL = 1e-9  # [m] a path that is no longer has no length
-_WIDE_GAP = 5.0  # percent, above which the user is told in a warning
+_WIDE_GAP = 5.0  # percent, above which a warning says so
+_LONGER = 1.05  # a smoothed gentle path may be a little shorter than an unsmoothed RRT* path
 
 
 @dataclass(frozen=True)
@@ -271,7 +272,8 @@ def _require_sight(goal: Goal, grasp_model: GraspModel, plan: ResolvedPath) -> N
     if goal.region.hidden_by(nodes[grasp_model.mesh.surface_faces()], goal.place(plan.solved),
                              _OWN):
         raise NoPathError(f"At the path's end the branch hides the {goal.name} from the camera.",
-                          "Paths are checked for sight, and not yet led to where there is some.",
+                          "Limber checks the line of sight at a path's end, but cannot plan for "
+                          "it yet.",
                           "Choose a --target-box on the camera's side, or move the camera.")
 
 
@@ -362,7 +364,7 @@ def _on_field(field: EnergyField, points: np.ndarray) -> PathMeasures:
 
 
 def _doubts(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -> list[str]:
-    if summary["plan"].get("length_m", 1.0) <= _STILL:
+    if summary["plan"]["length_m"] <= _STILL:
         return ["The start lies in the goal already: the path has no length, and there is nothing "
                 "to save."]
     doubts = []
@@ -374,8 +376,13 @@ def _doubts(summary: dict[str, Any], field_error: float, *paths: ResolvedPath) -
                           "poses with `limber energy --samples`.")
     gap = summary["certificate"]["gap_percent"]
     if gap is not None and gap > _WIDE_GAP:
-        doubts.append(f"The path may be up to {gap:.1f} % dearer than the best possible one; "
-                      "`--planner eikonal`, the default, comes closest.")
+        doubts.append(f"The path may cost up to {gap:.1f} % more than the best possible one" + (
+            "." if summary["planner"] == "eikonal" else "; `--planner eikonal` comes closest."))
+    shortest, gentle = (summary[key]["length_m"] for key in ("baseline", "plan"))
+    if shortest > _LONGER * gentle:
+        doubts.append("The path that is called shortest is longer than the gentle one: in a large "
+                      "goal RRT* aims at a few drawn poses. What is saved against it says little; "
+                      "name one goal pose (--goal) to compare paths.")
     unsolved = sum(path.unsolved_count for path in paths)
     if unsolved:
         doubts.append(f"{unsolved} poses along the shortest path had no acceptable solution and "
