@@ -27,8 +27,13 @@ from limber.errors import DamagedCacheWarning
 
 def cache_folder() -> Path | None:
     """Return the folder for compiled kernels, or None if it cannot be written to."""
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR")
-                  or platformdirs.user_cache_path("limber") / "numba" / _layout())
+    return _writable(Path(os.environ.get("NUMBA_CACHE_DIR")
+                          or platformdirs.user_cache_path("limber") / "numba" / _layout()))
+
+
+@functools.cache
+def _writable(folder: Path) -> Path | None:
+    """Make a folder; None where nothing can be written to it. Asked once: kernels are many."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from scipy.integrate import trapezoid
+import scipy
 
 from limber.errors import NoPathError
 from limber.geometry.skeleton.skeleton import Skeleton
@@ -33,7 +33,7 @@ def bending_modulus(skeleton: Skeleton, fraction: float, force: float, travel: f
     place = fraction * along[-1]
     at = np.linspace(0.0, place, 400)
     arms, radii = place - at, np.interp(at, along, radius)
-    return float(force / travel * trapezoid(arms**2 / (np.pi / 4 * radii**4), at))
+    return float(force / travel * scipy.integrate.trapezoid(arms**2 / (np.pi / 4 * radii**4), at))
 
 
 def base_beside(arm: Arm, tool: np.ndarray, point: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from limber.errors import WorkError
 from limber.mechanics.dynamics.motion import DynamicResult
@@ -125,7 +125,7 @@ def _shaken(model: BranchModel, grasp: Grasp, wanted: MotionWanted, way: MotionM
     out = np.clip(share / 0.25, 0.0, 1.0)
     swing = np.clip((share - 0.25) / 0.5, 0.0, 1.0)
     along = out**2 * (3 - 2 * out) * (0.75 + 0.25 * np.cos(2 * np.pi * SHAKES * swing))
-    poses = CubicSpline(np.linspace(0.0, 1.0, len(way.poses)), way.poses)(along)
+    poses = scipy.interpolate.CubicSpline(np.linspace(0.0, 1.0, len(way.poses)), way.poses)(along)
     held = _about_centre(grasp, wanted.point, poses)
     result = simulate_dynamics(model, grasp=grasp, poses=held, times=wanted.times,
                                settings=NewmarkSettings(), progress=progress)

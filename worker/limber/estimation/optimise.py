@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares, minimize
+import scipy
 
 from limber.errors import WorkError
 from limber.estimation.objective import FAILED_OBJECTIVE, Evaluation, Objective
@@ -109,7 +109,7 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
     settles = any(forward.watches_pose for forward in objective.forwards)
     shortest = WANDERING_STEP if settles else SETTLED_STEP
 
-    def minimised(moved: np.ndarray, loss: str, ending: float) -> OptimizeResult:
+    def minimised(moved: np.ndarray, loss: str, ending: float) -> "scipy.optimize.OptimizeResult":
         def jacobian(moved: np.ndarray) -> np.ndarray:
             found = _required(objective, moved + shift)
             step, length = _wanted_step(found, loss)
@@ -119,12 +119,12 @@ def gauss_newton(objective: Objective, start: np.ndarray, *, robust: bool = True
             return found.slopes
 
         try:
-            return least_squares(
+            return scipy.optimize.least_squares(
                 residual, moved, jacobian, bounds=(lower - shift, upper - shift), method="trf",
                 loss=loss, f_scale=OUTLYING, ftol=ending, xtol=SHORTEST_STEP, gtol=1e-12,
                 max_nfev=evaluation_limit)
         except _SettledError as end:
-            return OptimizeResult(
+            return scipy.optimize.OptimizeResult(
                 x=end.moved, status=1, message="The step that is still wanted is shorter than "
                 f"{shortest:g} standard deviations.")
 
@@ -197,10 +197,11 @@ def nelder_mead(objective: Objective, start: np.ndarray, *, evaluation_limit: in
     steps = np.r_[np.full(objective.space.group_count, 0.5),
                   [0.03 if name == "poisson" else 0.3 for name in objective.space.extra]]
     simplex = np.vstack([start, start + np.diag(steps)])
-    found = minimize(cost, start, method="Nelder-Mead", bounds=list(zip(lower, upper, strict=True)),
-                     callback=rule.after_iteration, options={
-                         "initial_simplex": np.clip(simplex, lower, upper), "xatol": tolerance,
-                         "fatol": tolerance, "maxfev": evaluation_limit, "adaptive": False})
+    found = scipy.optimize.minimize(
+        cost, start, method="Nelder-Mead", bounds=list(zip(lower, upper, strict=True)),
+        callback=rule.after_iteration, options={
+            "initial_simplex": np.clip(simplex, lower, upper), "xatol": tolerance,
+            "fatol": tolerance, "maxfev": evaluation_limit, "adaptive": False})
     return Fit(_required(objective, found.x), *rule.verdict(bool(found.success), evaluation_limit))
 
 

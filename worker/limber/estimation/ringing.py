@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from limber.errors import InputError
 from limber.present import present
@@ -132,9 +132,10 @@ def _fitted(times: np.ndarray, channels: np.ndarray, step: float) -> Ringing:
         low, high = np.log(0.2 / times[-1]), np.log(0.5 / step)
         bounds = (np.tile([low, np.log(_DAMPING[0])], len(trial) // 2),
                   np.tile([high, np.log(_DAMPING[1])], len(trial) // 2))
-        result = least_squares(lambda x: _left(x, times, channels).ravel(),
-                               np.clip(trial, bounds[0] + 1e-6, bounds[1] - 1e-6), bounds=bounds,
-                               x_scale=np.tile([0.02, 0.5], len(trial) // 2), max_nfev=60)
+        result = scipy.optimize.least_squares(
+            lambda x: _left(x, times, channels).ravel(),
+            np.clip(trial, bounds[0] + 1e-6, bounds[1] - 1e-6), bounds=bounds,
+            x_scale=np.tile([0.02, 0.5], len(trial) // 2), max_nfev=60)
         free, left = result.x, _left(result.x, times, channels)
         numbers = len(free) * (1 + channels.shape[1])
         score = channels.size * np.log(max(2 * result.cost / channels.size, 1e-30)) + (

@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import trapezoid
+import scipy
 
 from limber.mechanics.materials import RayleighDamping
 from limber.mechanics.model import BranchModel
@@ -119,7 +119,7 @@ def turbulent(sway: Swaying, speed: float, intensity: float, length: float, seco
     at = _frequencies(sway, speed / length)
     # What resonance adds; without it the branch follows all of the turbulence.
     added = np.abs(sway.transfer(at)) ** 2 - 1
-    resonance = float(trapezoid(added * wind_spectrum(at, speed, length), at))
+    resonance = float(scipy.integrate.trapezoid(added * wind_spectrum(at, speed, length), at))
     power = max(1 + resonance, 0.0)
     crossing = max(float(sway.frequencies[0]) * np.sqrt(max(resonance, 0.0) / max(power, 1e-12)),
                    _LEAST_CROSSING)

@@ -15,7 +15,7 @@ probability that is left (Bonferroni).
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm, qmc
+import scipy
 
 from limber.errors import ConvergenceError
 from limber.planning.field.grasp_model import GraspModel, refusal
@@ -139,8 +139,8 @@ class Exposure:
 def _draws(covariance: np.ndarray) -> np.ndarray:
     """Return changes of log E with this covariance [K, K], the same each time, shape [m, K]."""
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    even = qmc.Sobol(len(variances), seed=0).random_base2(_DRAWS_LOG2)
-    white = norm.ppf(np.clip(even, 1e-12, 1.0 - 1e-12))
+    even = scipy.stats.qmc.Sobol(len(variances), seed=0).random_base2(_DRAWS_LOG2)
+    white = scipy.special.ndtri(np.clip(even, 1e-12, 1.0 - 1e-12))
     return white * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import trapezoid
+import scipy
 
 from limber.compiled import compiled
 from limber.planning.field.energy_field import EnergyField, FieldArrays, allowed_at, energy_at
@@ -94,7 +94,7 @@ def measure_path(positions: np.ndarray, energies: np.ndarray, forces: np.ndarray
     spots = np.linspace(0.0, along[-1], max(round(along[-1] / STEP), 1) + 1)
     return PathMeasures(
         length_m=float(along[-1]),
-        energy_integral_jm=float(trapezoid(energies, along)),
+        energy_integral_jm=float(scipy.integrate.trapezoid(energies, along)),
         energy_sum_nmm=float(np.interp(spots, along, energies).sum() * 1e3),
         peak_energy_j=float(energies.max()), peak_force_n=float(forces.max()),
         positive_work_j=float(np.maximum(np.diff(energies), 0.0).sum()))

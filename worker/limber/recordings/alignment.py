@@ -7,7 +7,7 @@ interpolated and its wrench averaged over the time between two frames.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 from scipy.spatial.transform import Rotation, Slerp
 
 from limber.errors import InputError
@@ -114,8 +114,8 @@ def estimate_offset(pull: Pull, *, limit_s: float = 1.0) -> tuple[float, float]:
     cost = np.array([unexplained(offset) for offset in grid])
     best = int(np.argmin(cost))
     low, high = grid[max(best - 1, 0)], grid[min(best + 1, 80)]
-    found = minimize_scalar(unexplained, bounds=(low, high), method="bounded",
-                            options={"xatol": 1e-5})
+    found = scipy.optimize.minimize_scalar(unexplained, bounds=(low, high), method="bounded",
+                                           options={"xatol": 1e-5})
     step = 2e-3
     beside = unexplained(found.x + step) + unexplained(found.x - step)
     curvature = (beside - 2 * found.fun) / step**2

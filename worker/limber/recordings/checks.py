@@ -6,7 +6,7 @@ Each check returns the pull with the trouble removed and a sentence about it in 
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from limber.constants import FORCE_UNITS_N
 from limber.recordings.recording import Observations, Pull
@@ -97,7 +97,7 @@ def _better_order(predicted: np.ndarray, now: np.ndarray) -> np.ndarray | None:
     if len(seen) < 2:
         return None
     cost = np.linalg.norm(predicted[seen, None] - now[None, seen], axis=2)
-    rows, columns = linear_sum_assignment(cost**2)
+    rows, columns = scipy.optimize.linear_sum_assignment(cost**2)
     kept, best = np.trace(cost**2), np.sum(cost[rows, columns]**2)
     separation = np.min(np.linalg.norm(
         predicted[seen, None] - predicted[None, seen], axis=2) + np.diag(np.full(len(seen), 1e9)))

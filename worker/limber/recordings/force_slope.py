@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from limber.constants import FORCE_UNITS_N
 from limber.errors import InputError
@@ -139,7 +139,7 @@ def force_slope(displacement: np.ndarray, force: np.ndarray, *, warnings: tuple[
                         "does not depend on it.")
     x, y = x[loaded], y[loaded]
     slope, error = _line(x, y)
-    width = stats.t.ppf(0.975, len(x) - 2) * error
+    width = scipy.special.stdtrit(len(x) - 2, 0.975) * error
     stiffening = _stiffening(x, y)
     slips = _slips(x, y)
     before = float(_line(x[:slips[0] + 1], y[:slips[0] + 1])[0]) if (

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from limber.errors import InputError, MissingDependencyError, WorkError
 from limber.geometry.cloud.pixels import read_pixels
@@ -41,7 +41,7 @@ def segment_by_depth(depth: np.ndarray, *, near: float = 0.2, far: float = 2.0,
                              "They must be of one camera.", "Record the background again.")
         known = np.isfinite(background) & (background > 0)
         valid &= ~known | (depth < background - difference)
-    labels, count = ndimage.label(valid, structure=np.ones((3, 3)))
+    labels, count = scipy.ndimage.label(valid, structure=np.ones((3, 3)))
     if not count:
         return valid
     sizes = np.bincount(labels.ravel())[1:]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 from scipy.spatial.transform import Rotation
 
 from limber.errors import InputError
@@ -99,9 +99,9 @@ def fit_camera(robot: np.ndarray, seen: np.ndarray, camera_on: CameraOn, *,
         _require_depth(seen, largest_residual)
     starts = sorted((_started(turn, moves, seen) for turn in Rotation.random(
         _STARTS, rng=np.random.default_rng(0)).as_matrix()), key=lambda start: start[0])
-    found = min((least_squares(_off, start, args=(moves, seen), x_scale="jac", xtol=1e-13,
-                               ftol=1e-13) for _, start in starts[:_REFINED]),
-                key=lambda result: result.cost)
+    found = min((scipy.optimize.least_squares(_off, start, args=(moves, seen), x_scale="jac",
+                                              xtol=1e-13, ftol=1e-13)
+                 for _, start in starts[:_REFINED]), key=lambda result: result.cost)
     rows = found.fun.reshape(len(robot), -1)
     residuals = np.linalg.norm(rows, axis=1)
     if residuals.max() > largest_residual:

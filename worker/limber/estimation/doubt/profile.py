@@ -10,7 +10,7 @@ having followed (the profile likelihood; Venzon and Moolgavkar 1988).
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from limber.estimation.doubt.uncertainty import Uncertainty, inverse_information, scaled_rows
 from limber.estimation.objective import Evaluation, Objective
@@ -162,7 +162,7 @@ def bend_of(at: float, root: float) -> float:
     if abs(ratio - 1) < 1e-6:
         return 0.0
     ends = (1e-9, 200.0) if ratio < 1 else (-20.0, -1e-9)
-    return brentq(lambda way: -np.expm1(-way) / way - ratio, *ends) / at
+    return scipy.optimize.brentq(lambda way: -np.expm1(-way) / way - ratio, *ends) / at
 
 
 def limit_of(bend: float, root: float) -> float:

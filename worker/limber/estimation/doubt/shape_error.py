@@ -7,7 +7,7 @@ of axis and radius, and of several moduli go together as they do in the scan.
 """
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from limber.estimation.doubt.path_error import WIDEST
 from limber.estimation.doubt.shape_slopes import hung_slopes, shape_slopes, taken_up
@@ -52,7 +52,8 @@ def shape_error(evaluation: Evaluation, objective: Objective, subject: Subject,
     if steps is None:
         return None
     spread = np.sqrt(np.mean(steps**2, axis=1))
-    return np.minimum(spread * stats.t.ppf(0.975, count) / stats.norm.ppf(0.975), WIDEST)
+    student, normal = scipy.special.stdtrit(count, 0.975), scipy.special.ndtri(0.975)
+    return np.minimum(spread * student / normal, WIDEST)
 
 
 def hung_error(evaluation: Evaluation, objective: Objective, sigma: float) -> np.ndarray | None:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from limber.estimation.objective import Evaluation, Objective
 from limber.recordings.calibration import calibration_of
@@ -73,7 +73,7 @@ def uncertainty(evaluation: Evaluation, objective: Objective, level: float = 0.9
     together[:objective.space.group_count] = 1.0
     covariance += np.outer(together, together) * from_recording**2 / len(objective.forwards)
     deviation = np.sqrt(np.diag(covariance))
-    quantile = float(stats.t.ppf(0.5 + level / 2, freedom))
+    quantile = float(scipy.special.stdtrit(freedom, 0.5 + level / 2))
     width = quantile * deviation
     space = objective.space
     # Wider than 30 orders of magnitude says no more than that nothing is known.

@@ -6,7 +6,7 @@ the cost; every observed frame still counts in the fit, so no measurement is thr
 """
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 ROTATION_LENGTH_M = 0.1
 """A turn of one radian counts as this much travel: chosen; the model checks the spline."""
@@ -50,7 +50,7 @@ def key_frames(along: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     if len(places) < 4:
         spread = np.column_stack([np.interp(along, places, row) for row in np.eye(len(places))])
         return first, spread
-    return first, CubicSpline(places, np.eye(len(places)))(along)
+    return first, scipy.interpolate.CubicSpline(places, np.eye(len(places)))(along)
 
 
 def smoothed(times: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from limber.estimation.online.exact import Beside, ExactFrame, Here
 from limber.estimation.parameters import YOUNG_BOUNDS_PA
@@ -447,7 +447,7 @@ class OnlineEstimator:
 
     def _state(self, time: float, residual: float, trusted: bool) -> OnlineState:
         deviation = np.sqrt(np.diag(self.covariance))
-        width = stats.norm.ppf(0.975) * deviation
+        width = scipy.special.ndtri(0.975) * deviation
         interval = np.exp(self.log_young[:, None] + np.column_stack([-width, width]))
         # Nobody knows before the first frames of the full model how far off the reduced one is.
         checked = self._exact is None or len(self._surprises) >= 3

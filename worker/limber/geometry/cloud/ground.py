@@ -6,7 +6,7 @@ is none: points go on above it.
 """
 
 import numpy as np
-from scipy.ndimage import generic_filter
+import scipy
 
 _CELL = 0.03  # of the cloud's diagonal
 _LEAST_CELLS = 40
@@ -54,7 +54,7 @@ def find_ground(points: np.ndarray, up: np.ndarray, least: float) -> np.ndarray 
     where = np.full(len(count), 0)
     where[cell] = np.ravel_multi_index(tuple(place.T), shape)
     bumps.ravel()[where] = np.clip(off, -_BELOW * rough, _BELOW * rough)
-    bumps = generic_filter(bumps, _known_median, size=3, mode="constant", cval=np.nan)
+    bumps = scipy.ndimage.generic_filter(bumps, _known_median, size=3, mode="constant", cval=np.nan)
     over = height - plane(flat) - bumps.ravel()[where][cell]
     near = over < 2 * _BELOW * rough
     thick = 1.4826 * float(np.median(np.abs(over[near] - np.median(over[near]))))

@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from limber.errors import InputError
 from limber.mechanics.dynamics.pose_path import unwrapped
@@ -221,7 +221,7 @@ def simulate_reduced(model: ReducedModel, *, poses: np.ndarray, times: np.ndarra
     times, poses = np.asarray(times, float), np.asarray(poses, float)
     if times.ndim != 1 or len(times) < 2 or not (np.diff(times) > 0).all():
         raise InputError("Times do not ascend.", "Each frame needs a later time.", "Sort them.")
-    path = CubicSpline(times, unwrapped(poses[:, None])[:, 0], axis=0,
+    path = scipy.interpolate.CubicSpline(times, unwrapped(poses[:, None])[:, 0], axis=0,
                        bc_type=((1, np.zeros(6)), (2, np.zeros(6))))
     begin = start or model.solve_static(poses[0], nodal_forces=nodal_forces)
     stepper = ReducedStepper(model, begin, nodal_forces=nodal_forces, settings=settings)
@@ -250,8 +250,8 @@ def _pairs(first: float, second: float, pieces: int) -> list[tuple[float, float]
     return list(itertools.pairwise(cuts))
 
 
-def _spline_step(stepper: ReducedStepper, path: CubicSpline, first: float, second: float,
-                 seconds: list[float], depth: int = 0) -> bool:
+def _spline_step(stepper: ReducedStepper, path: "scipy.interpolate.CubicSpline", first: float,
+                 second: float, seconds: list[float], depth: int = 0) -> bool:
     began = time.perf_counter()
     held = _held_at(stepper.model, path, second)
     if stepper.step(*held, second - first):
@@ -263,7 +263,7 @@ def _spline_step(stepper: ReducedStepper, path: CubicSpline, first: float, secon
         for a, b in ((first, middle), (middle, second)))
 
 
-def _held_at(model: ReducedModel, path: CubicSpline, instant: float,
+def _held_at(model: ReducedModel, path: "scipy.interpolate.CubicSpline", instant: float,
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Grasp coordinates, velocity and acceleration on a path, by central differences."""
     small = 2e-5

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 import numpy as np
-from scipy.ndimage import label, maximum_filter
+import scipy
 
 from limber.errors import Cancelled, NoPathError
 from limber.planning.bound.corners import CURVATURE_FACTOR, least_between, least_size
@@ -213,7 +213,7 @@ def _bound(problem: GentleProblem, grid: _Grid, cell: np.ndarray) -> _Bounds:
     if not open_cells[tuple(cell)]:
         raise _separated(problem, grid, open_cells)
     # Only what hangs together with the start, also by an edge or a corner of a cell.
-    together = label(open_cells, _NEAR)[0]
+    together = scipy.ndimage.label(open_cells, _NEAR)[0]
     open_cells = together == together[tuple(cell)]
     raw = energy - problem.field_error
     rate = problem.weights.length + problem.weights.energy * np.maximum(raw, 0.0)
@@ -275,7 +275,7 @@ def _about_goal(problem: GentleProblem, grid: _Grid, ground: Terrain) -> _AboutG
                     corner_values(ground.rate[corners]).mean(axis=0))
     cost = _way_left(distance / growth, problem.goal.tolerance / growth, rate, h)
     curved = CURVATURE_FACTOR / 8.0 * sum(
-        maximum_filter(second, 3) for second in second_differences(cost))
+        scipy.ndimage.maximum_filter(second, 3) for second in second_differences(cost))
     half = 0.5 * h * np.sqrt(3.0)
     touching = open_cells & (filled <= growth * half)
     inside = filled < -growth * half

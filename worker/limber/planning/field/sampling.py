@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from limber.errors import ConvergenceError, WorkError
 from limber.planning.field.between import ask_between
@@ -107,10 +108,8 @@ def sample_positions(reach: Reach, rest: np.ndarray, count: int, valley: Valley,
     Raises:
         WorkError: the grasp has hardly any room.
     """
-    from scipy.stats import qmc
-
     radius = deflection * reach.arc_length
-    sequence = qmc.Sobol(4, seed=seed)
+    sequence = scipy.stats.qmc.Sobol(4, seed=seed)
     found: list[np.ndarray] = []
     for _ in range(64):
         draw = sequence.random(512)

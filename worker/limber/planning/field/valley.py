@@ -11,7 +11,7 @@ some are drawn a little beyond: no path is best at the limit of what was sampled
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+import scipy
 
 from limber.mechanics import StaticResult
 from limber.planning.field.crew import Crew
@@ -107,7 +107,8 @@ def _sphere(places: np.ndarray, base: np.ndarray, rest: np.ndarray) -> Valley:
         return np.linalg.norm(places - unknown[:3], axis=1) - unknown[3]
 
     if len(places) >= 8:
-        found = least_squares(missed, np.r_[base + 0.2 * arm, 0.8 * chord], x_scale=chord)
+        start = np.r_[base + 0.2 * arm, 0.8 * chord]
+        found = scipy.optimize.least_squares(missed, start, x_scale=chord)
         pivot, radius = found.x[:3], float(found.x[3])
         close = np.sqrt(np.mean(found.fun**2)) < _WORST * radius
         if close and 0.2 * chord < radius < 3.0 * chord and (rest - pivot) @ arm > 0.0:

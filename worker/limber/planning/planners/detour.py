@@ -15,7 +15,7 @@ what the bound leaves open then is the jump's.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.integrate import trapezoid
+import scipy
 
 from limber.errors import NoPathError
 from limber.planning.cost import arc_lengths, resample
@@ -224,4 +224,5 @@ def _weighed(problem: GentleProblem, weight: float) -> GentleProblem:
 def _measured(path: np.ndarray, problem: GentleProblem) -> tuple[float, float]:
     fine = resample(path, _SPACING)
     along = arc_lengths(fine)
-    return float(along[-1]), float(trapezoid(problem.energy_field.energy(fine), along))
+    energies = problem.energy_field.energy(fine)
+    return float(along[-1]), float(scipy.integrate.trapezoid(energies, along))

@@ -9,7 +9,7 @@ together. Where that is within the field's error, it is there that the field mus
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import label
+import scipy
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
@@ -95,7 +95,7 @@ def _shares(field: EnergyField, limits: FieldArrays, points: np.ndarray) -> np.n
 def _least_level(shares: np.ndarray, begin: tuple, ends: np.ndarray) -> float | None:
     """Return the least level at which places no higher lead from ``begin`` to one of ``ends``."""
     def leads(level: float) -> bool:
-        together = label(shares <= level, _NEAR)[0]
+        together = scipy.ndimage.label(shares <= level, _NEAR)[0]
         return together[begin] > 0 and bool((together[ends] == together[begin]).any())
 
     low, high = 0.0, float(shares[np.isfinite(shares)].max())

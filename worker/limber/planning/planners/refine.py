@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from limber.planning.cost import resample
 from limber.planning.field.energy_field import LOADS
@@ -107,8 +107,9 @@ class _Line:
             to_corners[:-1] += 0.5 * own[1::2]
             return value + broken, (to_corners[1:] * self.units).ravel()
 
-        found = minimize(cost, (flat[1:] / self.units).ravel(), jac=True, method="L-BFGS-B",
-                         options={"maxiter": _ITERATIONS, "maxcor": 20})
+        found = scipy.optimize.minimize(
+            cost, (flat[1:] / self.units).ravel(), jac=True, method="L-BFGS-B",
+            options={"maxiter": _ITERATIONS, "maxcor": 20})
         flat = moved(found.x)
         return flat, smooth_cost(self.points(flat), self.problem.energy_field,
                                  self.problem.weights)[0]

@@ -5,7 +5,7 @@ and not of the luck of sampling.
 """
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from limber.planning.cost import EdgeWeights, arc_lengths, edge_cost, path_cost, resample
 from limber.planning.field.energy_field import EnergyField, FieldArrays
@@ -68,8 +68,8 @@ def polish(path: np.ndarray, energy_field: EnergyField, limits: FieldArrays,
         value, gradient = smooth_cost(moved, energy_field, weights)
         return value, gradient[1:-1].ravel()
 
-    best = minimize(cost, corners[1:-1].ravel(), jac=True, method="L-BFGS-B",
-                    options={"maxiter": 200}).x.reshape(inner)
+    best = scipy.optimize.minimize(cost, corners[1:-1].ravel(), jac=True, method="L-BFGS-B",
+                                   options={"maxiter": 200}).x.reshape(inner)
     before = path_cost(path, limits, weights)
     for share in np.linspace(1.0, 0.1, 10):
         moved = corners.copy()
