@@ -13,6 +13,7 @@ from limber.planning.cost import CostWeights, resample
 from limber.planning.field.energy_field import among_obstacles
 from limber.planning.field.trust import TrustRegion
 from limber.planning.goals import GraspGoal, TargetGoal
+from limber.planning.planners import refine as refine_module
 from limber.planning.planners.detour import plan_detour
 from limber.planning.planners.gentle import plan_gentle
 from limber.planning.planners.refine import Limited, refine
@@ -238,6 +239,18 @@ def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
     assert kept.max() <= limit
     assert held.cost >= free.cost * (1 - 1e-6)
     assert held.certificate.lower <= held.cost
+
+
+def test_a_path_far_over_a_limit_is_given_up_soon(ridge_field, monkeypatch):
+    """A goal that takes a thousand times the force: three rounds, none of them again with more
+    margin, and the path is what it was."""
+    rounds, settle = [], refine_module._Line.settle
+    monkeypatch.setattr(refine_module._Line, "settle", lambda *given: (
+        rounds.append(1), settle(*given))[1])
+    problem = problem_on(ridge_field, max_force=1e-3)
+    line = np.linspace(START, GOAL.position, 40)
+    path, cost = refine(line, problem)
+    assert cost == np.inf and path is line and len(rounds) <= 3
 
 
 def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):

@@ -163,7 +163,8 @@ def test_refusals_leave_the_folder_as_it_was(copied):
     with pytest.raises(NoPathError, match="misses it by"):
         plan_paths(copied, PlanSettings(goal=(2.0, 0.0, 0.0)), name="bad")
     with pytest.raises(NoPathError, match=r"force .* where 0.01 .*is allowed"):
-        plan_paths(copied, PlanSettings(max_force=0.01, replans=1, iterations=300), name="bad")
+        plan_paths(copied, PlanSettings(max_force=0.01, replans=0, iterations=300), name="bad",
+                   workers=1)
     with pytest.raises(NoPathError, match=r"in millimetres\?"):
         plan_paths(copied, PlanSettings(goal=(20.0, 0.0, 400.0)), name="bad")
     with pytest.raises(InputError, match=r"in millimetres\?"):

@@ -31,6 +31,7 @@ _ROUNDS = 12
 _ITERATIONS = 80  # a round
 _WEIGHTS = (1e3, 1.0)  # of squared excesses at first: of place and length, and of loads
 _HOPELESS = 1e5  # times heavier: limits that are not kept then will not be
+_FAR = 10.0  # times a limit over it: weighs more than any cost, so heavier weights change nothing
 _HEAVIER = 5.0  # from a round to the next where limits are not kept much better than before
 _BETTER = 0.25
 _SETTLED = 3e-4  # change of the cost in a round, relative
@@ -46,21 +47,24 @@ def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]
     """
     best, least, moved = path, problem.cost(path), path
     for margin in _MARGINS:
-        moved = _moved(moved, problem, margin)
+        moved, over = _moved(moved, problem, margin)
         cost = problem.cost(moved)
         if cost < least:
             best, least = moved, cost
-        if np.isfinite(cost):
+        # A margin makes up for what is over between two points, not for a path that is far over.
+        if np.isfinite(cost) or over > _FAR:
             break
     return best, least
 
 
-def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> np.ndarray:
+def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> tuple[np.ndarray, float]:
+    """Return the path [n, 3] moved to keep ``margin`` [m] from the limits, and the most that it is
+    over any of them in the end, relative."""
     line = _Line(problem)
     limits = Limited(problem, margin)
     flat = line.chart.map(path)
     flat[0] = line.chart.map(problem.start)[0]
-    before, worst = np.inf, np.inf
+    before, worst, over = np.inf, np.inf, np.inf
     for _ in range(_ROUNDS):
         flat = resample(flat, max(np.linalg.norm(np.diff(flat, axis=0), axis=1).sum(), 1e-6)
                         / _EDGES)
@@ -70,10 +74,10 @@ def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> np.ndarra
             break
         if over > max(_BETTER * worst, limits.reserve):
             limits.heavier *= _HEAVIER
-        if limits.heavier > _HOPELESS:
+        if limits.heavier > (_HEAVIER if over > _FAR else _HOPELESS):
             break
         before, worst = cost, over
-    return line.chart.curved(resample(flat, _FINE))
+    return line.chart.curved(resample(flat, _FINE)), over
 
 
 class _Line:
