@@ -56,7 +56,7 @@ def test_a_plan_in_a_cell_says_how_the_arm_takes_it(copied):
 @pytest.mark.usefixtures("coarse_bound")
 def test_a_cell_that_allows_too_little_force_is_named(copied):
     """The cell's force limit, not a vague word: the goal alone needs more."""
-    weak = cell_file(copied, limits={"soft_force_n": 1.0, "hard_force_n": 20.0})
+    weak = cell_file(copied, limits={"soft_force_n": 0.1, "hard_force_n": 20.0})
     with pytest.raises(NoPathError, match="force"):
         plan_paths(copied, SETTINGS.model_copy(update={"replans": 0}), name="weak",
                    cell_file=weak, workers=1)
