@@ -1,5 +1,11 @@
-"""The main job as a user does it: every stage by its command, on one small generated branch."""
+"""The main job as a user does it: every stage by its command, on one small generated branch.
 
+The commands run in this process, which loads the kernels once; as processes they run where that is
+what is tested, here and in tests/planning/test_killed.py, tests/batch and tests/jobs.
+"""
+
+import contextlib
+import io
 import json
 import os
 import shutil
@@ -12,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limber.jobs.process import run_stage
+from limber.cli import call
 from limber.store import Branch
 
 # The fixture runs the whole pipeline within the first test, so the usual limit is too short.
@@ -32,6 +38,15 @@ KEYS = {
 PATH_KEYS = {"length_m", "energy_integral_jm", "energy_sum_nmm", "peak_energy_j", "peak_force_n"}
 
 
+def result_of(*arguments: object) -> dict:
+    """Run a command line; returns its JSON result."""
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told):
+        code = call([*map(str, arguments), "--json"])
+    assert code == 0, told.getvalue()
+    return json.loads(told.getvalue().splitlines()[-1])
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory) -> tuple[Path, dict[str, dict]]:
     """A branch folder after every stage, and each stage's JSON result."""
@@ -40,15 +55,16 @@ def done(tmp_path_factory) -> tuple[Path, dict[str, dict]]:
     results = {}
 
     def stage(name: str, *arguments: object) -> None:
-        results[name] = run_stage([name, *map(str, arguments)])
+        results[name] = result_of(name, *arguments)
     stage("generate", folder / "scan", "--seed", 3, "--length", 0.5, "--fork-count", 1)
-    stage("reconstruct", folder / "scan" / "cloud.ply", "-o", branch)
+    stage("reconstruct", folder / "scan" / "cloud.ply", "-o", branch, "--mesh-spacing", 4)
     stage("virtual-pull", branch, "--name", "pull-1", "--seed", 3)
     stage("estimate", branch)
     stage("simulate", branch)
-    stage("energy", branch, "--samples", 40, "--seed", 3)
-    stage("plan", branch, "--name", "to-goal", "--seed", 3)
-    stage("scene", branch, "-o", folder / "scene.blend", "--render", folder / "scene.png")
+    stage("energy", branch, "--samples", 40, "--seed", 3, "--workers", 1)
+    stage("plan", branch, "--name", "to-goal", "--seed", 3, "--iterations", 500, "--workers", 1)
+    stage("scene", branch, "-o", folder / "scene.blend", "--render", folder / "scene.png",
+          "--width", 560)
     stage("report", branch, "--picture", folder / "scene.png")
     return branch, results
 
@@ -115,8 +131,8 @@ def test_second_run_computes_nothing(done):
     """A stage whose input and settings have not changed is skipped and gives the same result."""
     branch, results = done
     before = (branch / "mesh.vtu").read_bytes()
-    again = run_stage(["reconstruct", str(branch.parent / "scan" / "cloud.ply"), "-o",
-                       str(branch)])
+    again = result_of("reconstruct", branch.parent / "scan" / "cloud.ply", "-o", branch,
+                      "--mesh-spacing", 4)
     assert again["tet_count"] == results["reconstruct"]["tet_count"]
     assert again["seconds"] < 0.5 * results["reconstruct"]["seconds"]
     assert (branch / "mesh.vtu").read_bytes() == before
@@ -130,7 +146,7 @@ def test_folder_can_be_moved(done, tmp_path):
     moved = tmp_path / "elsewhere" / "small.branch"
     shutil.copytree(branch, moved)
     Branch.open(moved, verify=True)
-    assert run_stage(["report", str(moved)])["missing"] == []
+    assert result_of("report", moved)["missing"] == []
 
 
 @pytest.mark.slow
@@ -149,7 +165,7 @@ def test_bad_cloud_costs_no_result(done, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 @pytest.mark.parametrize(("stage", "options"), [
-    ("estimate", ["--force"]), ("energy", ["--force", "--samples", "60"]),
+    ("estimate", ["--force"]), ("energy", ["--force", "--samples", "200", "--workers", "1"]),
 ])
 def test_ctrl_c_in_a_stage_keeps_the_folder(done, tmp_path, stage: str, options: list[str]):
     """Ctrl-C in the middle of a stage ends with 130; the folder verifies, its files unchanged."""
