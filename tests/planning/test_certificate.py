@@ -278,6 +278,7 @@ def test_gradients_of_cost_and_penalty_are_those_of_differences(ridge_field):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
 def test_costs_of_two_seeds_compare(ridge_field):
     """Scales and the plan's cost do not depend on the seed; D-RRT* is never below the bound."""
     found = [plan_pair(ridge_field, START, GOAL, PlanSettings(
