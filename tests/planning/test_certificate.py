@@ -228,6 +228,7 @@ def _wall():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
 def test_refined_path_keeps_limits_and_runs_along_them(ridge_field):
     """With a limit on force that binds, the refined path keeps it and gets close to it."""
     free = plan_gentle(problem_on(ridge_field))
@@ -295,6 +296,7 @@ def test_costs_of_two_seeds_compare(ridge_field):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("coarse_bound")
 def test_detour_limit_holds_and_its_bound_is_below(ridge_field):
     """Within 3 % of the shortest length: kept, dearer than without, and no bulge that is as short
     has less energy than the dual's bound says."""

@@ -125,12 +125,15 @@ def test_the_number_of_processes_is_no_setting_of_a_result():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
-def test_cancel_ends_sampling(small_model, some, workers):
+def test_cancel_ends_sampling(small_model, workers):
     """A cancel is obeyed between poses, in this process and across processes."""
+    # So many that quick processes are not done before the cancel reaches them.
+    targets = sample_positions(small_model.reach, small_model.rest_position, 200, Valley(
+        small_model.reach.base, small_model.reach.chord), deflection=0.3)
     progress = Progress(lambda fraction, _message, _numbers:
                         progress.cancel() if fraction > 0 else None)
     with pytest.raises(Cancelled):
-        sample_branch(small_model, some[0], workers=workers, progress=progress)
+        sample_branch(small_model, targets, workers=workers, progress=progress)
 
 
 def test_grasp_moves_on_a_sphere_by_itself(small_model):
