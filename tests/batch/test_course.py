@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from limber import cli
@@ -105,11 +106,13 @@ def test_a_killed_batch_goes_on(orchard, monkeypatch):
     end = time.monotonic() + 60
     while not (log.is_file() and '"done"' in log.read_text()) and time.monotonic() < end:
         time.sleep(0.01)
+    started = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not any("running" in row for row in states(jobs)), "what ran when it was killed waits"
+    _gone, alive = psutil.wait_procs(started, timeout=10)
+    assert not [p for p in alive if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
     checked = read_jobs(jobs)
-    time.sleep(1.0)
     run_jobs(checked, Records(checked), workers=1)
     found = states(jobs)
     assert {status for row in found for status in row} <= {"done", "up to date"}
