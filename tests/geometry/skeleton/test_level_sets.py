@@ -10,9 +10,27 @@ from limber.geometry.generated import generate_branch
 from limber.geometry.skeleton.contraction.laplacian_contraction import contract
 from limber.geometry.skeleton.contraction.level_sets import is_sparse, level_graph
 from limber.geometry.skeleton.radii import axis_fit
-from limber.geometry.skeleton.skeletonise import skeletonise
+from limber.geometry.skeleton.skeleton import Skeleton
+from limber.geometry.skeleton.skeletonise import SkeletonResult, skeletonise
 
 _UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def leaves() -> tuple[np.ndarray, np.ndarray]:
+    """Points of two leaves on a stem, and places along their midribs; few, but leafy as any."""
+    return curved_leaves(2800)
+
+
+@pytest.fixture(scope="module")
+def of_leaves(leaves) -> SkeletonResult:
+    return skeletonise(leaves[0], root=np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def crown() -> tuple[Skeleton, np.ndarray]:
+    """True axes of a sparse crown, and its points."""
+    return generated_crown(31, 2.0, 0.025, 0.015, 0.003)
 
 
 def test_levels_keep_near_twigs_apart() -> None:
@@ -38,29 +56,27 @@ def test_pieces_are_bridged_to_one_tree() -> None:
 
 
 @pytest.mark.slow
-def test_sparse_scans_are_told_from_others() -> None:
+def test_sparse_scans_are_told_from_others(crown) -> None:
     """A well scanned branch is contracted as ever; a crown whose twigs are lines is not."""
-    branch = generate_branch(31).cloud.points
-    _, crown = generated_crown(31, 4.0, 0.05, 0.02, 0.003)
+    branch = generate_branch(31, length=0.4, point_spacing=0.003).cloud.points
     assert not is_sparse(branch, contract(branch).drawn)
-    assert is_sparse(crown, contract(crown).drawn)
+    assert is_sparse(crown[1], contract(crown[1]).drawn)
 
 
 @pytest.mark.slow
-def test_crown_of_thin_twigs_is_found() -> None:
+def test_crown_of_thin_twigs_is_found(crown) -> None:
     """Most of a sparse crown's axes are found, and most of what is found is true."""
-    truth, points = generated_crown(31, 4.0, 0.05, 0.02, 0.003)
+    truth, points = crown
     found = skeletonise(points, root=truth.nodes[0]).skeleton
-    score = axis_scores(truth, found, 0.02)
+    score = axis_scores(truth, found, 0.015)
     assert score["recall"] > 0.75 and score["precision"] > 0.8
     assert explained(points, found) > 0.95
 
 
 @pytest.mark.slow
-def test_axes_follow_curved_leaves() -> None:
+def test_axes_follow_curved_leaves(leaves, of_leaves) -> None:
     """A leaf's axis runs along its midrib to its end, and the stem's stays in the stem."""
-    points, ribs = curved_leaves()
-    found = skeletonise(points, root=np.zeros(3)).skeleton
+    ribs, found = leaves[1], of_leaves.skeleton
     distance = cKDTree(np.vstack([found.nodes, _middles(found)])).query(ribs)[0]
     assert distance.mean() < 0.0015 and distance.max() < 0.005
     low = found.nodes[(found.nodes[:, 2] > 0.005) & (found.nodes[:, 2] < 0.05)]
@@ -69,36 +85,30 @@ def test_axes_follow_curved_leaves() -> None:
 
 
 @pytest.mark.slow
-def test_last_digits_of_a_solve_do_not_choose_the_skeleton(monkeypatch) -> None:
+def test_last_digits_of_a_solve_do_not_choose_the_skeleton(monkeypatch, leaves, of_leaves) -> None:
     """Errors as large as libraries' rounding, in each round of the fit: the same to the last bit.
 
     Where leaves lead the fit astray they had grown to other cylinders, and to other branches.
     """
-    points, _ = curved_leaves()
-    solve = axis_fit._System.solve
+    solve, rng = axis_fit._System.solve, np.random.default_rng(0)
 
-    def rounded(seed: int):
-        rng = np.random.default_rng(seed)
+    def rounded(system):
+        step = solve(system)
+        return step + 1e-15 * np.abs(step).max() * rng.standard_normal(step.shape)
 
-        def other(system):
-            step = solve(system)
-            return step + 1e-15 * np.abs(step).max() * rng.standard_normal(step.shape)
-        return other
-    found = []
-    for seed in range(2):
-        monkeypatch.setattr(axis_fit._System, "solve", rounded(seed))
-        found.append(skeletonise(points, root=np.zeros(3)))
-    assert found[0].residual.tobytes() == found[1].residual.tobytes()
-    assert found[0].skeleton.nodes.tobytes() == found[1].skeleton.nodes.tobytes()
+    monkeypatch.setattr(axis_fit._System, "solve", rounded)
+    found = skeletonise(leaves[0], root=np.zeros(3))
+    assert found.noise == of_leaves.noise
+    assert found.residual.tobytes() == of_leaves.residual.tobytes()
+    assert found.skeleton.nodes.tobytes() == of_leaves.skeleton.nodes.tobytes()
 
 
 @pytest.mark.slow
-def test_a_shuffled_leafy_scan_has_the_same_skeleton() -> None:
+def test_a_shuffled_leafy_scan_has_the_same_skeleton(leaves, of_leaves) -> None:
     """Points in another order: the same axes to the last bit."""
-    points, _ = curved_leaves(7000)
+    points, first = leaves[0], of_leaves.skeleton
     order = np.random.default_rng(5).permutation(len(points))
-    first, again = (skeletonise(some, root=np.zeros(3)).skeleton for some in (
-        points, points[order]))
+    again = skeletonise(points[order], root=np.zeros(3)).skeleton
     assert np.array_equal(first.parent, again.parent)
     assert np.abs(first.nodes - again.nodes).max() < 1e-9
 
