@@ -25,54 +25,37 @@ from limber.mechanics import BranchModel, solve_static
 mesh = straight_beam(0.2, 0.01, slice_count=3)
 solve_static(BranchModel(mesh, young=1e8, poisson=0.3, density=900.0)).require()
 """
+_POOLS = """
+from threadpoolctl import threadpool_info
+pools = [pool for pool in threadpool_info() if pool["user_api"] in ("blas", "openmp")]
+assert len(pools) >= 2 and {pool["num_threads"] for pool in pools} == {1}, pools
+"""
+
+
+def _told(program: str, threads: int, *arguments: str) -> str:
+    """What a program prints where the user's environment asks for so many threads."""
+    environment = os.environ | {"OMP_NUM_THREADS": str(threads),
+                                "OPENBLAS_NUM_THREADS": str(threads)}
+    done = subprocess.run([sys.executable, "-c", program, *arguments], check=False,
+                          capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.slow
 def test_a_leafy_scan_has_one_skeleton_whatever_threads_the_user_has(tmp_path: Path) -> None:
-    """With 1, 2 and 4 threads, also of libraries loaded first, and after a solve: to the last bit.
+    """With one thread, and with four in libraries loaded first and after a solve: to the last bit.
 
-    Leaves lead a fit astray: one more thread had made another skeleton, or a refusal.
+    Leaves lead a fit astray: one more thread had made another skeleton, or a refusal. After a
+    static solve all libraries of the process, cvxopt's too, use one thread.
     """
     scan = tmp_path / "scan.npy"
-    np.save(scan, curved_leaves()[0])
-    skeletons = {}
-    for name, threads, before in (("one", 1, ""), ("two, loaded", 2, _LIBRARIES),
-                                  ("four, solved", 4, _LIBRARIES + _SOLVED)):
-        environment = os.environ | {"OMP_NUM_THREADS": str(threads),
-                                    "OPENBLAS_NUM_THREADS": str(threads)}
-        done = subprocess.run([sys.executable, "-c", before + _SKELETON, str(scan)], check=False,
-                              capture_output=True, text=True, env=environment)
-        assert done.returncode == 0, done.stderr
-        skeletons[name] = done.stdout
-    assert len(set(skeletons.values())) == 1, skeletons
+    np.save(scan, curved_leaves(2800)[0])
+    solved = _LIBRARIES + _SOLVED + _POOLS + _SKELETON
+    assert _told(solved, 4, str(scan)) == _told(_SKELETON, 1, str(scan))
 
 
-@pytest.mark.parametrize("before", ["", "import numpy, scipy.linalg\n"])
+@pytest.mark.parametrize("before", ["", "import numpy, scipy.linalg\n", _LIBRARIES])
 def test_limber_leaves_no_library_with_two_threads(before: str) -> None:
     """Whatever the environment says, and whichever was loaded before it or is after."""
-    program = before + (
-        "import limber, numpy, scipy.linalg, cvxopt.cholmod\n"
-        "from threadpoolctl import threadpool_info\n"
-        "pools = [p for p in threadpool_info() if p['user_api'] in ('blas', 'openmp')]\n"
-        "assert len(pools) >= 2 and {p['num_threads'] for p in pools} == {1}, pools\n")
-    environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True,
-                          text=True, env=environment)
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_a_factorisation_leaves_every_library_with_one_thread():
-    """After a static solve all BLAS libraries of the process, cvxopt's too, use one thread."""
-    program = (
-        "from limber.geometry.tets.cylinder_mesh import straight_beam\n"
-        "from limber.mechanics import BranchModel, solve_static\n"
-        "mesh = straight_beam(0.2, 0.01, slice_count=3)\n"
-        "solve_static(BranchModel(mesh, young=1e8, poisson=0.3, density=900.0)).require()\n"
-        "from threadpoolctl import threadpool_info\n"
-        "pools = [p for p in threadpool_info() if p['user_api'] == 'blas']\n"
-        "assert len(pools) >= 2, pools\n"
-        "assert {p['num_threads'] for p in pools} == {1}, pools\n")
-    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True,
-                          text=True)
-    assert done.returncode == 0, done.stderr
+    _told(before + "import limber, numpy, scipy.linalg, cvxopt.cholmod\n" + _POOLS, 2)
