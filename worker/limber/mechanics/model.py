@@ -271,7 +271,8 @@ class BranchModel:
         if not self.point_masses:
             return self
         other = copy.copy(self)
-        other.point_masses, other._mass = (), {}
+        # Made once, too: each step of a motion asks for it where the density is sought.
+        other.point_masses, other._mass = (), self._mass.setdefault("bare", {})
         if other.hanging is not None:
             other.hanging = replace(other.hanging, added=None, mass_count=0)
         return other
