@@ -19,7 +19,7 @@ from limber.estimation.settings import EstimateSettings
 from limber.progress import Progress
 from limber.recordings.recording import Observations
 
-SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=8)
+SETTINGS = EstimateSettings(poisson=0.36, hold_out=False, key_frames=5)
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 

@@ -48,7 +48,7 @@ def reduced_around(full, young, spread):
     model = full.model(young)
     training = TrainingSettings(grasp_count=20, young_spread=spread)
     return build_reduced(model, here.grasp, full.weights, young,
-                         ReducedSettings(size=48, training=training))[0]
+                         ReducedSettings(size=40, training=training))[0]
 
 
 def followed(reduced, full, pull, exact, repeat=1):

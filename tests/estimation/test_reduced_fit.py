@@ -20,6 +20,13 @@ REDUCED = SETTINGS.model_copy(update={"forward": "reduced"})
 TRUTH = np.array([40e6, 22e6, 12e6, 3e6])
 
 
+@pytest.fixture(autouse=True)
+def few_states(monkeypatch):
+    """What a basis costs grows with the fourth power of its size; corrections make up for it."""
+    for name, few in (("SIZE", 24), ("STATES_PER_PULL", 12), ("STATES_AROUND", 12)):
+        monkeypatch.setattr(reduced_fit, name, few)
+
+
 @pytest.fixture(scope="module")
 def thick(small):
     """A coarse mesh: what is shown here does not depend on how fine it is."""
@@ -77,8 +84,10 @@ def test_a_basis_around_wrong_moduli_is_made_again(thick, small_pull):
 
 
 @pytest.mark.slow
-def test_poisson_and_density_by_differences(thick, noisy):
+def test_poisson_and_density_by_differences(thick, noisy, monkeypatch):
     """Derivatives to what the reduced model has none of, against the full model's."""
+    for name, many in (("SIZE", 56), ("STATES_PER_PULL", 24), ("STATES_AROUND", 24)):
+        monkeypatch.setattr(reduced_fit, name, many)
     entry = noisy.entry.model_copy(update={"gravity_m_s2": (0.0, 0.0, -9.81)})
     objective = thick.objective([replace(noisy, entry=entry)], SETTINGS)
     reduction = Reduction(objective.forwards)
@@ -131,7 +140,7 @@ def test_a_pull_of_three_frames_is_enough_for_a_basis(thick, small_pull):
         seen, times=seen.times[::7], positions=seen.positions[::7]))
     reduction = Reduction(thick.objective([few], SETTINGS).forwards)
     reduction.build(replace(thick.objective([few], SETTINGS).space.base, young=TRUTH))
-    assert reduction.bases[0].size == 72
+    assert reduction.bases[0].size == 40
 
 
 def test_pulls_it_cannot_hold_are_refused(thick, noisy):

@@ -8,6 +8,7 @@ import pytest
 
 from limber.cli import call
 from limber.errors import Cancelled, InputError
+from limber.estimation import reduced_fit
 from limber.estimation.settings import EstimateSettings
 from limber.estimation.virtual_pull import VirtualPullSettings
 from limber.geometry.tets.tet_mesh import TetMesh
@@ -98,10 +99,13 @@ def test_a_stopped_estimate_keeps_the_best_and_goes_on(branch_folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("forward", ["full", "reduced"])
-def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, forward: str):
+def test_what_a_killed_estimate_left_changes_no_digit(branch_folder, tmp_path, monkeypatch,
+                                                      forward: str):
     """Killed at its third evaluation, or at its end before anything was entered: the next run
     ends as one in a folder where nothing had happened.
     """
+    for name, few in (("SIZE", 10), ("STATES_PER_PULL", 6), ("STATES_AROUND", 6)):
+        monkeypatch.setattr(reduced_fit, name, few)
     settings = EstimateSettings(forward=forward, key_frames=4, shapes=0)
     clean, early, late = (tmp_path / name for name in ("clean", "early", "late"))
     for folder in (clean, early, late):

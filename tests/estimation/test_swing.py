@@ -64,7 +64,7 @@ def test_a_virtual_swing_gives_modulus_damping_and_release(start):
     model = BranchModel(mesh, young=2 * YOUNG, poisson=0.4, density=DENSITY,
                         gravity=GRAVITY if start == "held" else None)
     seen = virtual_swing(start)
-    found = fit_swing(model, end, seen, periods=2.5, density_sigma=0.02)
+    found = fit_swing(model, end, seen, periods=2.0, density_sigma=0.02)
     young = 2 * YOUNG * found.factor
     low, high = 2 * YOUNG * found.factor_interval
     assert found.converged
