@@ -35,7 +35,7 @@ KEYS = ("point_count", "node_count", "branch_count", "length_m", "radius_min_m",
 def generated(tmp_path_factory):
     """A generated branch on disk, reconstructed."""
     folder = tmp_path_factory.mktemp("generated")
-    branch = generate_branch(5, fork_count=2, length=0.6, point_spacing=0.0025)
+    branch = generate_branch(5, fork_count=2, length=0.5, point_spacing=0.004)
     write_generated(branch, folder)
     result = reconstruct(folder / "cloud.ply", folder / "g.branch")
     return folder, branch, result
@@ -110,15 +110,21 @@ def test_own_skeleton_skips_ours(generated, tmp_path):
 
 @pytest.mark.slow
 def test_left_out_twigs_become_masses(generated, tmp_path):
-    """Twigs over the order leave the mesh, and their mass is written."""
+    """Twigs over the order leave the mesh, and their mass is written; a later run that keeps all
+    twigs takes their masses away.
+    """
     folder, _, full = generated
-    result = reconstruct(folder / "cloud.ply", tmp_path / "t.branch",
-                         ReconstructSettings(twig_order=0))
-    masses = json.loads((tmp_path / "t.branch" / "point_masses.json").read_text())
+    place = tmp_path / "t.branch"
+    result = reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_order=0))
+    masses = json.loads((place / "point_masses.json").read_text())
     assert len(masses) == result["left_out_twigs"] == 2
     whole = 900 * full["mesh_volume_m3"]
     rest = 900 * result["mesh_volume_m3"] + result["left_out_mass_kg"]
     assert rest == pytest.approx(whole, rel=0.04)
+    assert Branch.open(place).has("point_masses.json")
+    reconstruct(folder / "cloud.ply", place)
+    assert not Branch.open(place).has("point_masses.json")
+    assert not load_model(Branch.open(place)).point_masses
 
 
 @pytest.mark.slow
@@ -139,18 +145,6 @@ def test_left_out_twigs_weigh_in_a_simulation(generated, tmp_path):
         stage.path("point_masses.json").write_text("[]")
     bare = np.array(simulate(place, settings, force=True)["grasp_force_n"])
     assert 0.02 < np.linalg.norm(held - bare) / (9.80665 * result["left_out_mass_kg"]) < 2.0
-
-
-@pytest.mark.slow
-def test_twigs_that_are_meshed_again_weigh_once(generated, tmp_path):
-    """A later run that keeps all twigs takes their masses away."""
-    folder, _, _ = generated
-    place = tmp_path / "again.branch"
-    reconstruct(folder / "cloud.ply", place, ReconstructSettings(twig_order=0))
-    assert Branch.open(place).has("point_masses.json")
-    reconstruct(folder / "cloud.ply", place)
-    assert not Branch.open(place).has("point_masses.json")
-    assert not load_model(Branch.open(place)).point_masses
 
 
 def test_failed_run_leaves_the_folder_as_it_was(generated, tmp_path):

@@ -13,7 +13,7 @@ from limber.geometry.skeleton.skeleton import Skeleton
 from limber.geometry.skeleton.skeletonise import skeletonise
 
 
-def _points(radius: float, noise: float, half: bool, count: int = 6000, seed: int = 0):
+def _points(radius: float, noise: float, half: bool, count: int = 3000, seed: int = 0):
     rng = np.random.default_rng(seed)
     # One side is seen up to where generated scans see it: within 6 degrees of grazing.
     reach = np.arccos(0.1) if half else np.pi
@@ -72,7 +72,7 @@ def test_points_lie_at_their_aims_on_average(radius: float) -> None:
 @pytest.mark.parametrize("half", [False, True])
 def test_noise_of_half_the_radius_is_told_whole(half: bool) -> None:
     """Points over a radius off are left out; without those it came out 10 % too small."""
-    fit = fit_axes(_axis(0.006), _points(0.006, 0.003, half), rounds=30)
+    fit = fit_axes(_axis(0.006), _points(0.006, 0.003, half, 6000), rounds=30)
     assert fit.noise == pytest.approx(0.003, rel=0.05)
 
 
@@ -138,7 +138,7 @@ def _twig_beside_a_stem(radius: float, noise: float, half: bool, per_radius: flo
 
 @pytest.mark.slow
 @pytest.mark.parametrize("half", [False, True])
-@pytest.mark.parametrize("noise", [0.001, 0.002, 0.003])
+@pytest.mark.parametrize("noise", [0.001, 0.003])
 @pytest.mark.parametrize("per_radius", [3, 8])
 def test_a_twig_of_few_points_is_as_thick_as_it_is(half, noise, per_radius) -> None:
     """A radius of 3 mm, noise up to as much: half as thick again with 3 points a radius, and a
@@ -178,14 +178,14 @@ def test_an_axis_that_starts_far_too_thin_does_not_follow_single_points() -> Non
 def test_sides_are_told_apart() -> None:
     """Half a circle is one side, a full one is all around, scatter along the sight is a camera's.
     """
-    axis = np.tile([0.0, 0.0, 1.0], (6000, 1))
+    axis = np.tile([0.0, 0.0, 1.0], (3000, 1))
 
     def seen(points):
         distance = np.linalg.norm(points[:, :2], axis=1)
         out = np.column_stack([points[:, :2] / distance[:, None], np.zeros(len(points))])
         sharpness = 0.006 * distance / 0.001**2
         return out, sharpness, seen_sides(
-            out, axis, distance - 0.006, sharpness, np.full(6000, 36.0), np.ones(6000))
+            out, axis, distance - 0.006, sharpness, np.full(3000, 36.0), np.ones(3000))
 
     assert seen(_points(0.006, 0.001, False))[2].share.min() == 1.0
     out, sharpness, half = seen(_points(0.006, 0.001, True))
@@ -194,7 +194,7 @@ def test_sides_are_told_apart() -> None:
     camera[:, 0] += np.random.default_rng(1).normal(0, 0.001, len(camera))
     assert seen(camera)[2].along_sight
     # The mean place is shorter the less is known, and never longer than the circle's radius.
-    size = np.linalg.norm(mean_places(out, axis, sharpness, np.full(6000, 36.0), half), axis=1)
+    size = np.linalg.norm(mean_places(out, axis, sharpness, np.full(3000, 36.0), half), axis=1)
     assert size.max() <= 1 + 1e-9 and size.min() > 0.3
 
 
