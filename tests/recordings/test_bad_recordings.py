@@ -151,7 +151,7 @@ def pull_with(bare_folder, name, change):
 def estimated(branch_folder, capsys, *options, code=0):
     capsys.readouterr()
     assert call(["estimate", str(branch_folder), "--key-frames", "4", "--no-mesh-check",
-                 "--fractions", "0.3,0.7", "--field", "inverse_distance", "--json",
+                 "--fractions", "0.6", "--field", "inverse_distance", "--json",
                  "--progress", "none", *options]) == code
     return json.loads(capsys.readouterr().out.strip().splitlines()[-1])
 
