@@ -118,9 +118,11 @@ def test_work_of_the_gripper_is_the_energy(beam, slender_beam):
 
 
 @pytest.mark.slow
-def test_force_and_pose_are_dual(beam, slender_beam):
+def test_force_and_pose_are_dual(column):
     """The reaction at a pinned pose, applied as a force, gives the same shape."""
-    grasp = Grasp.at(slender_beam, [0, 0, 0.45], 0.012, "pinned")
+    mesh, _ = column
+    beam = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.at(mesh, [0, 0, 0.45], 0.012, "pinned")
     pose = grasp.rest_pose + np.array([0.15, 0.05, -0.033, 0, 0, 0])
     held = solve_static(beam, grasp=grasp, pose=pose).require()
     pulled = solve_static(beam, grasp=grasp, grasp_force=held.reaction_force).require()
@@ -149,10 +151,12 @@ def test_result_does_not_depend_on_the_path():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["pinned", "clamped"])
-def test_a_guess_of_the_end_saves_the_way(beam, slender_beam, mode):
+def test_a_guess_of_the_end_saves_the_way(column, mode):
     """Near the end, or far off it: the state is the one that the way leads to, its pose the asked
     one to the last digit; from the end itself there is nothing to do."""
-    grasp = Grasp.at(slender_beam, [0, 0, 0.45], 0.012, mode)
+    mesh, _ = column
+    beam = BranchModel(mesh, young=YOUNG, poisson=0.35, density=900, gravity=None)
+    grasp = Grasp.at(mesh, [0, 0, 0.45], 0.012, mode)
     pose = grasp.rest_pose + np.array([0.12, 0.05, -0.03, 0, 0, 0])
     near = pose + np.array([0.01, 0.0, 0.0, 0, 0, 0])
     start = solve_static(beam, grasp=grasp, pose=near).require()
