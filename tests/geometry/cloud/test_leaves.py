@@ -26,11 +26,11 @@ LONG, WIDE = 0.07, 0.02
 
 
 def _leaf(foot: np.ndarray, way: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A drooping blade, bent along and across, of noisy points 1 mm apart."""
+    """A drooping blade, bent along and across, of noisy points 1.4 mm apart."""
     way = way / np.linalg.norm(way)
     across = np.cross(way, [0.0, 0.3, 1.0])
     across /= np.linalg.norm(across)
-    u, v = rng.uniform(0, 1, 4400), rng.uniform(-1, 1, 4400)
+    u, v = rng.uniform(0, 1, 2200), rng.uniform(-1, 1, 2200)
     inside = np.abs(v) < np.sin(np.pi * u)
     u, v = u[inside, None], v[inside, None]
     blade = (foot + LONG * u * way + WIDE * v * across
@@ -43,7 +43,7 @@ def seedling():
     """Stems of 2 to 4 mm radius with a leaf at each tip; which points are leaf; area of leaves."""
     rng = np.random.default_rng(11)
     branch = generate_branch(31, length=0.3, radius_root=0.004, radius_tip=0.002, bend=0.4,
-                             fork_count=2, noise=3e-4, point_spacing=0.0012, occlusion=0.05)
+                             fork_count=2, noise=3e-4, point_spacing=0.0017, occlusion=0.05)
     stems = branch.skeleton
     leaves = [_leaf(stems.nodes[tip], stems.nodes[tip] - stems.nodes[stems.parent[tip]], rng)
               for tip in stems.tips()]
