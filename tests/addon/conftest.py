@@ -1,7 +1,10 @@
 """What tests of the add-on share: branch folders with known motion, bpy, the add-on, a Blender."""
 
+import contextlib
 import csv
+import importlib
 import importlib.util
+import io
 import json
 import os
 import shutil
@@ -15,6 +18,7 @@ import numpy as np
 import pytest
 
 import limber
+from limber.cli import call
 from limber.geometry.tets.cylinder_mesh import straight_beam
 from limber.geometry.tets.tet_mesh import TetMesh
 from limber.store import Branch
@@ -110,11 +114,10 @@ def bare_beam(tmp_path: Path) -> BeamBranch:
 
 @pytest.fixture()
 def bpy():
-    """The bpy module with an empty file, before the test and after it."""
+    """The bpy module with an empty file."""
     module = pytest.importorskip("bpy", reason="NO BPY: pip install 'limber[blender]'")
     module.ops.wm.read_factory_settings(use_empty=True)
-    yield module
-    module.ops.wm.read_factory_settings(use_empty=True)
+    return module
 
 
 @pytest.fixture()
@@ -154,6 +157,42 @@ def registered(addon, monkeypatch, worker_python):
     addon.register()
     yield addon
     addon.unregister()
+
+
+class _Ended:
+    """A process that has ended, as a job sees one."""
+
+    def __init__(self, code: int):
+        self.returncode = code
+        self.stdin = io.StringIO()
+
+    def poll(self) -> int:
+        return self.returncode
+
+
+@pytest.fixture()
+def worker_here(registered, monkeypatch):
+    """The worker's commands run in this process, which has loaded what they need.
+
+    For tests of what is asked of the worker and what is done with its answer. Those of operators
+    and jobs start it as the process that it is.
+    """
+    jobs = importlib.import_module("limber_addon.jobs")
+    launch = jobs.Job.launch
+
+    def launch_here(job) -> None:
+        if job.command[1:3] != ["-m", "limber"]:
+            return launch(job)
+        said, log = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(log):
+            code = call(job.command[3:])
+        for name, stream in (("out", said), ("err", log)):
+            for line in stream.getvalue().splitlines():
+                job._lines.put((name, line))
+        job._process, job._readers = _Ended(code), []
+        job.state = jobs.JobState.RUNNING
+        return None
+    monkeypatch.setattr(jobs.Job, "launch", launch_here)
 
 
 @pytest.fixture(scope="session")

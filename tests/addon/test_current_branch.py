@@ -11,6 +11,8 @@ from tests.addon.test_panels import Layout
 
 from limber.cli import call
 
+pytestmark = pytest.mark.usefixtures("worker_here")
+
 BLEND_FILES = Path(__file__).parents[2] / "blend_files"
 
 

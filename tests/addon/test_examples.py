@@ -13,7 +13,7 @@ from limber.geometry.generated import generate_branch
 
 
 @pytest.fixture()
-def run(bpy, registered, monkeypatch):
+def run(bpy, worker_here, monkeypatch):
     def run(name, *arguments):
         monkeypatch.setattr(sys, "argv", ["blender", "--", *map(str, arguments)])
         runpy.run_path(str(ADDON / "examples" / f"{name}.py"), run_name="__main__")

@@ -8,7 +8,7 @@ import pytest
 
 
 @pytest.fixture()
-def limits(registered):
+def limits(worker_here):
     return importlib.import_module("limber_addon.operators.limits")
 
 

@@ -159,7 +159,7 @@ def test_open_result_of_a_damaged_folder(bpy, registered, beam):
 
 
 @pytest.mark.slow
-def test_play_says_when_the_frames_are_gone(bpy, registered, beam):
+def test_play_says_when_the_frames_are_gone(bpy, worker_here, beam):
     """A cache that went missing is an error, not a branch that stands still."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
     shutil.rmtree(beam.folder)
@@ -168,7 +168,7 @@ def test_play_says_when_the_frames_are_gone(bpy, registered, beam):
 
 
 @pytest.mark.slow
-def test_color_by_refuses_unknown(bpy, registered, beam):
+def test_color_by_refuses_unknown(bpy, worker_here, beam):
     """Colouring by something that the branch does not have is an error."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
     assert bpy.ops.limber.color_by(scalar="young") == {"FINISHED"}

@@ -87,7 +87,7 @@ def _draw(panel, context):
 
 
 @pytest.fixture()
-def panels(registered):
+def panels(worker_here):
     def panel(name):
         module = importlib.import_module(f"limber_addon.panels.{name}")
         return getattr(module, f"LIMBER_PT_{name}")

@@ -46,7 +46,7 @@ def pulled(beam):
 
 
 @pytest.fixture()
-def opened(bpy, registered, pulled, tmp_path):
+def opened(bpy, worker_here, pulled, tmp_path):
     """The pull's motion in a scene of 24 frames a second: twelve to each frame of it."""
     scene_data(Branch.open(pulled.folder), motion="p").write(tmp_path / "scene.npz")
     data = part("scene_data").read_scene_data(tmp_path / "scene.npz")
@@ -122,7 +122,7 @@ def test_the_panel_plays_recordings(bpy, opened, pulled):
 
 
 @pytest.mark.slow
-def test_a_pull_of_the_example_is_replayed(bpy, registered, tmp_path):
+def test_a_pull_of_the_example_is_replayed(bpy, worker_here, tmp_path):
     """By the worker: the branch moves as the gripper did, with its measured points over it, and
     the next plan or motion is shown instead."""
     shutil.copytree(EXAMPLE, tmp_path / "twig.branch")

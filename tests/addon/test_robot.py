@@ -58,7 +58,7 @@ def test_a_checked_plan_is_followed_once_its_name_is_typed(bpy, checked):
 
 
 @pytest.mark.slow
-def test_the_plan_in_sight_is_what_a_robot_would_follow(bpy, registered, beam):
+def test_the_plan_in_sight_is_what_a_robot_would_follow(bpy, worker_here, beam):
     """Opened, its name stands in the robot's panel: the panel's default names no plan."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
     assert bpy.context.scene.limber.execute.name == "to-goal"

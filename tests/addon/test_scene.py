@@ -112,7 +112,7 @@ def test_marks_stand_at_their_first_place_on_the_first_frame(bpy, addon, beam, t
 
 
 @pytest.mark.slow
-def test_a_motion_starts_and_runs_as_it_is_told(bpy, registered, beam, positions):
+def test_a_motion_starts_and_runs_as_it_is_told(bpy, worker_here, beam, positions):
     """At half its speed from frame 11 on: the surface and what is keyed with it stay together."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
     bpy.ops.limber.retime(frame_start=11, speed=0.5)
@@ -198,7 +198,7 @@ def test_paths_are_relative(bpy, addon, beam, tmp_path):
 
 
 @pytest.mark.slow
-def test_path_becomes_relative_when_saved_later(bpy, registered, beam, positions, tmp_path):
+def test_path_becomes_relative_when_saved_later(bpy, worker_here, beam, positions, tmp_path):
     """Opened before the first save, saved beside the folder, both moved: it still plays."""
     bpy.ops.limber.open_result(directory=str(beam.folder))
     modifier = bpy.data.objects["beam"].modifiers[0]

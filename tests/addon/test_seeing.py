@@ -221,7 +221,7 @@ def test_a_folder_is_found_again(bpy, opened, beam, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_example_opens(bpy, registered, tmp_path):
+def test_the_example_opens(bpy, worker_here, tmp_path):
     """The branch that comes along, in a copy: with all its results."""
     assert bpy.ops.limber.open_example(directory=str(tmp_path / "mine")) == {"FINISHED"}
     surface = part("branches").find_surface(bpy.context.scene)

@@ -8,7 +8,7 @@ import pytest
 
 
 @pytest.fixture()
-def opened(bpy, registered, beam):
+def opened(bpy, worker_here, beam):
     bpy.ops.limber.open_result(directory=str(beam.folder))
     return importlib.import_module("limber_addon.branches").find_surface(bpy.context.scene)
 

@@ -9,6 +9,8 @@ import pytest
 
 from limber.geometry.skeleton.files import read_skeleton
 
+pytestmark = pytest.mark.usefixtures("worker_here")
+
 EXAMPLE = Path(__file__).parents[2] / "blend_files" / "bending_branch"
 
 

@@ -4,7 +4,7 @@ import pytest
 
 
 @pytest.fixture()
-def cube(bpy, registered):
+def cube(bpy, worker_here):
     """The cube of a Blender that has just started."""
     bpy.ops.wm.read_factory_settings()
     return bpy.data.objects["Cube"]
