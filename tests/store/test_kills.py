@@ -1,5 +1,6 @@
 """A program that is killed, at whatever step, leaves a branch folder before or after its stage."""
 
+import json
 import os
 import subprocess
 import sys
@@ -12,11 +13,11 @@ from limber.store import Branch
 
 # Every change of a name on the disk is counted; the process dies before the one asked for.
 _DYING = """
-import os, pathlib, shutil, sys
+import os, shutil
 from limber.store import Branch
-folder, deadly = sys.argv[1], int(sys.argv[2])
+os.fsync = lambda handle: None
 count = 0
-def counted(function):
+def counted(function, deadly):
     def call(*arguments, **options):
         global count
         count += 1
@@ -24,31 +25,64 @@ def counted(function):
             os._exit(9)
         return function(*arguments, **options)
     return call
-def watch():
+def watch(deadly):
     for name in ("replace", "rename", "unlink", "rmdir", "mkdir"):
-        setattr(os, name, counted(getattr(os, name)))
-    shutil.rmtree = counted(shutil.rmtree)
+        setattr(os, name, counted(getattr(os, name), deadly))
+    shutil.rmtree = counted(shutil.rmtree, deadly)
+def write(folder, deadly):
+    branch = Branch.open(folder)
+    watch(deadly)
+    with branch.stage("a", {"n": 2}) as stage:
+        stage.path("x.txt").write_text("new")
+        stage.path("deep/y.txt").write_text("new")
+        stage.remove("old.txt")
+def create(folder, deadly):
+    watch(deadly)
+    Branch.create(folder)
 """
-_STAGE = _DYING + """
-branch = Branch.open(folder)
-watch()
-with branch.stage("a", {"n": 2}) as stage:
-    stage.path("x.txt").write_text("new")
-    stage.path("deep/y.txt").write_text("new")
-    stage.remove("old.txt")
-"""
-_CREATE = _DYING + """
-watch()
-Branch.create(folder)
+# Loads what they need once, and is each of them in a process of its own.
+_FORKING = _DYING + """
+import json, sys
+for line in sys.stdin:
+    name, folder, deadly = json.loads(line)
+    child = os.fork()
+    if not child:
+        globals()[name](folder, deadly)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
 
 
-def die(program: str, folder: Path, deadly: int) -> bool:
-    """Run a program that dies at its step ``deadly``; False if it has fewer steps."""
-    done = subprocess.run([sys.executable, "-c", program, str(folder), str(deadly)],
-                          check=False, capture_output=True, text=True)
-    assert done.returncode in (0, 9), done.stderr
-    return done.returncode == 9
+@pytest.fixture(scope="module")
+def die():
+    """A function that does ``write`` or ``create`` in a process that dies at a step; False if it
+    has fewer steps.
+    """
+    if not hasattr(os, "fork"):
+        def start(name: str, folder: Path, deadly: int) -> bool:
+            program = f"{_DYING}\n{name}({str(folder)!r}, {deadly})"
+            done = subprocess.run([sys.executable, "-c", program], check=False)
+            return _has_died(done.returncode)
+        yield start
+        return
+    with subprocess.Popen([sys.executable, "-c", _FORKING], stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE, text=True) as server:
+        def fork(name: str, folder: Path, deadly: int) -> bool:
+            server.stdin.write(json.dumps([name, str(folder), deadly]) + "\n")
+            server.stdin.flush()
+            return _has_died(int(server.stdout.readline()))
+        yield fork
+
+
+def _has_died(code: int) -> bool:
+    assert code in (0, 9)
+    return code == 9
+
+
+@pytest.fixture(autouse=True)
+def without_waiting_for_the_disk(monkeypatch):
+    """A process is killed here, no power is cut: what was written need not reach the disk."""
+    monkeypatch.setattr(os, "fsync", lambda _handle: None)
 
 
 def litter(folder: Path) -> list[str]:
@@ -68,11 +102,11 @@ def fresh(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_kill_at_every_step_of_a_stage_leaves_the_folder_before_or_after(fresh):
+def test_a_kill_at_every_step_of_a_stage_leaves_the_folder_before_or_after(fresh, die):
     """At each change of a name: opened again all files are of one run; no litter after the next."""
     found = []
     deadly = 1
-    while die(_STAGE, folder := fresh(str(deadly)), deadly):
+    while die("write", folder := fresh(str(deadly)), deadly):
         branch = Branch.open(folder, verify=True)
         state = branch.manifest.stages["a"].settings["n"]
         texts = {name: branch.path(name).read_text() for name in sorted(branch.manifest.files)}
@@ -91,8 +125,7 @@ def test_a_kill_at_every_step_of_a_stage_leaves_the_folder_before_or_after(fresh
     assert len(found) >= 8
 
 
-@pytest.mark.slow
-def test_a_kill_at_every_step_of_create_leaves_a_folder_that_opens(tmp_path: Path):
+def test_a_kill_at_every_step_of_create_leaves_a_folder_that_opens(tmp_path: Path, die):
     """New or empty before: what is there afterwards can be made a branch folder again, or is one.
     """
     for made_before in (False, True):
@@ -101,7 +134,7 @@ def test_a_kill_at_every_step_of_create_leaves_a_folder_that_opens(tmp_path: Pat
             folder = tmp_path / f"{made_before}-{deadly}.branch"
             if made_before:
                 folder.mkdir()
-            if not die(_CREATE, folder, deadly):
+            if not die("create", folder, deadly):
                 break
             Branch.create(folder)
             Branch.open(folder, verify=True)
@@ -112,12 +145,12 @@ def test_a_kill_at_every_step_of_create_leaves_a_folder_that_opens(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_a_commit_that_another_program_left_half_done_comes_first(fresh):
+def test_a_commit_that_another_program_left_half_done_comes_first(fresh, die):
     """An opener from before the kill, who never looked at the journal, still loses nothing."""
     folder = fresh("left")
     early = Branch.open(folder)
     deadly = 1
-    while die(_STAGE, folder, deadly) and not (folder / ".commit").exists():
+    while die("write", folder, deadly) and not (folder / ".commit").exists():
         deadly += 1
     assert (folder / ".commit").exists()
     with early.stage("b") as stage:
