@@ -10,7 +10,7 @@ import bpy
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, view, waited
+from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, view
 
 
 def begin():
@@ -64,8 +64,6 @@ def undo():
 
 
 def is_undone():
-    if not waited(0.5):
-        return False
     cube = bpy.data.objects["Cube"]
     seen["undone"] = [cube.visible_get(), cube.hide_render, "bending_branch" in bpy.data.objects]
     return True

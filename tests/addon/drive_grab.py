@@ -11,7 +11,7 @@ from bpy_extras import view3d_utils
 from mathutils import Vector
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, override, picture, seen, view, waited
+from driving import FOLDER, KEY, draw, drive, override, picture, seen, view, waited
 
 state = {}
 
@@ -56,13 +56,12 @@ def open_result():
 
 
 def begin():
-    if not waited(1.0):
-        return False
     with override():
         bpy.ops.view3d.view_axis(type="FRONT")
         bpy.ops.view3d.view_all()
         if "before" not in state:
             bpy.ops.wm.tool_set_by_id(name="limber.grab_tool")
+    draw()
     state["before"] = tip()[1]
     with override():
         seen["began"] = list(bpy.ops.limber.grab("INVOKE_DEFAULT"))
@@ -83,17 +82,15 @@ def hover():
 
 
 def press():
-    return waited(0.3) and event("LEFTMOUSE", "PRESS")
+    return event("LEFTMOUSE", "PRESS")
 
 
 def drag():
-    return waited(0.6) and event("MOUSEMOVE", move=(60, -4))
+    return waited(0.1) and event("MOUSEMOVE", move=(60, -4))
 
 
 def is_bent():
     """The tip has come along by most of the way that the mouse has gone."""
-    if not waited(0.2):
-        return False
     bent = max((now - then).length for now, then in zip(tip()[1], state["before"], strict=True))
     seen["bent_m"] = bent
     return bent > 0.02
@@ -121,11 +118,11 @@ def let_go():
 
 
 def keep():
-    return waited(0.3) and event("RET", "PRESS", move=(60, -4))
+    return event("RET", "PRESS", move=(60, -4))
 
 
 def is_kept():
-    if not waited(0.5) or sessions():
+    if sessions():
         return False
     group = bpy.context.scene.limber.simulate
     seen["kept"] = [group.use_move, list(group.move), list(group.grasp_point), group.grasp_mode]
@@ -144,7 +141,7 @@ def undo():
 
 
 def escape():
-    return waited(0.5) and event("ESC", "PRESS")
+    return event("ESC", "PRESS")
 
 
 def is_left():
@@ -155,8 +152,6 @@ def is_left():
 def key(kind, height):
     """Point at the beam at a height and press a key."""
     def step():
-        if not waited(0.3):
-            return False
         state["place"] = pixels(Vector((0.0, 0.0, height)))
         event("MOUSEMOVE")
         return event(kind, "PRESS")
@@ -180,13 +175,15 @@ def is_loaded_down():
     load = bpy.context.scene.limber.load
     seen["live"] = {"lines": list(lines), "bent_m": bent, "fruit": load.fruit, "cut": load.cut,
                     "hidden": len(surface().data.vertices) - len(shown.vertices)}
-    return bent > 1e-3 and waited(1.0)
+    return bent > 1e-3 and waited(0.3)
 
 
 def is_whole():
+    if sessions():
+        return False
     load = bpy.context.scene.limber.load
     seen["after_live"] = [load.fruit, load.cut, "Limber cut" in surface().modifiers]
-    return waited(0.3) and not sessions()
+    return True
 
 
 drive([open_result, begin, is_loaded, hover, press, drag, is_bent, limit, is_over, picture("grab"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, drive, override, picture, seen, started, view, waited
+from driving import FOLDER, KEY, drive, is_tab_open, override, picture, seen, started, view
 
 
 def jobs():
@@ -22,12 +22,8 @@ def open_sidebar():
 
 
 def open_tab():
-    _, area, sidebar = view("UI")
-    if not waited(0.5):
-        return False
-    sidebar.active_panel_category = "Limber"
-    area.tag_redraw()
-    seen["category"] = sidebar.active_panel_category
+    is_tab_open()
+    seen["category"] = view("UI")[2].active_panel_category
     bpy.context.scene.limber.reconstruct.cloud = str(FOLDER / "scan.ply")
     for thing in list(bpy.data.objects):
         bpy.data.objects.remove(thing)
@@ -41,13 +37,11 @@ def button_place(offset):
 
 
 def click(offset):
-    """Point at a button, press it a moment later, let it go a moment later still."""
+    """Point at a button, press it in the next step of the timer, let it go in the one after."""
     def step():
         window = view()[0]
         x, y = button_place(offset)
         phase = started.setdefault("click", 0)
-        if not waited(0.3 * (phase + 1)):
-            return False
         kind, value = (("MOUSEMOVE", "NOTHING"), ("LEFTMOUSE", "PRESS"),
                        ("LEFTMOUSE", "RELEASE"))[phase]
         window.event_simulate(type=kind, value=value, x=x, y=y)
@@ -124,8 +118,6 @@ def play():
 
 
 def played():
-    if not waited(1.0):
-        return False
     seen["playing"] = view()[0].screen.is_animation_playing
     seen["frame_after_play"] = bpy.context.scene.frame_current
     return bpy.context.scene.frame_current > 1

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, seen, waited
+from driving import FOLDER, KEY, clear, drive, is_tab_open, override, picture, seen
 
 state = {}
 
@@ -58,8 +58,6 @@ def choose(*numbers):
 
 def edit():
     """A twig's tip is moved with G's operator, another twig hung elsewhere, a twig cut off."""
-    if not waited(0.5):
-        return False
     given = sys.modules[f"{KEY}.bridge.skeletons"].as_given(skeleton().data)
     carried = [int(k) for k in np.flatnonzero(np.bincount(
         given.parent[given.parent >= 0], minlength=len(given.parent)) == 0)]
@@ -83,8 +81,6 @@ def edit():
 
 
 def undo():
-    if not waited(0.5):
-        return False
     with override():
         bpy.ops.ed.undo()
     return True
@@ -103,7 +99,7 @@ def apply():
 
 
 def applied():
-    if sys.modules[f"{KEY}.jobs"].is_running() or not waited(2.0):
+    if sys.modules[f"{KEY}.jobs"].is_running():
         return False
     thing = skeleton()
     if thing is None or marks().edit_count or not len(marks().points["edited"]):

@@ -36,12 +36,10 @@ def clear():
 
 
 def is_tab_open():
-    """Show Limber's tab, half a second into the current step; whether it is shown."""
-    if not waited(0.5):
-        return False
-    _, area, sidebar = view("UI")
-    sidebar.active_panel_category = "Limber"
-    area.tag_redraw()
+    """Show Limber's tab; the step for it."""
+    # The tabs are known once the sidebar has been drawn.
+    draw()
+    view("UI")[2].active_panel_category = "Limber"
     return True
 
 
@@ -50,18 +48,23 @@ def override():
     return bpy.context.temp_override(window=window, screen=window.screen, area=area, region=region)
 
 
+def draw():
+    """Have the whole window drawn now: what is placed and read in it is then as it is shown."""
+    with override():
+        bpy.ops.wm.redraw_timer(type="DRAW_WIN_SWAP", iterations=1)
+
+
 def waited(seconds):
     """Whether the current step has lasted that long."""
     return time.monotonic() - started["step"] > seconds
 
 
 def picture(name):
-    """Return the step that has a picture taken, a second after the step before."""
+    """Return the step that has a picture taken."""
     def step():
         request = FOLDER / f"{name}.request"
         if "picture" not in started:
-            if not waited(1.0):
-                return False
+            draw()
             started["picture"] = request
             request.touch()
         if request.exists():
@@ -86,7 +89,7 @@ def drive(steps, longest):
             elif waited(longest):
                 raise TimeoutError(f"{started['name']}, {len(left)} steps from the end")
             if left:
-                return 0.05
+                return 0.02
         except Exception:
             seen["error"] = traceback.format_exc()
         (FOLDER / "log.json").write_text(json.dumps(seen))
@@ -96,4 +99,6 @@ def drive(steps, longest):
     bpy.context.preferences.view.show_splash = False
     # Blender keeps what was changed when it quits: the next test would start with it.
     bpy.context.preferences.use_preferences_save = False
-    bpy.app.timers.register(run, first_interval=2.0)
+    # A view is at once where it is turned to.
+    bpy.context.preferences.view.smooth_view = 0
+    bpy.app.timers.register(run, first_interval=0.1)

@@ -353,7 +353,7 @@ def _take_pictures(folder: Path, display: str, process: subprocess.Popen) -> Non
             subprocess.run(["import", "-display", display, "-window", "root", str(picture)],
                            check=True, timeout=30)
             request.unlink()
-        time.sleep(0.05)
+        time.sleep(0.02)
 
 
 def _colour_count(path: Path) -> int:
