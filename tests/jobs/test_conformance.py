@@ -47,10 +47,11 @@ class InPool:
     name = "pool"
 
     def __init__(self, monkeypatch):
-        monkeypatch.setattr(pool_module, "_GRACE_SECONDS", 0.5)
+        monkeypatch.setattr(pool_module, "_GRACE_SECONDS", 0.3)
 
-    def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None) -> Outcome:
-        outcome = Outcome()
+    def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None,
+            outcome: Outcome | None = None) -> Outcome:
+        outcome = outcome or Outcome()
         with Pool(1) as pool:
             def hear(fraction: float, message: str, _numbers: dict) -> None:
                 outcome.reports.append((fraction, message))
@@ -83,10 +84,11 @@ class AsProcess:
     name = "process"
 
     def __init__(self, monkeypatch):
-        monkeypatch.setattr(process, "_GRACE_SECONDS", 0.5)
+        monkeypatch.setattr(process, "_GRACE_SECONDS", 0.3)
 
-    def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None) -> Outcome:
-        outcome = Outcome()
+    def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None,
+            outcome: Outcome | None = None) -> Outcome:
+        outcome = outcome or Outcome()
 
         def hear(fraction: float, message: str, _numbers: dict) -> None:
             outcome.reports.append((fraction, message))
@@ -114,13 +116,14 @@ class InAddon:
         package.__path__ = [str(ROOT / "addon")]
         monkeypatch.setitem(sys.modules, package.__name__, package)
         self.jobs = importlib.import_module(f"{package.__name__}.jobs")
-        monkeypatch.setattr(self.jobs, "_GRACE_SECONDS", 0.5)
+        monkeypatch.setattr(self.jobs, "_GRACE_SECONDS", 0.3)
         # The worker's own Python finds itself; that of the tests finds this tree.
         monkeypatch.setattr(self.jobs, "worker_environment", lambda: dict(os.environ))
 
-    def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None) -> Outcome:
+    def run(self, behaviour: str, cancel_at: str = "", limits: Limits | None = None,
+            outcome: Outcome | None = None) -> Outcome:
         assert limits is None
-        outcome = Outcome()
+        outcome = outcome or Outcome()
         job = self.jobs.Job("test", [sys.executable, "-u", str(PROGRAM), behaviour])
         job.launch()
         outcome.processes = [psutil.Process(job.pid)]
@@ -206,7 +209,7 @@ def test_cancel_ends_a_job_that_hangs(runner):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("behaviour", "limits", "said"), [
-    ("hang", Limits(seconds=1.0), "was stopped after 1 s"),
+    ("hang", Limits(seconds=0.6), "was stopped after 1 s"),
     ("greedy", Limits(memory_mb=300.0), "Its limit is 300 MB")])
 def test_limits_end_a_job(runner, behaviour: str, limits: Limits, said: str):
     if isinstance(runner, InAddon):
@@ -216,7 +219,7 @@ def test_limits_end_a_job(runner, behaviour: str, limits: Limits, said: str):
     assert_ended(outcome)
 
 
-# A program that starts a job, says its process id, and waits to be killed.
+# A program that starts a job, says when the job has reported, and waits to be killed.
 _PARENT = """
 import sys, threading, time
 import pytest
@@ -225,7 +228,12 @@ if __name__ == "__main__":
     import os
     os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)
     runner = RUNNERS[int(sys.argv[1])](pytest.MonkeyPatch())
-    threading.Thread(target=runner.run, args=(sys.argv[2],), daemon=True).start()
+    outcome = Outcome()
+    threading.Thread(target=runner.run, args=(sys.argv[2],), kwargs={"outcome": outcome},
+                     daemon=True).start()
+    while not outcome.reports:
+        time.sleep(0.02)
+    print("reported", flush=True)
     time.sleep(60)
 """
 
@@ -238,18 +246,13 @@ def test_a_killed_parent_leaves_nothing(runner, behaviour: str, tmp_path):
     program = tmp_path / "parent.py"
     program.write_text(_PARENT)
     parent = subprocess.Popen([sys.executable, str(program), str(RUNNERS.index(type(runner))),
-                               behaviour], stdout=subprocess.DEVNULL, env=os.environ)
-    family = psutil.Process(parent.pid)
-    started: list[psutil.Process] = []
-    deadline = time.monotonic() + 30
+                               behaviour], stdout=subprocess.PIPE, text=True, env=os.environ)
     # The pool has a process of Python's own beside its worker; both are up when the job is.
-    while not any(p.cpu_times().user > 0.01 for p in started) and time.monotonic() < deadline:
-        time.sleep(0.2)
-        started = family.children(recursive=True)
+    assert parent.stdout.readline() == "reported\n"
+    started = psutil.Process(parent.pid).children(recursive=True)
     assert started and parent.poll() is None
-    time.sleep(0.5)
-    started = family.children(recursive=True)
     parent.kill()
     parent.wait()
+    parent.stdout.close()
     _gone, alive = psutil.wait_procs(started, timeout=8)
     assert not [p for p in alive if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]

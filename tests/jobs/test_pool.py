@@ -4,58 +4,25 @@ import os
 import time
 
 import pytest
+from tests.subjects.tasks import (
+    badly_begun,
+    budget,
+    buggy,
+    diverges,
+    half,
+    late_square,
+    nested,
+    remember,
+    remembered,
+    reports_for_long,
+    unpicklable,
+)
 
 from limber.errors import Cancelled, ConvergenceError, InputError
 from limber.jobs import Pool, core_budget, run_tasks, worker_count
+from limber.jobs import pool as pool_module
 from limber.jobs.budget import free_memory_mb
 from limber.progress import Progress
-
-
-def late_square(number: int) -> int:
-    """The first ones take longest."""
-    time.sleep(0.05 * (5 - number))
-    return number**2
-
-
-def budget(_number: int) -> tuple[int, int]:
-    return core_budget(), os.getpid()
-
-
-def nested(_number: int) -> list[tuple[int, int]]:
-    return run_tasks(budget, [(0,), (1,)])
-
-
-def diverges(number: int) -> int:
-    if number == 1:
-        raise ConvergenceError("It diverged.", "Too far.", "Go less far.", result={"steps": 3})
-    time.sleep(30)
-    return number
-
-
-def buggy(_number: int) -> int:
-    return 1 // 0
-
-
-def remember(value: int) -> None:
-    os.environ["REMEMBERED"] = str(value)
-
-
-def remembered(number: int) -> str:
-    return f"{number} {os.environ['REMEMBERED']}"
-
-
-def badly_begun() -> None:
-    raise InputError("There is no such branch.")
-
-
-def unpicklable(_number: int) -> object:
-    return lambda: None
-
-
-def half(progress: Progress) -> int:
-    progress(0.5, "half")
-    time.sleep(0.5)
-    return 1
 
 
 @pytest.mark.slow
@@ -100,7 +67,8 @@ def test_a_wrong_budget_is_refused(monkeypatch, text: str):
 
 
 @pytest.mark.slow
-def test_the_first_error_stops_the_others_and_keeps_what_it_carries():
+def test_the_first_error_stops_the_others_and_keeps_what_it_carries(monkeypatch):
+    monkeypatch.setattr(pool_module, "_GRACE_SECONDS", 0.3)
     started = time.monotonic()
     with Pool(2) as pool, pytest.raises(ConvergenceError, match=r"diverged\. Too far") as error:
         pool.map(diverges, [(0,), (1,), (2,)])
@@ -138,11 +106,11 @@ def test_a_failed_beginning_is_the_error_of_every_task():
 def test_progress_tells_share_count_and_remaining_time(monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "2")
     seen = []
-    run_tasks(half, [()] * 6, progress=Progress(lambda *said: seen.append(said)), message="halves")
+    run_tasks(half, [()] * 4, progress=Progress(lambda *said: seen.append(said)), message="halves")
     fractions = [fraction for fraction, _, _ in seen]
     assert fractions == sorted(fractions) and fractions[-1] == 1.0
     assert {message for _, message, _ in seen} == {"halves"}
-    assert [numbers["done"] for _, _, numbers in seen][-1] == 6
+    assert [numbers["done"] for _, _, numbers in seen][-1] == 4
     remaining = [numbers["remaining_s"] for _, _, numbers in seen if "remaining_s" in numbers]
     assert remaining and remaining[-1] <= remaining[0] < 60
 
@@ -151,21 +119,15 @@ def test_progress_tells_share_count_and_remaining_time(monkeypatch):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_cancel_reaches_the_tasks(workers: int, monkeypatch):
     monkeypatch.setenv("LIMBER_CORES", "2")
-    progress = Progress(lambda fraction, _m, _n: progress.cancel() if fraction > 0.1 else None)
+    progress = Progress(lambda fraction, _m, _n: progress.cancel() if fraction > 0.01 else None)
     started = time.monotonic()
     with pytest.raises(Cancelled):
         run_tasks(half, [()] * 100, workers=workers, progress=progress)
     assert time.monotonic() - started < 15
 
 
-def reports_for_long(progress: Progress) -> None:
-    for part in range(1000):
-        progress(part / 1000, "long")
-        time.sleep(0.02)
-
-
 def test_a_task_cancelled_by_its_own_progress_ends_alone():
-    """The pool itself was not cancelled: it goes on with other tasks."""
+    """The pool itself was not cancelled: it goes on with other """
     progress = Progress(lambda _fraction, _message, _numbers: progress.cancel())
     with Pool(1) as pool:
         with pytest.raises(Cancelled):

@@ -25,7 +25,7 @@ def steps(progress: Progress = SILENT) -> dict:
     """Reports as it goes and returns a result."""
     for step in range(5):
         progress(step / 4, "going", step=step)
-        time.sleep(0.1)
+        time.sleep(0.06)
     return {"n": 3}
 
 
@@ -69,7 +69,7 @@ def greedy(progress: Progress = SILENT) -> dict:
     """Takes ever more memory."""
     held = []
     while True:
-        held.append(os.urandom(1 << 24))
+        held.append(b"x" * (1 << 26))
         progress(0.1, "taking")
         time.sleep(0.05)
 
@@ -83,7 +83,7 @@ def main(name: str) -> int:
     from limber.jobs.ending import end_with_parent_pipe
 
     signal.signal(signal.SIGTERM, _interrupted)
-    end_with_parent_pipe(grace_seconds=1.0)
+    end_with_parent_pipe(grace_seconds=0.3)
     # A library that asks for input must not wait for ever.
     assert sys.stdin.read() == ""
     code, outcome = 0, {"command": name, "status": "done", "error": None}
