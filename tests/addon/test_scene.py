@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.subjects.processes import left_alive
 
 from limber.cli import call
 
@@ -353,5 +354,4 @@ def test_a_killed_scene_leaves_no_blender(bpy, beam, tmp_path):
         program.kill()
         program.wait()
         program.stdout.close()
-    _, alive = psutil.wait_procs(started, timeout=5)
-    assert not alive
+    assert not left_alive(started, 5)

@@ -16,6 +16,7 @@ from pathlib import Path
 import psutil
 import pytest
 from tests.subjects import behaviours
+from tests.subjects.processes import left_alive
 
 from limber.errors import Cancelled, LimberError
 from limber.jobs import Limits, Pool, process
@@ -152,8 +153,7 @@ def runner(request, monkeypatch):
 def assert_ended(outcome: Outcome) -> None:
     """None of the job's processes is left."""
     assert outcome.processes
-    _gone, alive = psutil.wait_procs(outcome.processes, timeout=5)
-    assert not [p for p in alive if p.status() != psutil.STATUS_ZOMBIE]
+    assert not left_alive(outcome.processes, 5)
 
 
 @pytest.mark.slow
@@ -254,5 +254,4 @@ def test_a_killed_parent_leaves_nothing(runner, behaviour: str, tmp_path):
     parent.kill()
     parent.wait()
     parent.stdout.close()
-    _gone, alive = psutil.wait_procs(started, timeout=8)
-    assert not [p for p in alive if p.is_running() and p.status() != psutil.STATUS_ZOMBIE]
+    assert not left_alive(started, 8)

@@ -12,6 +12,7 @@ import psutil
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.subjects.processes import left_alive
 
 from limber.errors import InputError, WorkError
 from limber.mechanics import BranchModel, Grasp, solve_static
@@ -284,8 +285,7 @@ def test_the_session_ends_with_a_client_that_was_killed(branch_folder, tmp_path)
         family = [psutil.Process(int(number))]
         family += family[0].children(recursive=True)
         holder.kill()
-    _, left = psutil.wait_procs(family, timeout=20)
-    assert not left
+    assert not left_alive(family, 20)
     assert not os.path.exists(path.strip())
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from tests.subjects.processes import left_alive
 
 from limber.errors import InputError, WorkError
 from limber.mechanics import Grasp, solve_static
@@ -179,8 +180,7 @@ def test_the_session_dies_alone_and_its_client_says_so(branch_folder):
             time.sleep(0.01)
     session.close()
     assert not path.exists()
-    _, left = psutil.wait_procs(children, timeout=20)
-    assert not left
+    assert not left_alive(children, 20)
 
 
 @pytest.mark.slow
