@@ -141,11 +141,20 @@ def test_a_slow_robot_is_led_by_a_solution_farther_back(setting, beam):
     assert 0.002 < np.linalg.norm(at.bends[0][0]) < 0.0031
 
 
-@pytest.fixture
-def held(setting):
+@pytest.fixture(scope="module")
+def holder(setting):
+    """A solver's process that the tests share: its start takes longer than most of them."""
     branch = HeldBranch(setting)
     yield branch
     branch.close()
+
+
+@pytest.fixture
+def held(holder, setting):
+    """A gripper that holds nothing."""
+    yield holder
+    holder.setting = setting
+    holder.release()
 
 
 def closed(held, flange) -> str:
@@ -159,13 +168,24 @@ def closed(held, flange) -> str:
     return held.state
 
 
-def pulled_aside(held, flange, steps):
-    """Move the flange by 10 mm and wait so many steps; where it is then."""
+def settled(held, flange) -> None:
+    """Stand still until the branch is solved there, and nothing more is asked."""
+    for _ in range(400):
+        # Its speed dies down first: else it would be solved where the gripper does not go.
+        held.wrench(flange, 0.002)
+    for _ in range(10):
+        if not held._busy:
+            return
+        held._pipe.poll(5.0)
+        held.wrench(flange, 0.002)
+    raise AssertionError("the branch was solved again and again")
+
+
+def pulled_aside(held, flange):
+    """Move the flange by 10 mm and wait for the branch; where it is then."""
     moved = flange.copy()
     moved[1, 3] += 0.01
-    for _ in range(steps):
-        held.wrench(moved, 0.002)
-        held._pipe.poll(0.05)
+    settled(held, moved)
     return moved
 
 
@@ -252,7 +272,7 @@ def test_sliding_in_the_grip_lets_the_force_fall(held):
     flange = Controller("ur5e").flange
     held.wrench(flange, 0.002)
     assert closed(held, flange) == "held"
-    moved = pulled_aside(held, flange, 50)
+    moved = pulled_aside(held, flange)
     before = np.linalg.norm(held.wrench(moved, 0.002)[:3])
     held.slide(0.5)
     after = np.linalg.norm(held.wrench(moved, 0.002)[:3])
@@ -298,7 +318,7 @@ def test_what_is_seen_stays_behind_by_what_gives_way(held):
     held.setting = replace(held.setting, compliance=1e-2)
     held.wrench(flange, 0.002)
     assert closed(held, flange) == "held"
-    pulled_aside(held, flange, 200)
+    pulled_aside(held, flange)
     solution = held._solution
     behind = (held._gripper @ held._offset)[:3, 3] - solution.frame[:3, 3]
     assert behind == pytest.approx(1e-2 * solution.wrench[:3], abs=5e-5)
