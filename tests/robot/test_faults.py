@@ -16,7 +16,9 @@ from benchmarks.robot_faults import (
     new_robot,
     provoke,
     restored,
+    set_off,
     straight,
+    tared,
 )
 from limber.compiled import cache_folder
 from limber.errors import InputError, LimberError, SafetyStop, WorkError
@@ -57,11 +59,10 @@ def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(moving_ro
     """Told at once; then nothing that is asked of the driver takes longer either."""
     address = f"127.0.0.{int(moving_robot.address.split('.')[-1]) + 20}"
     with Cable(address, moving_robot.address) as cable, RobotLink(cell_for(address)) as link:
-        time.sleep(0.3)
-        link.tare()
         if moving:
-            link.start(straight(moving_robot, (0.0, 0.2, 0.0)))
-            time.sleep(0.6)
+            set_off(moving_robot, link, straight(moving_robot, (0.0, 0.2, 0.0)))
+        else:
+            tared(link)
         began = time.monotonic()
         cable.cut(direction)
         assert link.wait("stopped", seconds=5)["reason"]
@@ -93,9 +94,7 @@ def test_a_killed_controller_is_reported(worker_address):
 def test_a_second_client_is_refused_and_the_first_goes_on(moving_robot):
     cell = cell_for(moving_robot.address)
     with RobotLink(cell) as first:
-        time.sleep(0.2)
-        first.tare()
-        first.start(straight(moving_robot, (0.0, 0.2, 0.0)))
+        set_off(moving_robot, first, straight(moving_robot, (0.0, 0.2, 0.0)))
         with pytest.raises(LimberError):
             RobotLink(cell).close()
         assert first.wait("reached", "stopped", seconds=30)["event"] == "reached"
@@ -108,13 +107,12 @@ def test_a_path_is_followed_within_a_millimetre(model, worker_address):
         from limber.robot.trajectory import Trajectory, along, densely
 
         start = np.array(robot.state["pose"])
-        poses = densely(np.array([start, start + [0, 0.05, 0, 0, 0, 0],
-                                  start + [0, 0.05, 0.03, 0, 0.1, 0]]))
+        poses = densely(np.array([start, start + [0, 0.02, 0, 0, 0, 0],
+                                  start + [0, 0.02, 0.015, 0, 0.05, 0]]))
         path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
         rows = []
         with RobotLink(cell_for(worker_address, model), rows.append) as link:
-            time.sleep(0.2)
-            link.tare()
+            tared(link)
             assert link.follow(path)["event"] == "reached"
             back = link.retreat()
             assert back["event"] == "reached"
@@ -131,10 +129,7 @@ def test_a_path_is_followed_within_a_millimetre(model, worker_address):
 def test_pause_at_the_soft_limit_then_resume(moving_robot):
     cell = cell_for(moving_robot.address)
     with RobotLink(cell) as link:
-        time.sleep(0.2)
-        link.tare()
-        link.start(straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
-        time.sleep(0.5)
+        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
         moving_robot.ask("added_wrench", wrench=[0, 0, 12.0, 0, 0, 0])
         assert "soft force" in link.wait("paused", "stopped", "reached", seconds=5)["reason"]
         time.sleep(0.5)
@@ -151,10 +146,7 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(worker_address):
     with new_robot(worker_address, "ur5", 3) as robot, RobotLink(
             cell_for(worker_address, "ur5")) as link:
         begin = np.array(robot.state["pose"])
-        time.sleep(0.2)
-        link.tare()
-        link.start(straight(robot, (0.0, 0.2, 0.0)))
-        time.sleep(0.8)
+        set_off(robot, link, straight(robot, (0.0, 0.2, 0.0)))
         robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
         assert "force" in link.wait("stopped", seconds=5)["reason"]
         assert any("wait for a step" in each for each in link.warnings)
@@ -172,8 +164,7 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
         "gripper": "digital_output", "grip_seconds": 0.2})})
     with RobotLink(cell) as link:
-        time.sleep(0.2)
-        link.tare()
+        tared(link)
         link.gripper(close=True)
         link.start(straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
         time.sleep(1.2)
@@ -192,10 +183,7 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_
 
 def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(moving_robot):
     with RobotLink(cell_for(moving_robot.address)) as link:
-        time.sleep(0.2)
-        link.tare()
-        link.start(straight(moving_robot, (0.0, 0.1, 0.0)))
-        time.sleep(0.6)
+        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.1, 0.0)))
         link.stop()
         link.wait("stopped", seconds=5)
         moving_robot.ask("stand", joints=list(np.add(moving_robot.state["joints"],
@@ -209,10 +197,7 @@ def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(moving_robot):
 def test_a_computer_that_stands_still_is_no_silent_robot(moving_robot, held_up, ends):
     """Both held up for 80 ms: nothing was there to be heard. The robot alone: its data is old."""
     with RobotLink(cell_for(moving_robot.address)) as link:
-        time.sleep(0.2)
-        link.tare()
-        link.start(straight(moving_robot, (0.0, 0.08, 0.0)))
-        time.sleep(0.8)
+        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.05, 0.0)))
         held = [moving_robot.process] + ([link.process] if held_up == "both" else [])
         for process in reversed(held):
             process.send_signal(signal.SIGSTOP)
@@ -234,8 +219,7 @@ def test_a_first_run_compiles_before_the_watchdog_listens(moving_robot, tmp_path
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernels))
     with RobotLink(cell_for(moving_robot.address)) as link:
         assert any(kernels.rglob("frames.turned_wrench*.nbc"))
-        time.sleep(0.3)
-        link.tare()
+        tared(link)
         link.start(straight(moving_robot, (0.0, 0.02, 0.0)))
         assert link.wait("reached", "stopped", seconds=10)["event"] == "reached"
 
@@ -243,12 +227,10 @@ def test_a_first_run_compiles_before_the_watchdog_listens(moving_robot, tmp_path
 def test_after_a_stop_only_a_choice_moves_it(moving_robot):
     with RobotLink(cell_for(moving_robot.address)) as link:
         line = straight(moving_robot, (0.0, 0.1, 0.0))
-        time.sleep(0.2)
+        link.wait_for_samples()
         with pytest.raises(SafetyStop, match="not tared"):
             link.start(line)
-        link.tare()
-        link.start(line)
-        time.sleep(0.6)
+        set_off(moving_robot, link, line)
         link.stop()
         assert "asked to stop" in link.wait("stopped", seconds=5)["reason"]
         time.sleep(0.2)
@@ -276,9 +258,8 @@ def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
             time.sleep(1.5)
         taken.append(rows)
     with RobotLink(cell_for(moving_robot.address), take) as link:
-        time.sleep(0.2)
-        link.tare()
-        link.start(straight(moving_robot, (0.0, 0.12, 0.0)))
+        tared(link)
+        link.start(straight(moving_robot, (0.0, 0.09, 0.0)))
         stalled.set()
         assert link.wait("reached", "stopped", seconds=30)["event"] == "reached"
         time.sleep(0.1)

@@ -6,6 +6,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import SCRIPT_PORT
 
 STILL_M_S = 1e-4
-_BEFORE_FAULT_SECONDS = 0.8
+_TARE_SECONDS = 0.2  # 25 readings of a CB3, 100 of an e-Series arm
+_AT_SPEED = 0.97  # of the trajectory's: it comes near to it slowly at the end
 _START_SECONDS = 10.0
 
 
@@ -91,6 +93,31 @@ def straight(robot: VirtualRobot, way: tuple[float, float, float], speed: float 
                       ExpectedWrench.nothing(poses) if expected else None)
 
 
+def tared(link: RobotLink) -> None:
+    """Tare the sensor as soon as the robot tells how it stands."""
+    link.wait_for_samples()
+    link.tare(_TARE_SECONDS)
+
+
+def set_off(robot: VirtualRobot, link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:
+    """Tare, begin a trajectory, and return the robot's state when the arm is at its speed.
+
+    Raises:
+        AssertionError: it does not come to that speed; the reason is that of the stop.
+    """
+    tared(link)
+    link.start(trajectory)
+    wanted = _AT_SPEED * trajectory.greatest_speeds[0]
+    # A machine with much else to do begins the motion later.
+    given_up = time.monotonic() + _START_SECONDS
+    while np.linalg.norm((state := robot.state)["tool_speed"][:3]) < wanted:
+        if time.monotonic() > given_up:
+            told = link.wait("stopped", seconds=1.0)["reason"]
+            raise AssertionError(f"it did not move: {told}")
+        time.sleep(0.01)
+    return state
+
+
 def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) -> Outcome:
     """Move the robot, provoke a fault on the way, and watch it from its own side.
 
@@ -98,18 +125,7 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
         AssertionError: it did not come to a standstill, or nothing was reported.
     """
     with RobotLink(cell) as link:
-        time.sleep(0.2)
-        link.tare()
-        link.start(straight(robot, (0.0, 0.2, 0.0)))
-        time.sleep(_BEFORE_FAULT_SECONDS)
-        before, waited = robot.state, time.monotonic()
-        # A machine with much else to do begins the motion later.
-        while abs(before["tool_speed"][1]) < 0.02 and time.monotonic() - waited < _START_SECONDS:
-            time.sleep(0.05)
-            before = robot.state
-        if abs(before["tool_speed"][1]) < 0.02:
-            told = link.wait("stopped", seconds=1.0)["reason"]
-            raise AssertionError(f"it did not move before the fault: {told}")
+        before = set_off(robot, link, straight(robot, (0.0, 0.2, 0.0)))
         began = time.monotonic()
         FAULTS[name](robot, link)
         standstill, way = float("nan"), float("nan")
