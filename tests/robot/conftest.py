@@ -68,11 +68,17 @@ def e_series(worker_address):
         yield robot
 
 
-@pytest.fixture
-def worker_address(worker_id) -> str:
+@pytest.fixture(scope="session")
+def own_address(worker_id) -> str:
     """A loopback address of this test process: the client knows no other ports."""
     number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 0
     return f"127.0.0.{11 + number}"
+
+
+@pytest.fixture(scope="session")
+def worker_address(own_address) -> str:
+    """The address of a robot that moves: who uses it is held to wall clocks."""
+    return own_address
 
 
 class Watch:
@@ -108,8 +114,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     and another one than the test asks for.
     """
     for item in items:
-        in_a_process = "worker_address" in getattr(item, "fixturenames", ())
-        if in_a_process or item.path.name == "test_faults.py":
+        if "worker_address" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.real_time)
             item.add_marker(pytest.mark.flaky(
                 reruns=4, condition=Watch.saw_the_machine_stand_still))

@@ -21,27 +21,38 @@ from benchmarks.robot_faults import (
     tared,
 )
 from limber.compiled import cache_folder
-from limber.errors import InputError, LimberError, SafetyStop, WorkError
+from limber.errors import LimberError, SafetyStop
 from limber.progress import SILENT
 from limber.robot.attendant import retreat_if_chosen
-from limber.robot.cell import Cell
 from limber.robot.expected import ExpectedWrench
-from limber.robot.link import COLUMNS, RobotLink
+from limber.robot.link import RobotLink
+from limber.robot.trajectory import Trajectory, along, densely
 
 pytest.importorskip("rtde_control")
 
 
 @pytest.fixture(scope="module")
-def shared_robot(worker_id):
-    number = int(worker_id.removeprefix("gw")) if worker_id.startswith("gw") else 0
-    with new_robot(f"127.0.0.{51 + number}", "ur5e", 5) as robot:
-        yield robot
+def robots(worker_address):
+    """A robot of each series beside each other, started once: their controllers share no port."""
+    host = int(worker_address.split(".")[-1])
+    with (new_robot(f"127.0.0.{host + 20}", "ur5", 3) as cb3,
+          new_robot(f"127.0.0.{host + 40}", "ur5e", 5) as e_series):
+        yield {"ur5": cb3, "ur5e": e_series}
+
+
+def _restored(robot):
+    restored(robot)
+    return robot
 
 
 @pytest.fixture
-def moving_robot(shared_robot):
-    restored(shared_robot)
-    return shared_robot
+def moving_robot(robots):
+    return _restored(robots["ur5e"])
+
+
+@pytest.fixture
+def moving_cb3(robots):
+    return _restored(robots["ur5"])
 
 
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in ENDS_ROBOT])
@@ -78,14 +89,6 @@ def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(moving_ro
         assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
 
 
-def test_a_call_that_never_comes_back_is_told_as_a_safety_stop(moving_robot):
-    """The driver is ended by its deadline before it could say a word."""
-    with RobotLink(cell_for(moving_robot.address)) as link:
-        link.process.send_signal(signal.SIGALRM)
-        with pytest.raises(SafetyStop, match="did not answer its driver"):
-            link.wait("stopped", seconds=5)
-
-
 def test_a_killed_controller_is_reported(worker_address):
     with new_robot(worker_address, "ur5e", 1) as robot:
         assert provoke("controller killed", robot, cell_for(worker_address)).report
@@ -94,29 +97,27 @@ def test_a_killed_controller_is_reported(worker_address):
 def test_a_second_client_is_refused_and_the_first_goes_on(moving_robot):
     cell = cell_for(moving_robot.address)
     with RobotLink(cell) as first:
-        set_off(moving_robot, first, straight(moving_robot, (0.0, 0.2, 0.0)))
+        set_off(moving_robot, first, straight(moving_robot, (0.0, 0.12, 0.0)))
         with pytest.raises(LimberError):
             RobotLink(cell).close()
         assert first.wait("reached", "stopped", seconds=30)["event"] == "reached"
 
 
 @pytest.mark.parametrize("model", ["ur5", "ur5e"])
-def test_a_path_is_followed_within_a_millimetre(model, worker_address):
+def test_a_path_is_followed_within_a_millimetre(model, robots):
     """Two legs at 30 mm/s: distance of the arm from the path, by the arm's own state."""
-    with new_robot(worker_address, model, 2) as robot:
-        from limber.robot.trajectory import Trajectory, along, densely
-
-        start = np.array(robot.state["pose"])
-        poses = densely(np.array([start, start + [0, 0.02, 0, 0, 0, 0],
-                                  start + [0, 0.02, 0.015, 0, 0.05, 0]]))
-        path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
-        rows = []
-        with RobotLink(cell_for(worker_address, model), rows.append) as link:
-            tared(link)
-            assert link.follow(path)["event"] == "reached"
-            back = link.retreat()
-            assert back["event"] == "reached"
-        samples = np.concatenate(rows)
+    robot = _restored(robots[model])
+    start = np.array(robot.state["pose"])
+    poses = densely(np.array([start, start + [0, 0.016, 0, 0, 0, 0],
+                              start + [0, 0.016, 0.012, 0, 0.04, 0]]))
+    path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
+    rows = []
+    with RobotLink(cell_for(robot.address, model), rows.append) as link:
+        tared(link)
+        assert link.follow(path)["event"] == "reached"
+        back = link.retreat()
+        assert back["event"] == "reached"
+    samples = np.concatenate(rows)
     steps = np.diff(samples[:, 0])
     assert np.all(steps > 0)
     assert steps.max() < 1.5 * steps.min()
@@ -129,33 +130,33 @@ def test_a_path_is_followed_within_a_millimetre(model, worker_address):
 def test_pause_at_the_soft_limit_then_resume(moving_robot):
     cell = cell_for(moving_robot.address)
     with RobotLink(cell) as link:
-        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
+        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.06, 0.0), expected=False))
         moving_robot.ask("added_wrench", wrench=[0, 0, 12.0, 0, 0, 0])
         assert "soft force" in link.wait("paused", "stopped", "reached", seconds=5)["reason"]
         time.sleep(0.5)
         assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
-        for force in np.linspace(12, 0, 90):
+        # By 5 % each 30 ms: a force that falls faster is a slip.
+        for force in [*np.geomspace(12, 0.5, 60), 0.0]:
             moving_robot.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
-            time.sleep(0.05)
+            time.sleep(0.03)
         assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
         assert link.resume()["event"] == "reached"
 
 
-def test_a_cb3_is_stopped_without_waiting_for_its_step(worker_address):
+def test_a_cb3_is_stopped_without_waiting_for_its_step(moving_cb3):
     """By the dashboard, whatever the force came with; then it goes back the way it came."""
-    with new_robot(worker_address, "ur5", 3) as robot, RobotLink(
-            cell_for(worker_address, "ur5")) as link:
-        begin = np.array(robot.state["pose"])
-        set_off(robot, link, straight(robot, (0.0, 0.2, 0.0)))
-        robot.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
+    with RobotLink(cell_for(moving_cb3.address, "ur5")) as link:
+        begin = np.array(moving_cb3.state["pose"])
+        set_off(moving_cb3, link, straight(moving_cb3, (0.0, 0.2, 0.0)))
+        moving_cb3.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
         assert "force" in link.wait("stopped", seconds=5)["reason"]
         assert any("wait for a step" in each for each in link.warnings)
-        robot.ask("added_wrench", wrench=[0] * 6)
+        moving_cb3.ask("added_wrench", wrench=[0] * 6)
         time.sleep(0.3)
         assert link.retreat()["event"] == "reached"
         # The program that was uploaded anew is watched like the first.
-        assert robot.state["watchdog_s"] == pytest.approx(0.1)
-        assert np.allclose(robot.state["pose"][:3], begin[:3], atol=1e-4)
+        assert moving_cb3.state["watchdog_s"] == pytest.approx(0.1)
+        assert np.allclose(moving_cb3.state["pose"][:3], begin[:3], atol=1e-4)
 
 
 def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_robot):
@@ -167,7 +168,7 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_
         tared(link)
         link.gripper(close=True)
         link.start(straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
-        time.sleep(1.2)
+        time.sleep(0.9)
         moving_robot.ask("added_wrench", wrench=[0, 0, 14.0, 0, 0, 0])
         assert "soft force" in link.wait("paused", "stopped", seconds=5)["reason"]
         paused = moving_robot.state
@@ -240,14 +241,6 @@ def test_after_a_stop_only_a_choice_moves_it(moving_robot):
         assert np.allclose(moving_robot.state["pose"][:3], line.poses[0, :3], atol=1e-4)
 
 
-def test_a_path_that_starts_elsewhere_is_refused(moving_robot):
-    line = straight(moving_robot, (0.0, 0.1, 0.0))
-    moved = type(line)(line.times, line.poses + [0, 0, 0.02, 0, 0, 0], line.expected)
-    with RobotLink(cell_for(moving_robot.address)) as link:
-        with pytest.raises(SafetyStop, match=r"starts 20\.0 mm"):
-            link.start(moved)
-
-
 def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
     """Samples of 1.5 s would fill its pipe four times over: the motion goes on to its end."""
     stalled, taken = threading.Event(), []
@@ -265,49 +258,3 @@ def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
         time.sleep(0.1)
     clock = np.concatenate(taken)[:, 0]
     assert np.diff(clock) == pytest.approx(np.full(len(clock) - 1, 0.002), abs=1e-5)
-
-
-@pytest.mark.parametrize("action, values, error, told", [
-    ("local", {}, SafetyStop, "remote control"),
-    ("slider", {"value": 0.0}, SafetyStop, "slider"),
-    ("protective_stop", {}, SafetyStop, "not ready"),
-    ("silent", {"value": True}, WorkError, "does not answer"),
-])
-def test_a_robot_that_cannot_be_moved_is_refused(moving_robot, action, values, error, told):
-    moving_robot.ask(action, **values)
-    try:
-        with pytest.raises(error, match=told):
-            RobotLink(cell_for(moving_robot.address)).close()
-    finally:
-        moving_robot.ask("slider", value=1.0)
-        restored(moving_robot)
-
-
-def test_the_wrong_robot_is_refused(moving_robot):
-    for model, told in (("ur10e", "says that it is a UR5"), ("ur5", "different series")):
-        cell = Cell(robot={"model": model, "address": moving_robot.address},
-                    base={"pose": (0,) * 6})
-        with pytest.raises(InputError, match=told):
-            RobotLink(cell).close()
-
-
-def test_another_version_than_the_calibrated_one_is_refused(moving_robot):
-    cell = cell_for(moving_robot.address)
-    other = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": "5.4.1"})})
-    with pytest.raises(InputError, match=r"calibrated with 5\.4\.1"):
-        RobotLink(other).close()
-
-
-def test_the_last_sample_is_had_from_the_link(moving_robot):
-    """Not from who takes samples, who may not have listened yet when one came."""
-    with RobotLink(cell_for(moving_robot.address), lambda _rows: None) as link:
-        row = link.wait_for_samples()
-    assert row.shape == (len(COLUMNS),)
-    assert np.allclose(row[1:4], moving_robot.state["pose"][:3], atol=1e-4)
-
-
-def test_nobody_at_the_address_is_told_soon():
-    begin = time.monotonic()
-    with pytest.raises(WorkError, match="No robot answers"):
-        RobotLink(cell_for("127.0.0.99")).close()
-    assert time.monotonic() - begin < 20

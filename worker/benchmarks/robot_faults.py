@@ -155,7 +155,8 @@ def provoke(name: str, robot: VirtualRobot, cell: Cell, seconds: float = 3.0) ->
 def restored(robot: VirtualRobot) -> None:
     """Bring a robot back to where a fault found it, as a person at its pendant would."""
     for action, values in (("silent", False), ("delay", 0.0), ("frozen_sensor", False),
-                           ("sensor_nan", False), ("clock_jump", 0.0)):
+                           ("sensor_nan", False), ("clock_jump", 0.0), ("slider", 1.0),
+                           ("outputs", 0)):
         robot.ask(action, value=values)
     robot.ask("added_wrench", wrench=[0.0] * 6)
     robot.ask("unlock")

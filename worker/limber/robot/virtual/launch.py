@@ -221,8 +221,6 @@ def _set(target: str, name: str) -> Callable:
     return action
 
 
-
-
 ACTIONS: dict[str, Callable[..., Any]] = {
     "state": lambda server: None,
     "cut": lambda server: server.cut(),
@@ -233,6 +231,7 @@ ACTIONS: dict[str, Callable[..., Any]] = {
     "added_wrench": _set_force,
     "clock_jump": _set("controller", "clock_offset"),
     "slider": _set("controller", "slider"),
+    "outputs": _set("controller", "digital_outputs"),
     "protective_stop": lambda server: server.controller.protective_stop("test"),
     "unlock": lambda server: server.controller.unlock(),
     "emergency_stop": lambda server: server.controller.emergency_stop(),

@@ -1,0 +1,92 @@
+"""A robot that is not moved: what is refused before, and what a link tells of one that stands.
+
+Nothing here depends on clocks, so these tests run beside others.
+"""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.robot_faults import cell_for, new_robot, restored, straight
+from limber.errors import InputError, SafetyStop, WorkError
+from limber.robot.cell import Cell
+from limber.robot.link import COLUMNS, RobotLink
+
+pytest.importorskip("rtde_control")
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def shared_robot(own_address):
+    with new_robot(own_address, "ur5e", 5) as robot:
+        yield robot
+
+
+@pytest.fixture
+def resting_robot(shared_robot):
+    restored(shared_robot)
+    return shared_robot
+
+
+def test_a_call_that_never_comes_back_is_told_as_a_safety_stop(resting_robot):
+    """The driver is ended by its deadline before it could say a word."""
+    with RobotLink(cell_for(resting_robot.address)) as link:
+        link.process.send_signal(signal.SIGALRM)
+        with pytest.raises(SafetyStop, match="did not answer its driver"):
+            link.wait("stopped", seconds=5)
+
+
+def test_a_path_that_starts_elsewhere_is_refused(resting_robot):
+    line = straight(resting_robot, (0.0, 0.1, 0.0))
+    moved = type(line)(line.times, line.poses + [0, 0, 0.02, 0, 0, 0], line.expected)
+    with RobotLink(cell_for(resting_robot.address)) as link:
+        with pytest.raises(SafetyStop, match=r"starts 20\.0 mm"):
+            link.start(moved)
+
+
+@pytest.mark.parametrize("action, values, error, told", [
+    ("local", {}, SafetyStop, "remote control"),
+    ("slider", {"value": 0.0}, SafetyStop, "slider"),
+    ("protective_stop", {}, SafetyStop, "not ready"),
+    ("silent", {"value": True}, WorkError, "does not answer"),
+])
+def test_a_robot_that_cannot_be_moved_is_refused(resting_robot, action, values, error, told):
+    resting_robot.ask(action, **values)
+    try:
+        with pytest.raises(error, match=told):
+            RobotLink(cell_for(resting_robot.address)).close()
+    finally:
+        resting_robot.ask("slider", value=1.0)
+        restored(resting_robot)
+
+
+def test_the_wrong_robot_is_refused(resting_robot):
+    for model, told in (("ur10e", "says that it is a UR5"), ("ur5", "different series")):
+        cell = Cell(robot={"model": model, "address": resting_robot.address},
+                    base={"pose": (0,) * 6})
+        with pytest.raises(InputError, match=told):
+            RobotLink(cell).close()
+
+
+def test_another_version_than_the_calibrated_one_is_refused(resting_robot):
+    cell = cell_for(resting_robot.address)
+    other = cell.model_copy(update={"robot": cell.robot.model_copy(update={"version": "5.4.1"})})
+    with pytest.raises(InputError, match=r"calibrated with 5\.4\.1"):
+        RobotLink(other).close()
+
+
+def test_the_last_sample_is_had_from_the_link(resting_robot):
+    """Not from who takes samples, who may not have listened yet when one came."""
+    with RobotLink(cell_for(resting_robot.address), lambda _rows: None) as link:
+        row = link.wait_for_samples()
+    assert row.shape == (len(COLUMNS),)
+    assert np.allclose(row[1:4], resting_robot.state["pose"][:3], atol=1e-4)
+
+
+def test_nobody_at_the_address_is_told_soon():
+    begin = time.monotonic()
+    with pytest.raises(WorkError, match="No robot answers"):
+        RobotLink(cell_for("127.0.0.99")).close()
+    assert time.monotonic() - begin < 20
