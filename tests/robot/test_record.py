@@ -12,6 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from benchmarks.robot_faults import restored
+from limber.cli import command_of
 from limber.errors import BranchFolderError, InputError, NoPathError, SafetyStop, WorkError
 from limber.progress import SILENT
 from limber.recordings.recording import read_pull
@@ -21,6 +23,7 @@ from limber.robot.recorder import MarkerStream, PullRecorder, known_errors
 from limber.stages.loading import load_skeleton
 from limber.stages.record import RecordOptions, RecordSettings, record
 from limber.stages.record_way import suggested_pull, there_and_back, way_on_arc, way_through
+from limber.stages.registry import stage_description
 from limber.store import Branch
 
 pytest.importorskip("rtde_control")
@@ -34,19 +37,29 @@ def sideways_pull(branch_folder, **changes) -> RecordSettings:
                              "pause": 0.2, "shape": "straight", **changes})
 
 
-def recorded(branch_folder, tmp_path, address, name="robot-1", **options):
-    branch = Branch.open(branch_folder)
-    cell = standing_at(branch, address)
-    path = cell_file(cell, tmp_path)
-    with robot_holding(branch, cell, tmp_path) as robot:
-        result = record(branch_folder, path, name, sideways_pull(branch_folder),
-                        RecordOptions(confirm=name, markers=MARKERS, **options))
-    return result, robot
+def cell_at(branch_folder, address, **limits) -> Cell:
+    return standing_at(Branch.open(branch_folder), address, grip_seconds=0.4, **limits)
 
 
-def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, worker_address):
+@pytest.fixture(scope="module")
+def shared_robot(branch_template, worker_address, tmp_path_factory):
+    """With the branch between its jaws; every test's folder is a copy of that branch's."""
+    cell = cell_at(branch_template, worker_address)
+    with robot_holding(Branch.open(branch_template), cell, tmp_path_factory.mktemp("truth")) as it:
+        yield it
+
+
+@pytest.fixture
+def robot(shared_robot):
+    restored(shared_robot)
+    return shared_robot
+
+
+def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, robot):
     """No sample lost; the piece goes out and back; force rises and falls; markers beside it."""
-    result, _ = recorded(branch_folder, tmp_path, worker_address)
+    path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
+    result = record(branch_folder, path, "robot-1", sideways_pull(branch_folder),
+                    RecordOptions(confirm="robot-1", markers=MARKERS))
     assert result["ended"] == "reached" and result["marker_frames"] > 5
     pull = read_pull(branch_folder / "pulls" / "robot-1")
     assert np.diff(pull.times) == pytest.approx(np.full(len(pull.times) - 1, 0.002), abs=1e-5)
@@ -64,8 +77,8 @@ def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, worker_
     assert seen.positions[-1] == pytest.approx(seen.positions[0], abs=3e-3)
 
 
-def test_nothing_moves_without_a_typed_name(branch_folder, tmp_path, worker_address):
-    path = cell_file(standing_at(Branch.open(branch_folder), worker_address), tmp_path)
+def test_nothing_moves_without_a_typed_name(branch_folder, tmp_path):
+    path = cell_file(standing_at(Branch.open(branch_folder), "127.0.0.98"), tmp_path)
     for confirm in (None, "something"):
         with pytest.raises(InputError, match="Nobody confirmed"):
             record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm=confirm))
@@ -81,75 +94,66 @@ def test_a_recording_that_never_began_leaves_nothing(branch_folder, tmp_path):
     assert Branch.open(branch_folder).streams() == []
 
 
-def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path, worker_address):
-    cell = standing_at(Branch.open(branch_folder), worker_address)
+def test_a_cell_of_another_branch_is_refused(branch_folder, tmp_path):
+    cell = standing_at(Branch.open(branch_folder), "127.0.0.98")
     path = cell_file(cell.model_copy(update={"branch": "another"}), tmp_path)
     with pytest.raises(InputError, match="calibrated for branch another"):
         record(branch_folder, path, "r", RecordSettings(), RecordOptions(confirm="r"))
 
 
-def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, worker_address):
+def test_a_stop_keeps_what_was_recorded(branch_folder, tmp_path, robot):
     """A force limit that the pull breaks: exit 4, a recording that says where it ended."""
-    branch = Branch.open(branch_folder)
-    cell = standing_at(branch, worker_address, soft_force_n=1.0, hard_force_n=1.2)
-    path = cell_file(cell, tmp_path)
-    with robot_holding(branch, cell, tmp_path) as robot:
-        with pytest.raises(SafetyStop, match=r"force limit.*samples are in"):
-            record(branch_folder, path, "stopped", sideways_pull(branch_folder),
-                   RecordOptions(confirm="stopped"))
-        assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    cell = cell_at(branch_folder, robot.address, soft_force_n=1.0, hard_force_n=1.2)
+    with pytest.raises(SafetyStop, match=r"force limit.*samples are in"):
+        record(branch_folder, cell_file(cell, tmp_path), "stopped", sideways_pull(branch_folder),
+               RecordOptions(confirm="stopped"))
+    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
     found = Branch.open(branch_folder).manifest.stages["record:stopped"].result
     assert "force limit" in found["ended"] and found["sample_count"] > 100
     assert read_pull(branch_folder / "pulls" / "stopped").entry.observation == "none"
 
 
 def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folder, tmp_path,
-                                                                   worker_address):
+                                                                   robot, capfd):
     """Along its axis a branch is stiff: 30 N within a millimetre or two, and more on the way."""
-    branch = Branch.open(branch_folder)
-    cell = standing_at(branch, worker_address)
-    skeleton = load_skeleton(branch)
+    skeleton = load_skeleton(Branch.open(branch_folder))
     axis = skeleton.point_at(0.92) - skeleton.point_at(0.87)
-    with robot_holding(branch, cell, tmp_path) as robot:
-        done = subprocess.run(
-            [sys.executable, "-m", "limber", "record", str(branch_folder), "--cell",
-             str(cell_file(cell, tmp_path)), "--name", "stiff", "--confirm", "stiff",
+    path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        command_of(stage_description("record"), "").main(
+            [str(branch_folder), "--cell", str(path), "--name", "stiff", "--confirm", "stiff",
              "--after-stop", "retreat", "--shape", "straight", "--direction", *map(str, axis),
-             "--distance", "0.03", "--speed", "0.005", "--json"],
-            capture_output=True, check=False, text=True, timeout=100)
-        state = robot.state
-    told = json.loads(done.stdout.splitlines()[-1])
-    assert done.returncode == 4, (told, done.stderr, state)
+             "--distance", "0.03", "--speed", "0.005", "--json"], standalone_mode=False)
+    out, errors = capfd.readouterr()
+    told = json.loads(out.splitlines()[-1])
+    assert stop.value.code == 4, (told, errors, robot.state)
     assert "force limit" in told["ended"] and told["peak_force_n"] > 30
     after = told["after_stop"]
     assert after["choice"] == "retreat" and after["retreated"] and not after["gripper_opened"]
     assert after["force_n"] < 3
-    assert after["outcome"] in told["error"] and after["outcome"] in done.stderr
+    assert after["outcome"] in told["error"] and after["outcome"] in errors
 
 
-def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, worker_address):
+def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, robot):
     """kill -9 in the middle: the arm stops, all but the last second is there afterwards."""
     branch = Branch.open(branch_folder)
-    cell = standing_at(branch, worker_address)
-    path = cell_file(cell, tmp_path)
-    with robot_holding(branch, cell, tmp_path) as robot:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "limber", "record", str(branch_folder), "--cell", str(path),
-             "--name", "cut", "--confirm", "cut", "--direction",
-             *(str(x) for x in sideways(branch)),
-             "--distance", "0.03", "--speed", "0.006", "--json"],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        end = time.monotonic() + 60
-        while np.linalg.norm(robot.state["tool_speed"][:3]) < 2e-3:
-            assert time.monotonic() < end and process.poll() is None, process.stdout.read()
-            time.sleep(0.02)
-        begin = robot.state["clock"]
-        time.sleep(2.5)
-        killed = robot.state["clock"]
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        time.sleep(1.0)
-        assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
+    path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "limber", "record", str(branch_folder), "--cell", str(path),
+         "--name", "cut", "--confirm", "cut", "--direction", *(str(x) for x in sideways(branch)),
+         "--distance", "0.03", "--speed", "0.006", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    end = time.monotonic() + 60
+    while np.linalg.norm(robot.state["tool_speed"][:3]) < 2e-3:
+        assert time.monotonic() < end and process.poll() is None, process.stdout.read()
+        time.sleep(0.02)
+    begin = robot.state["clock"]
+    time.sleep(2.0)
+    killed = robot.state["clock"]
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    time.sleep(0.5)
+    assert np.linalg.norm(robot.state["tool_speed"]) < 1e-3
     branch = Branch.open(branch_folder)
     assert "pulls/cut/robot.csv" in branch.streams()
     result = record(branch_folder, path, "cut", RecordSettings(), RecordOptions(recover=True))
