@@ -1,5 +1,6 @@
 """A path as motion of a robot, and `limber execute` on the virtual robot that holds the branch."""
 
+import shutil
 import time
 
 import numpy as np
@@ -7,16 +8,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robot_cells import cell_file, robot_holding, sideways, standing_at
+from benchmarks.robot_faults import restored
 from limber.errors import InputError, NoPathError, SafetyStop
 from limber.mechanics.status import Status
 from limber.progress import Progress
+from limber.robot.arms import ARMS
 from limber.robot.belonging import check_plan
 from limber.robot.calibration import fit_base
-from limber.robot.cell import Cell
+from limber.robot.cell import ApproachEntry, Cell
 from limber.robot.execution import across, followed, robot_motion
 from limber.robot.expected import Predicted
-from limber.robot.kinematics import forward, inverted, matrices, pose_vectors
-from limber.robot.virtual.controller import HOME
+from limber.robot.kinematics import forward, inverse, inverted, matrices, pose_vectors
 from limber.stages.execute import (
     ExecuteOptions,
     ExecuteSettings,
@@ -169,17 +171,15 @@ def planned_in(folder, force: float = 1.5) -> None:
         stage.path("plans/path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-@pytest.fixture
-def planned_folder(branch_template, tmp_path):
+@pytest.fixture(scope="module")
+def planned_template(branch_template, tmp_path_factory):
     """The small branch with its true moduli in the mesh, and a plan."""
-    import shutil
-
     from limber.estimation.virtual_pull import VirtualPullSettings
     from limber.mechanics.young_field import young_weights
     from limber.stages.loading import load_mesh
     from limber.stages.virtual_pull import load_truth
 
-    folder = shutil.copytree(branch_template, tmp_path / "planned.branch")
+    folder = shutil.copytree(branch_template, tmp_path_factory.mktemp("plans") / "planned.branch")
     branch = Branch.open(folder)
     truth = load_truth(branch, VirtualPullSettings())
     mesh = load_mesh(branch)
@@ -191,6 +191,11 @@ def planned_folder(branch_template, tmp_path):
                        ).write(stage.path("mesh.vtu"))
     planned_in(folder)
     return folder
+
+
+@pytest.fixture
+def planned_folder(planned_template, tmp_path):
+    return shutil.copytree(planned_template, tmp_path / "planned.branch")
 
 
 @pytest.mark.slow
@@ -299,32 +304,60 @@ def test_a_plan_for_another_robot_branch_or_base_is_refused(changes, told):
         check_plan(made_for | changes, cell)
 
 
-def armed(planned_folder, tmp_path, address, *, unexpected: float, stands=None):
-    """Execute the plan; the arm stands with its start's joints, or those of ``stands`` [rad, 6]."""
-    pytest.importorskip("rtde_control")
-    branch = Branch.open(planned_folder)
-    # The gripper stands where the approach begins, and comes as the cell's robot was put.
-    back = Cell(robot={"model": "ur5e"}, base={"pose": (0,) * 6}).approach.distance_m
-    cell = standing_at(branch, address, fraction=FRACTION, back=back, unexpected_force_n=unexpected,
-                       soft_force_n=15.0, hard_force_n=20.0)
-    skeleton = load_skeleton(branch)
+APPROACH = ApproachEntry(distance_m=0.03)
+
+
+def cell_before(folder, address, **limits) -> Cell:
+    """The gripper stands where the approach begins, and comes as the cell's robot was put."""
+    cell = standing_at(Branch.open(folder), address, fraction=FRACTION, back=APPROACH.distance_m,
+                       grip_seconds=0.4, soft_force_n=15.0, hard_force_n=20.0, **limits)
+    return cell.model_copy(update={"approach": APPROACH})
+
+
+@pytest.fixture(scope="module")
+def motion_settings(planned_template):
+    skeleton = load_skeleton(Branch.open(planned_template))
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
-    settings = ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
-    path = cell_file(cell, tmp_path)
-    dry = execute(planned_folder, "path", path, settings, ExecuteOptions())
-    joints = dry["start_joints_rad"] if stands is None else stands(dry["start_joints_rad"])
-    with robot_holding(branch, cell, tmp_path) as robot:
+    return ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
+
+
+@pytest.fixture(scope="module")
+def start_joints(planned_template, motion_settings, worker_address, tmp_path_factory):
+    """Where a dry run says that the arm has to stand [rad, 6]."""
+    path = cell_file(cell_before(planned_template, worker_address), tmp_path_factory.mktemp("dry"))
+    dry = execute(planned_template, "path", path, motion_settings, ExecuteOptions())
+    return np.array(dry["start_joints_rad"])
+
+
+@pytest.fixture(scope="module")
+def robot(planned_template, worker_address, tmp_path_factory):
+    """With the branch before its gripper; every test's folder is a copy of that branch's."""
+    pytest.importorskip("rtde_control")
+    cell = cell_before(planned_template, worker_address)
+    with robot_holding(Branch.open(planned_template), cell, tmp_path_factory.mktemp("truth")) as it:
+        yield it
+
+
+@pytest.fixture
+def armed(planned_folder, tmp_path, robot, motion_settings, start_joints):
+    """Execute the plan; the arm stands with its start's joints, or those of ``stands`` [rad, 6]."""
+    def run(*, unexpected: float, stands=None):
+        path = cell_file(cell_before(planned_folder, robot.address, unexpected_force_n=unexpected),
+                         tmp_path)
+        restored(robot)
+        joints = start_joints if stands is None else stands(start_joints)
         robot.ask("stand", joints=list(map(float, joints)))
         try:
-            result = execute(planned_folder, "path", path, settings,
+            result = execute(planned_folder, "path", path, motion_settings,
                              ExecuteOptions(arm=True, confirm="path"))
         except SafetyStop:
             _require_a_true_branch(robot.state)
             raise
         time.sleep(0.2)
         state = robot.state
-    _require_a_true_branch(state)
-    return result, state
+        _require_a_true_branch(state)
+        return result, state
+    return run
 
 
 def _require_a_true_branch(state) -> None:
@@ -334,10 +367,9 @@ def _require_a_true_branch(state) -> None:
         pytest.skip(f"the virtual branch was solved too slowly here: its force was {off:.1f} N off")
 
 
-def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_folder, tmp_path,
-                                                                       worker_address):
+def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_folder, armed):
     """Approach, hold, follow, return, let go; the force as predicted on another mesh, noise on."""
-    result, state = armed(planned_folder, tmp_path, worker_address, unexpected=3.0)
+    result, state = armed(unexpected=3.0)
     assert result["force_within_share"] > 0.95, state
     assert result["predicted_force_sigma_n"] < 1.0
     assert result["reached"] and result["path_error_m"] < 1e-3
@@ -346,24 +378,28 @@ def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_
     assert np.linalg.norm(np.subtract(state["pose"][:3], result["start_pose_base"][:3])) < 1e-3
 
 
-def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, tmp_path,
-                                                            worker_address):
+def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, armed):
     """An allowance within the sensor's noise is passed: exit 4, a report, far below the limit."""
     with pytest.raises(SafetyStop, match="stopped"):
-        armed(planned_folder, tmp_path, worker_address, unexpected=0.2)
+        armed(unexpected=0.2)
     found = Branch.open(planned_folder).manifest.stages["execute:path"].result
     assert not found["reached"] and found["stop_reason"]
     assert found["peak_force_n"] is None or found["peak_force_n"] < 10
 
 
+def by_another_branch(joints: np.ndarray) -> np.ndarray:
+    """Elbow and wrist the other way, the gripper at the same pose."""
+    arm = ARMS["ur5e"]
+    return inverse(arm, forward(arm, joints))[0]
+
+
 @pytest.mark.parametrize("stands, told", [
-    (lambda joints: HOME, r"joint 3 \(elbow\) is at 90\.0 degrees, and 54\.0 was expected"),
+    (by_another_branch, r"joint 3 \(elbow\) is at 54\.0 degrees, and 90\.0 was expected"),
     (lambda joints: joints + np.r_[np.zeros(5), np.radians(50)],
      r"turned by 50\.0 degrees.*joint 6 \(wrist 3\)")])
-def test_an_arm_in_another_configuration_does_not_move(planned_folder, tmp_path, worker_address,
-                                                       stands, told):
+def test_an_arm_in_another_configuration_does_not_move(planned_folder, armed, stands, told):
     """At the start's pose by another branch; at its place, with the wrist turned."""
     with pytest.raises(SafetyStop, match=told) as stop:
-        armed(planned_folder, tmp_path, worker_address, unexpected=3.0, stands=stands)
+        armed(unexpected=3.0, stands=stands)
     assert "start_joints_rad" in str(stop.value)
     assert "execute:path" not in Branch.open(planned_folder).manifest.stages

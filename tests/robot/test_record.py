@@ -58,7 +58,7 @@ def robot(shared_robot):
 def test_a_recorded_pull_is_what_the_branch_did(branch_folder, tmp_path, robot):
     """No sample lost; the piece goes out and back; force rises and falls; markers beside it."""
     path = cell_file(cell_at(branch_folder, robot.address), tmp_path)
-    result = record(branch_folder, path, "robot-1", sideways_pull(branch_folder),
+    result = record(branch_folder, path, "robot-1", sideways_pull(branch_folder, speed=0.02),
                     RecordOptions(confirm="robot-1", markers=MARKERS))
     assert result["ended"] == "reached" and result["marker_frames"] > 5
     pull = read_pull(branch_folder / "pulls" / "robot-1")
@@ -148,7 +148,7 @@ def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, robot):
         assert time.monotonic() < end and process.poll() is None, process.stdout.read()
         time.sleep(0.02)
     begin = robot.state["clock"]
-    time.sleep(2.0)
+    time.sleep(1.6)
     killed = robot.state["clock"]
     process.send_signal(signal.SIGKILL)
     process.wait()
