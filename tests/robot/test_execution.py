@@ -318,22 +318,23 @@ def cell_before(folder, address, **limits) -> Cell:
 def motion_settings(planned_template):
     skeleton = load_skeleton(Branch.open(planned_template))
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
-    return ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), hold=0.5)
+    return ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), speed=0.05,
+                           hold=0.5)
 
 
 @pytest.fixture(scope="module")
-def start_joints(planned_template, motion_settings, worker_address, tmp_path_factory):
+def start_joints(planned_template, motion_settings, own_address, tmp_path_factory):
     """Where a dry run says that the arm has to stand [rad, 6]."""
-    path = cell_file(cell_before(planned_template, worker_address), tmp_path_factory.mktemp("dry"))
+    path = cell_file(cell_before(planned_template, own_address), tmp_path_factory.mktemp("dry"))
     dry = execute(planned_template, "path", path, motion_settings, ExecuteOptions())
     return np.array(dry["start_joints_rad"])
 
 
 @pytest.fixture(scope="module")
-def robot(planned_template, worker_address, tmp_path_factory):
+def robot(planned_template, own_address, tmp_path_factory):
     """With the branch before its gripper; every test's folder is a copy of that branch's."""
     pytest.importorskip("rtde_control")
-    cell = cell_before(planned_template, worker_address)
+    cell = cell_before(planned_template, own_address)
     with robot_holding(Branch.open(planned_template), cell, tmp_path_factory.mktemp("truth")) as it:
         yield it
 
@@ -367,6 +368,7 @@ def _require_a_true_branch(state) -> None:
         pytest.skip(f"the virtual branch was solved too slowly here: its force was {off:.1f} N off")
 
 
+@pytest.mark.real_time
 def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_folder, armed):
     """Approach, hold, follow, return, let go; the force as predicted on another mesh, noise on."""
     result, state = armed(unexpected=3.0)
@@ -378,6 +380,7 @@ def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_
     assert np.linalg.norm(np.subtract(state["pose"][:3], result["start_pose_base"][:3])) < 1e-3
 
 
+@pytest.mark.real_time
 def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, armed):
     """An allowance within the sensor's noise is passed: exit 4, a report, far below the limit."""
     with pytest.raises(SafetyStop, match="stopped"):
@@ -393,6 +396,7 @@ def by_another_branch(joints: np.ndarray) -> np.ndarray:
     return inverse(arm, forward(arm, joints))[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stands, told", [
     (by_another_branch, r"joint 3 \(elbow\) is at 54\.0 degrees, and 90\.0 was expected"),
     (lambda joints: joints + np.r_[np.zeros(5), np.radians(50)],

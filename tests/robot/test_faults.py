@@ -97,7 +97,7 @@ def test_a_killed_controller_is_reported(worker_address):
 def test_a_second_client_is_refused_and_the_first_goes_on(moving_robot):
     cell = cell_for(moving_robot.address)
     with RobotLink(cell) as first:
-        set_off(moving_robot, first, straight(moving_robot, (0.0, 0.12, 0.0)))
+        set_off(moving_robot, first, straight(moving_robot, (0.0, 0.1, 0.0)))
         with pytest.raises(LimberError):
             RobotLink(cell).close()
         assert first.wait("reached", "stopped", seconds=30)["event"] == "reached"
@@ -108,8 +108,8 @@ def test_a_path_is_followed_within_a_millimetre(model, robots):
     """Two legs at 30 mm/s: distance of the arm from the path, by the arm's own state."""
     robot = _restored(robots[model])
     start = np.array(robot.state["pose"])
-    poses = densely(np.array([start, start + [0, 0.016, 0, 0, 0, 0],
-                              start + [0, 0.016, 0.012, 0, 0.04, 0]]))
+    poses = densely(np.array([start, start + [0, 0.012, 0, 0, 0, 0],
+                              start + [0, 0.012, 0.009, 0, 0.03, 0]]))
     path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
     rows = []
     with RobotLink(cell_for(robot.address, model), rows.append) as link:
@@ -242,17 +242,17 @@ def test_after_a_stop_only_a_choice_moves_it(moving_robot):
 
 
 def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
-    """Samples of 1.5 s would fill its pipe four times over: the motion goes on to its end."""
+    """Samples of 0.8 s would fill its pipe twice over: the motion goes on to its end."""
     stalled, taken = threading.Event(), []
 
     def take(rows: np.ndarray) -> None:
         if stalled.is_set():
             stalled.clear()
-            time.sleep(1.5)
+            time.sleep(0.8)
         taken.append(rows)
     with RobotLink(cell_for(moving_robot.address), take) as link:
         tared(link)
-        link.start(straight(moving_robot, (0.0, 0.09, 0.0)))
+        link.start(straight(moving_robot, (0.0, 0.06, 0.0)))
         stalled.set()
         assert link.wait("reached", "stopped", seconds=30)["event"] == "reached"
         time.sleep(0.1)

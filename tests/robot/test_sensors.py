@@ -156,13 +156,13 @@ def test_torn_messages_are_dropped(text, good):
     assert (parsed_message(text) is not None) == good
 
 
-def test_ft300_messages_in_any_pieces(worker_address):
+def test_ft300_messages_in_any_pieces(own_address):
     """A hundred messages cut at random places; the last whole one is the reading."""
     sent = [f"( {k} , {-k} , 3.0 , 0.1 , 0.2 , 0.3 )" for k in range(100)]
     data, rng = "".join(sent).encode(), np.random.default_rng(0)
     cuts = np.sort(rng.choice(len(data), 60, replace=False))
-    with socket.create_server((worker_address, FT300_PORT)) as server:
-        cell = Cell(robot={"model": "ur5", "address": worker_address}, base={"pose": (0,) * 6},
+    with socket.create_server((own_address, FT300_PORT)) as server:
+        cell = Cell(robot={"model": "ur5", "address": own_address}, base={"pose": (0,) * 6},
                     sensor={"kind": "ft300"})
         sensor = Ft300Sensor(cell)
         peer, _ = server.accept()
@@ -214,8 +214,8 @@ def test_without_a_sensor_nothing_is_moved():
         open_sensor(cb3)
 
 
-def test_a_missing_ft300_is_told(worker_address):
-    cell = Cell(robot={"model": "ur5", "address": worker_address}, base={"pose": (0,) * 6},
+def test_a_missing_ft300_is_told(own_address):
+    cell = Cell(robot={"model": "ur5", "address": own_address}, base={"pose": (0,) * 6},
                 sensor={"kind": "ft300"})
     with pytest.raises(WorkError, match="63351"):
         open_sensor(cell)

@@ -116,15 +116,16 @@ def test_it_listens_on_loopback_only():
         Server(Controller("ur5e"), "0.0.0.0")
 
 
-def test_a_taken_port_is_told(worker_address):
-    with socket.create_server((worker_address, RTDE_PORT)):
+def test_a_taken_port_is_told(own_address):
+    with socket.create_server((own_address, RTDE_PORT)):
         with pytest.raises(WorkError, match="30004"):
-            asyncio.run(Server(Controller("ur5e"), worker_address).open())
+            asyncio.run(Server(Controller("ur5e"), own_address).open())
 
 
-def test_a_second_robot_on_the_same_address_is_refused(e_series):
-    with pytest.raises(WorkError, match="cannot be opened"):
-        VirtualRobot("ur5e", e_series.address)
+@pytest.mark.slow
+def test_a_second_robot_on_the_same_address_is_refused(own_address):
+    with VirtualRobot("ur5e", own_address), pytest.raises(WorkError, match="cannot be opened"):
+        VirtualRobot("ur5e", own_address)
 
 
 rtde_control = pytest.importorskip("rtde_control")
@@ -242,8 +243,9 @@ def test_the_ft300_stream_is_what_robotiq_sends(worker_address):
     assert rows[:, 2].mean() == pytest.approx(40.0, abs=10.0)
 
 
-def test_the_process_ends_with_its_parents_pipe(worker_address):
-    robot = VirtualRobot("ur5e", worker_address)
+@pytest.mark.slow
+def test_the_process_ends_with_its_parents_pipe(own_address):
+    robot = VirtualRobot("ur5e", own_address)
     robot.process.stdin.close()
     assert robot.process.wait(5.0) == 0
     robot.close()

@@ -19,7 +19,7 @@ from limber.robot.virtual.launch import VirtualRobot
 from limber.robot.virtual.server import SCRIPT_PORT
 
 STILL_M_S = 1e-4
-_TARE_SECONDS = 0.2  # 25 readings of a CB3, 100 of an e-Series arm
+_TARE_READINGS = 50
 _AT_SPEED = 0.97  # of the trajectory's: it comes near to it slowly at the end
 _START_SECONDS = 10.0
 
@@ -96,7 +96,7 @@ def straight(robot: VirtualRobot, way: tuple[float, float, float], speed: float 
 def tared(link: RobotLink) -> None:
     """Tare the sensor as soon as the robot tells how it stands."""
     link.wait_for_samples()
-    link.tare(_TARE_SECONDS)
+    link.tare(_TARE_READINGS / link.facts["rate_hz"])
 
 
 def set_off(robot: VirtualRobot, link: RobotLink, trajectory: Trajectory) -> dict[str, Any]:
