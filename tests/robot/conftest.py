@@ -1,13 +1,14 @@
 """A virtual controller stepped by hand, and one in a process with the real client on it."""
 
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from benchmarks.held_up import HELD_UP_SECONDS, Witness
+from benchmarks.robot_faults import new_robot, restored
 from limber.robot.virtual.controller import Controller
-from limber.robot.virtual.launch import VirtualRobot
 
 
 class Registers:
@@ -54,18 +55,48 @@ def registers():
     return Registers(Controller("ur5e", seed=3))
 
 
-@pytest.fixture(params=["ur5", "ur5e"])
-def robot(request, worker_address):
-    """A virtual robot of each series in a process of its own."""
-    with VirtualRobot(request.param, worker_address) as robot:
-        yield robot
+@pytest.fixture(scope="module")
+def robots(worker_address):
+    """A virtual robot of each series in a process of its own; the CB3 has an FT300."""
+    host = int(worker_address.split(".")[-1])
+    with (new_robot(f"127.0.0.{host + 20}", "ur5", 3) as cb3,
+          new_robot(f"127.0.0.{host + 40}", "ur5e", 5) as e_series):
+        yield {"ur5": cb3, "ur5e": e_series}
 
 
 @pytest.fixture
-def e_series(worker_address):
-    """A virtual UR5e in a process of its own."""
-    with VirtualRobot("ur5e", worker_address) as robot:
-        yield robot
+def cb3(robots):
+    """The UR5, as a test before has not left it."""
+    restored(robots["ur5"])
+    return robots["ur5"]
+
+
+@pytest.fixture
+def e_series(robots):
+    """The UR5e, as a test before has not left it."""
+    restored(robots["ur5e"])
+    return robots["ur5e"]
+
+
+@pytest.fixture(params=["ur5", "ur5e"])
+def robot(request, robots):
+    """Each of the two."""
+    return request.getfixturevalue({"ur5": "cb3", "ur5e": "e_series"}[request.param])
+
+
+@contextmanager
+def let_go(*interfaces):
+    """Interfaces of ur-rtde that are dropped afterwards, before their robot ends.
+
+    Each disconnects then, in half a second; one that was asked to takes another half. Where a test
+    fails its traceback keeps them.
+    """
+    try:
+        yield
+    except BaseException:
+        for each in interfaces:
+            each.disconnect()
+        raise
 
 
 @pytest.fixture(scope="session")

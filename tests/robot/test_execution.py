@@ -319,7 +319,7 @@ def motion_settings(planned_template):
     skeleton = load_skeleton(Branch.open(planned_template))
     axis = skeleton.point_at(FRACTION) - skeleton.point_at(FRACTION - 0.05)
     return ExecuteSettings(gripper_rotation=tuple(map(float, across(axis)[0])), speed=0.05,
-                           hold=0.5)
+                           hold=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -340,8 +340,10 @@ def robot(planned_template, own_address, tmp_path_factory):
 
 
 @pytest.fixture
-def armed(planned_folder, tmp_path, robot, motion_settings, start_joints):
+def armed(planned_folder, tmp_path, robot, motion_settings, start_joints, monkeypatch):
     """Execute the plan; the arm stands with its start's joints, or those of ``stands`` [rad, 6]."""
+    monkeypatch.setattr("limber.stages.execute._TARE_SECONDS", 0.3)
+
     def run(*, unexpected: float, stands=None):
         path = cell_file(cell_before(planned_folder, robot.address, unexpected_force_n=unexpected),
                          tmp_path)

@@ -15,7 +15,6 @@ from benchmarks.robot_faults import (
     cell_for,
     new_robot,
     provoke,
-    restored,
     set_off,
     straight,
     tared,
@@ -31,54 +30,30 @@ from limber.robot.trajectory import Trajectory, along, densely
 pytest.importorskip("rtde_control")
 
 
-@pytest.fixture(scope="module")
-def robots(worker_address):
-    """A robot of each series beside each other, started once: their controllers share no port."""
-    host = int(worker_address.split(".")[-1])
-    with (new_robot(f"127.0.0.{host + 20}", "ur5", 3) as cb3,
-          new_robot(f"127.0.0.{host + 40}", "ur5e", 5) as e_series):
-        yield {"ur5": cb3, "ur5e": e_series}
-
-
-def _restored(robot):
-    restored(robot)
-    return robot
-
-
-@pytest.fixture
-def moving_robot(robots):
-    return _restored(robots["ur5e"])
-
-
-@pytest.fixture
-def moving_cb3(robots):
-    return _restored(robots["ur5"])
-
-
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in ENDS_ROBOT])
-def test_every_fault_ends_in_standstill_and_a_report(moving_robot, name):
+def test_every_fault_ends_in_standstill_and_a_report(e_series, name):
     """At 50 mm/s: standing within 0.6 s, most of them within a few millimetres."""
-    outcome = provoke(name, moving_robot, cell_for(moving_robot.address))
+    outcome = provoke(name, e_series, cell_for(e_series.address))
     assert outcome.report
     assert outcome.standstill_s < 0.6 and outcome.way_m < 0.03
 
 
 @pytest.mark.parametrize("moving", [True, False])
 @pytest.mark.parametrize("direction", DIRECTIONS)
-def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(moving_robot, direction,
+def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(e_series, direction,
                                                                        moving):
     """Told at once; then nothing that is asked of the driver takes longer either."""
-    address = f"127.0.0.{int(moving_robot.address.split('.')[-1]) + 20}"
-    with Cable(address, moving_robot.address) as cable, RobotLink(cell_for(address)) as link:
+    address = f"127.0.0.{int(e_series.address.split('.')[-1]) + 20}"
+    with Cable(address, e_series.address) as cable, RobotLink(cell_for(address)) as link:
         if moving:
-            set_off(moving_robot, link, straight(moving_robot, (0.0, 0.2, 0.0)))
+            set_off(e_series, link, straight(e_series, (0.0, 0.2, 0.0)))
         else:
             tared(link)
         began = time.monotonic()
         cable.cut(direction)
         assert link.wait("stopped", seconds=5)["reason"]
         assert time.monotonic() - began < 1.0
-        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3 or moving
+        assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3 or moving
         if direction == "from the robot":
             assert link.process.wait(5.0) is not None
             assert time.monotonic() - began < 2.0
@@ -86,7 +61,7 @@ def test_a_connection_that_carries_one_way_stops_it_within_two_seconds(moving_ro
         with pytest.raises(LimberError):
             link.retreat()
         assert time.monotonic() - began < 2.0
-        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
+        assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3
 
 
 def test_a_killed_controller_is_reported(worker_address):
@@ -94,25 +69,23 @@ def test_a_killed_controller_is_reported(worker_address):
         assert provoke("controller killed", robot, cell_for(worker_address)).report
 
 
-def test_a_second_client_is_refused_and_the_first_goes_on(moving_robot):
-    cell = cell_for(moving_robot.address)
+def test_a_second_client_is_refused_and_the_first_goes_on(e_series):
+    cell = cell_for(e_series.address)
     with RobotLink(cell) as first:
-        set_off(moving_robot, first, straight(moving_robot, (0.0, 0.1, 0.0)))
+        set_off(e_series, first, straight(e_series, (0.0, 0.1, 0.0)))
         with pytest.raises(LimberError):
             RobotLink(cell).close()
         assert first.wait("reached", "stopped", seconds=30)["event"] == "reached"
 
 
-@pytest.mark.parametrize("model", ["ur5", "ur5e"])
-def test_a_path_is_followed_within_a_millimetre(model, robots):
+def test_a_path_is_followed_within_a_millimetre(robot):
     """Two legs at 30 mm/s: distance of the arm from the path, by the arm's own state."""
-    robot = _restored(robots[model])
     start = np.array(robot.state["pose"])
     poses = densely(np.array([start, start + [0, 0.012, 0, 0, 0, 0],
                               start + [0, 0.012, 0.009, 0, 0.03, 0]]))
     path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
     rows = []
-    with RobotLink(cell_for(robot.address, model), rows.append) as link:
+    with RobotLink(cell_for(robot.address, robot.model), rows.append) as link:
         tared(link)
         assert link.follow(path)["event"] == "reached"
         back = link.retreat()
@@ -127,53 +100,53 @@ def test_a_path_is_followed_within_a_millimetre(model, robots):
     assert np.linalg.norm(samples[-1, 1:4] - start[:3]) < 1e-4
 
 
-def test_pause_at_the_soft_limit_then_resume(moving_robot):
-    cell = cell_for(moving_robot.address)
+def test_pause_at_the_soft_limit_then_resume(e_series):
+    cell = cell_for(e_series.address)
     with RobotLink(cell) as link:
-        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.06, 0.0), expected=False))
-        moving_robot.ask("added_wrench", wrench=[0, 0, 12.0, 0, 0, 0])
+        set_off(e_series, link, straight(e_series, (0.0, 0.04, 0.0), expected=False))
+        e_series.ask("added_wrench", wrench=[0, 0, 12.0, 0, 0, 0])
         assert "soft force" in link.wait("paused", "stopped", "reached", seconds=5)["reason"]
         time.sleep(0.5)
-        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
+        assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3
         # By 5 % each 30 ms: a force that falls faster is a slip.
         for force in [*np.geomspace(12, 0.5, 60), 0.0]:
-            moving_robot.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
+            e_series.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
             time.sleep(0.03)
-        assert np.linalg.norm(moving_robot.state["tool_speed"]) < 1e-3
+        assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3
         assert link.resume()["event"] == "reached"
 
 
-def test_a_cb3_is_stopped_without_waiting_for_its_step(moving_cb3):
+def test_a_cb3_is_stopped_without_waiting_for_its_step(cb3):
     """By the dashboard, whatever the force came with; then it goes back the way it came."""
-    with RobotLink(cell_for(moving_cb3.address, "ur5")) as link:
-        begin = np.array(moving_cb3.state["pose"])
-        set_off(moving_cb3, link, straight(moving_cb3, (0.0, 0.2, 0.0)))
-        moving_cb3.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
+    with RobotLink(cell_for(cb3.address, "ur5")) as link:
+        begin = np.array(cb3.state["pose"])
+        set_off(cb3, link, straight(cb3, (0.0, 0.2, 0.0)))
+        cb3.ask("added_wrench", wrench=[0, 0, 60.0, 0, 0, 0])
         assert "force" in link.wait("stopped", seconds=5)["reason"]
         assert any("wait for a step" in each for each in link.warnings)
-        moving_cb3.ask("added_wrench", wrench=[0] * 6)
+        cb3.ask("added_wrench", wrench=[0] * 6)
         time.sleep(0.3)
         assert link.retreat()["event"] == "reached"
         # The program that was uploaded anew is watched like the first.
-        assert moving_cb3.state["watchdog_s"] == pytest.approx(0.1)
-        assert np.allclose(moving_cb3.state["pose"][:3], begin[:3], atol=1e-4)
+        assert cb3.state["watchdog_s"] == pytest.approx(0.1)
+        assert np.allclose(cb3.state["pose"][:3], begin[:3], atol=1e-4)
 
 
-def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_robot):
+def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(e_series):
     """It pauses, goes back some centimetres under the same force, stops and lets go."""
-    cell = cell_for(moving_robot.address)
+    cell = cell_for(e_series.address)
     cell = cell.model_copy(update={"tool": cell.tool.model_copy(update={
         "gripper": "digital_output", "grip_seconds": 0.2})})
     with RobotLink(cell) as link:
         tared(link)
         link.gripper(close=True)
-        link.start(straight(moving_robot, (0.0, 0.1, 0.0), expected=False))
+        link.start(straight(e_series, (0.0, 0.1, 0.0), expected=False))
         time.sleep(0.9)
-        moving_robot.ask("added_wrench", wrench=[0, 0, 14.0, 0, 0, 0])
+        e_series.ask("added_wrench", wrench=[0, 0, 14.0, 0, 0, 0])
         assert "soft force" in link.wait("paused", "stopped", seconds=5)["reason"]
-        paused = moving_robot.state
+        paused = e_series.state
         told = retreat_if_chosen(cell, link, "retreat", SILENT)
-        ended = moving_robot.state
+        ended = e_series.state
     assert not told["retreated"] and told["gripper_opened"]
     assert "force does not fall" in told["outcome"] and "14." in told["outcome"]
     assert told["force_n"] == pytest.approx(14.0, abs=1.0)
@@ -182,12 +155,12 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(moving_
     assert 0.015 < way[1] < 0.03 and np.linalg.norm(ended["tool_speed"]) < 1e-3
 
 
-def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(moving_robot):
-    with RobotLink(cell_for(moving_robot.address)) as link:
-        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.1, 0.0)))
+def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(e_series):
+    with RobotLink(cell_for(e_series.address)) as link:
+        set_off(e_series, link, straight(e_series, (0.0, 0.1, 0.0)))
         link.stop()
         link.wait("stopped", seconds=5)
-        moving_robot.ask("stand", joints=list(np.add(moving_robot.state["joints"],
+        e_series.ask("stand", joints=list(np.add(e_series.state["joints"],
                                                      [0.2, 0, 0, 0, 0, 0])))
         time.sleep(0.1)
         with pytest.raises(SafetyStop, match=r"mm and .* degrees from the way"):
@@ -195,11 +168,11 @@ def test_an_arm_that_was_moved_after_its_stop_does_not_go_back(moving_robot):
 
 
 @pytest.mark.parametrize("held_up, ends", [("both", "reached"), ("the robot", "stopped")])
-def test_a_computer_that_stands_still_is_no_silent_robot(moving_robot, held_up, ends):
+def test_a_computer_that_stands_still_is_no_silent_robot(e_series, held_up, ends):
     """Both held up for 80 ms: nothing was there to be heard. The robot alone: its data is old."""
-    with RobotLink(cell_for(moving_robot.address)) as link:
-        set_off(moving_robot, link, straight(moving_robot, (0.0, 0.05, 0.0)))
-        held = [moving_robot.process] + ([link.process] if held_up == "both" else [])
+    with RobotLink(cell_for(e_series.address)) as link:
+        set_off(e_series, link, straight(e_series, (0.0, 0.04, 0.0)))
+        held = [e_series.process] + ([link.process] if held_up == "both" else [])
         for process in reversed(held):
             process.send_signal(signal.SIGSTOP)
         time.sleep(0.08)
@@ -213,35 +186,36 @@ def test_a_computer_that_stands_still_is_no_silent_robot(moving_robot, held_up, 
         assert "no data from the robot" in event["reason"]
 
 
-def test_a_first_run_compiles_before_the_watchdog_listens(moving_robot, tmp_path, monkeypatch):
+def test_a_first_run_compiles_before_the_watchdog_listens(e_series, tmp_path, monkeypatch):
     """It had just compiled, and looked for what that left behind while its watchdog ran out."""
     kernels = tmp_path / "kernels"
-    shutil.copytree(cache_folder(), kernels, ignore=shutil.ignore_patterns("frames.turned_wrench*", "frames.pose_of*"))
+    shutil.copytree(cache_folder(), kernels, ignore=shutil.ignore_patterns(
+        "frames.turned_wrench*", "frames.pose_of*"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernels))
-    with RobotLink(cell_for(moving_robot.address)) as link:
+    with RobotLink(cell_for(e_series.address)) as link:
         assert any(kernels.rglob("frames.turned_wrench*.nbc"))
         tared(link)
-        link.start(straight(moving_robot, (0.0, 0.02, 0.0)))
+        link.start(straight(e_series, (0.0, 0.02, 0.0)))
         assert link.wait("reached", "stopped", seconds=10)["event"] == "reached"
 
 
-def test_after_a_stop_only_a_choice_moves_it(moving_robot):
-    with RobotLink(cell_for(moving_robot.address)) as link:
-        line = straight(moving_robot, (0.0, 0.1, 0.0))
+def test_after_a_stop_only_a_choice_moves_it(e_series):
+    with RobotLink(cell_for(e_series.address)) as link:
+        line = straight(e_series, (0.0, 0.1, 0.0))
         link.wait_for_samples()
         with pytest.raises(SafetyStop, match="not tared"):
             link.start(line)
-        set_off(moving_robot, link, line)
+        set_off(e_series, link, line)
         link.stop()
         assert "asked to stop" in link.wait("stopped", seconds=5)["reason"]
         time.sleep(0.2)
         with pytest.raises(SafetyStop, match="Choose"):
-            link.start(straight(moving_robot, (0.0, 0.05, 0.0)))
+            link.start(straight(e_series, (0.0, 0.05, 0.0)))
         assert link.retreat()["event"] == "reached"
-        assert np.allclose(moving_robot.state["pose"][:3], line.poses[0, :3], atol=1e-4)
+        assert np.allclose(e_series.state["pose"][:3], line.poses[0, :3], atol=1e-4)
 
 
-def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
+def test_a_program_that_is_slow_to_read_holds_nothing_up(e_series):
     """Samples of 0.8 s would fill its pipe twice over: the motion goes on to its end."""
     stalled, taken = threading.Event(), []
 
@@ -250,9 +224,9 @@ def test_a_program_that_is_slow_to_read_holds_nothing_up(moving_robot):
             stalled.clear()
             time.sleep(0.8)
         taken.append(rows)
-    with RobotLink(cell_for(moving_robot.address), take) as link:
+    with RobotLink(cell_for(e_series.address), take) as link:
         tared(link)
-        link.start(straight(moving_robot, (0.0, 0.06, 0.0)))
+        link.start(straight(e_series, (0.0, 0.06, 0.0)))
         stalled.set()
         assert link.wait("reached", "stopped", seconds=30)["event"] == "reached"
         time.sleep(0.1)

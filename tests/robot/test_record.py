@@ -50,7 +50,10 @@ def shared_robot(branch_template, worker_address, tmp_path_factory):
 
 
 @pytest.fixture
-def robot(shared_robot):
+def robot(shared_robot, monkeypatch):
+    """Before a pull it is waited for less than beside a real branch."""
+    monkeypatch.setattr("limber.stages.record._TARE_SECONDS", 0.3)
+    monkeypatch.setattr("limber.stages.record._SETTLE_SECONDS", 0.2)
     restored(shared_robot)
     return shared_robot
 
@@ -123,7 +126,7 @@ def test_a_pull_against_something_stiff_is_let_back_after_its_pause(branch_folde
         command_of(stage_description("record"), "").main(
             [str(branch_folder), "--cell", str(path), "--name", "stiff", "--confirm", "stiff",
              "--after-stop", "retreat", "--shape", "straight", "--direction", *map(str, axis),
-             "--distance", "0.03", "--speed", "0.005", "--json"], standalone_mode=False)
+             "--distance", "0.03", "--speed", "0.007", "--json"], standalone_mode=False)
     out, errors = capfd.readouterr()
     told = json.loads(out.splitlines()[-1])
     assert stop.value.code == 4, (told, errors, robot.state)

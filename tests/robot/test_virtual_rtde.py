@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from tests.robot.conftest import let_go
 
 from limber.errors import InputError, WorkError
 from limber.robot import rtde
@@ -139,7 +140,7 @@ def test_the_real_client_moves_it(robot):
 
     receive = rtde_receive.RTDEReceiveInterface(robot.address)
     control = rtde_control.RTDEControlInterface(robot.address)
-    try:
+    with let_go(control, receive):
         start = np.array(receive.getActualTCPPose())
 
         def off(*offset: float) -> list[float]:
@@ -194,9 +195,6 @@ def test_the_real_client_moves_it(robot):
         time.sleep(0.1)
         assert not control.moveL(off(*here), 0.1, 0.5)
         assert robot.state["program"] == "STOPPED"
-    finally:
-        control.disconnect()
-        receive.disconnect()
 
 
 def test_watchdog_and_protective_stop_with_the_real_client(e_series):
@@ -204,7 +202,7 @@ def test_watchdog_and_protective_stop_with_the_real_client(e_series):
 
     receive = rtde_receive.RTDEReceiveInterface(e_series.address)
     control = rtde_control.RTDEControlInterface(e_series.address)
-    try:
+    with let_go(control, receive):
         start = receive.getActualTCPPose()
         away = [start[0], start[1] + 0.2, *start[2:]]
         assert control.moveL(away, 0.05, 0.5, True)
@@ -223,15 +221,11 @@ def test_watchdog_and_protective_stop_with_the_real_client(e_series):
         assert e_series.state["program"] == "PLAYING"
         time.sleep(0.25)
         assert e_series.state["program"] == "STOPPED"
-    finally:
-        control.disconnect()
-        receive.disconnect()
 
 
-def test_the_ft300_stream_is_what_robotiq_sends(worker_address):
-    with (VirtualRobot("ur5", worker_address, ["--ft300"]) as robot,
-          socket.create_connection((worker_address, FT300_PORT), 5.0) as stream):
-        robot.ask("added_wrench", wrench=[0, 0, 40.0, 0, 0, 1.0])
+def test_the_ft300_stream_is_what_robotiq_sends(cb3):
+    with socket.create_connection((cb3.address, FT300_PORT), 5.0) as stream:
+        cb3.ask("added_wrench", wrench=[0, 0, 40.0, 0, 0, 1.0])
         time.sleep(0.1)
         stream.recv(65536)
         text = stream.recv(4096).decode()

@@ -12,10 +12,11 @@ import tomlkit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from limber.errors import InputError
+from limber.files import write_atomically
+from limber.plain import plain
 from limber.reading import read_toml
 from limber.robot.arms import ARMS, Arm, arm_named
 from limber.robot.kinematics import inverted, matrices
-from limber.store import plain, write_atomically
 
 Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float]

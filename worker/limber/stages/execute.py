@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 _SPACING = 0.0025  # m between poses that are solved: a chord of it on a bend of 0.3 m stretches
 # a branch by 3 micrometres
 _MOST_POSES = 120
+_TARE_SECONDS = 1.0
 _BEFORE_PATH_SECONDS = 10.0  # from the tare to the path's start
 
 
@@ -394,8 +395,8 @@ def _steps(cell: Cell, link: RobotLink, motion: RobotMotion, settings: ExecuteSe
     """Go through approach, grasp, path, return and leaving; stops at the first that stops."""
     progress(0.5, "taring: keep the gripper free")
     live.at("taring")
-    time.sleep(0.2)
-    link.tare(1.0)
+    link.wait_for_samples()
+    link.tare(_TARE_SECONDS)
     on_path: tuple[int, int] | None = None
     legs: list[tuple[str, Trajectory]] = [
         ("approach", motion.approach), ("path", motion.path), ("return", motion.way_back),

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from limber.robot.trajectory import Trajectory
     from limber.store import Stream
 
+_TARE_SECONDS = 1.0
+_SETTLE_SECONDS = 0.5  # until the branch rests in the closed gripper
+
 
 class RecordInputs(BranchInputs):
     """A branch folder, the robot's cell and the recording's name."""
@@ -160,9 +163,9 @@ def _recorded(branch: Branch, cell: Cell, name: str, settings: RecordSettings,
                                progress.part(0.02, 0.1))
             progress(0.1, "taring: keep the gripper free")
             live.at("taring")
-            tared = link.tare(1.0)
+            tared = link.tare(_TARE_SECONDS)
             grip(cell, link, close=True, progress=progress)
-            time.sleep(0.5)
+            time.sleep(_SETTLE_SECONDS)
             _write_entry(entry_lines, cell, point, tared, trajectory.duration, tracker,
                          marker_lines)
             recorder.close_gripper()

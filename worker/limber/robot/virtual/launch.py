@@ -36,7 +36,7 @@ class VirtualRobot:
 
     def __init__(self, model: str = "ur5e", address: str = "127.0.0.1",
                  options: Sequence[str] = ()):
-        self.address = address
+        self.model, self.address = model, address
         command = [sys.executable, "-m", "limber.robot.virtual", "--model", model,
                    "--address", address, *map(str, options)]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
