@@ -117,6 +117,14 @@ def branch_folder(branch_template, tmp_path):
     return shutil.copytree(branch_template, tmp_path / "small.branch")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse a test held to wall clocks where `scripts/test` does not look for it."""
+    lost = [item.nodeid for item in items if item.get_closest_marker("real_time") is not None
+            and Path(__file__).parent / "robot" not in item.path.parents]
+    if lost:
+        raise pytest.UsageError(f"real_time is for tests/robot alone: {', '.join(lost)}")
+
+
 _QUICK_SECONDS = 2.0
 """A test without the mark `slow` takes half a second; several times that is worth a word."""
 

@@ -1,7 +1,8 @@
 """A virtual controller stepped by hand, and one in a process with the real client on it."""
 
 import time
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
@@ -59,9 +60,11 @@ def registers():
 def robots(worker_address):
     """A virtual robot of each series in a process of its own; the CB3 has an FT300."""
     host = int(worker_address.split(".")[-1])
-    with (new_robot(f"127.0.0.{host + 20}", "ur5", 3) as cb3,
-          new_robot(f"127.0.0.{host + 40}", "ur5e", 5) as e_series):
-        yield {"ur5": cb3, "ur5e": e_series}
+    with ExitStack() as stack, ThreadPoolExecutor() as both:
+        started = [both.submit(new_robot, f"127.0.0.{host + beside}", model, seed)
+                   for beside, model, seed in ((20, "ur5", 3), (40, "ur5e", 5))]
+        yield {robot.model: stack.enter_context(robot) for robot in
+               (each.result() for each in started)}
 
 
 @pytest.fixture

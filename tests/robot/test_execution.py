@@ -382,7 +382,7 @@ def test_an_armed_run_feels_what_was_predicted_and_ends_where_it_should(planned_
     assert np.linalg.norm(np.subtract(state["pose"][:3], result["start_pose_base"][:3])) < 1e-3
 
 
-@pytest.mark.real_time
+@pytest.mark.slow
 def test_a_force_unlike_the_predicted_one_stops_an_armed_run(planned_folder, armed):
     """An allowance within the sensor's noise is passed: exit 4, a report, far below the limit."""
     with pytest.raises(SafetyStop, match="stopped"):

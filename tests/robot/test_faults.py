@@ -81,8 +81,8 @@ def test_a_second_client_is_refused_and_the_first_goes_on(e_series):
 def test_a_path_is_followed_within_a_millimetre(robot):
     """Two legs at 30 mm/s: distance of the arm from the path, by the arm's own state."""
     start = np.array(robot.state["pose"])
-    poses = densely(np.array([start, start + [0, 0.012, 0, 0, 0, 0],
-                              start + [0, 0.012, 0.009, 0, 0.03, 0]]))
+    poses = densely(np.array([start, start + [0, 0.01, 0, 0, 0, 0],
+                              start + [0, 0.01, 0.0075, 0, 0.025, 0]]))
     path = Trajectory(along(poses, 0.03, 0.2), poses, ExpectedWrench.nothing(poses))
     rows = []
     with RobotLink(cell_for(robot.address, robot.model), rows.append) as link:
@@ -109,7 +109,7 @@ def test_pause_at_the_soft_limit_then_resume(e_series):
         time.sleep(0.5)
         assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3
         # By 5 % each 30 ms: a force that falls faster is a slip.
-        for force in [*np.geomspace(12, 0.5, 60), 0.0]:
+        for force in [*np.geomspace(12, 0.7, 54), 0.0]:
             e_series.ask("added_wrench", wrench=[0, 0, float(force), 0, 0, 0])
             time.sleep(0.03)
         assert np.linalg.norm(e_series.state["tool_speed"]) < 1e-3
@@ -125,7 +125,6 @@ def test_a_cb3_is_stopped_without_waiting_for_its_step(cb3):
         assert "force" in link.wait("stopped", seconds=5)["reason"]
         assert any("wait for a step" in each for each in link.warnings)
         cb3.ask("added_wrench", wrench=[0] * 6)
-        time.sleep(0.3)
         assert link.retreat()["event"] == "reached"
         # The program that was uploaded anew is watched like the first.
         assert cb3.state["watchdog_s"] == pytest.approx(0.1)
@@ -189,8 +188,8 @@ def test_a_computer_that_stands_still_is_no_silent_robot(e_series, held_up, ends
 def test_a_first_run_compiles_before_the_watchdog_listens(e_series, tmp_path, monkeypatch):
     """It had just compiled, and looked for what that left behind while its watchdog ran out."""
     kernels = tmp_path / "kernels"
-    shutil.copytree(cache_folder(), kernels, ignore=shutil.ignore_patterns(
-        "frames.turned_wrench*", "frames.pose_of*"))
+    shutil.copytree(cache_folder(), kernels,
+                    ignore=shutil.ignore_patterns("frames.turned_wrench*"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(kernels))
     with RobotLink(cell_for(e_series.address)) as link:
         assert any(kernels.rglob("frames.turned_wrench*.nbc"))

@@ -38,7 +38,7 @@ def sideways_pull(branch_folder, **changes) -> RecordSettings:
 
 
 def cell_at(branch_folder, address, **limits) -> Cell:
-    return standing_at(Branch.open(branch_folder), address, grip_seconds=0.4, **limits)
+    return standing_at(Branch.open(branch_folder), address, grip_seconds=0.3, **limits)
 
 
 @pytest.fixture(scope="module")
