@@ -310,7 +310,7 @@ APPROACH = ApproachEntry(distance_m=0.03)
 def cell_before(folder, address, **limits) -> Cell:
     """The gripper stands where the approach begins, and comes as the cell's robot was put."""
     cell = standing_at(Branch.open(folder), address, fraction=FRACTION, back=APPROACH.distance_m,
-                       grip_seconds=0.4, soft_force_n=15.0, hard_force_n=20.0, **limits)
+                       grip_seconds=0.3, soft_force_n=15.0, hard_force_n=20.0, **limits)
     return cell.model_copy(update={"approach": APPROACH})
 
 

@@ -72,7 +72,7 @@ def test_a_killed_controller_is_reported(worker_address):
 def test_a_second_client_is_refused_and_the_first_goes_on(e_series):
     cell = cell_for(e_series.address)
     with RobotLink(cell) as first:
-        set_off(e_series, first, straight(e_series, (0.0, 0.1, 0.0)))
+        set_off(e_series, first, straight(e_series, (0.0, 0.08, 0.0)))
         with pytest.raises(LimberError):
             RobotLink(cell).close()
         assert first.wait("reached", "stopped", seconds=30)["event"] == "reached"
@@ -140,7 +140,7 @@ def test_where_the_force_does_not_fall_on_the_way_back_the_gripper_opens(e_serie
         tared(link)
         link.gripper(close=True)
         link.start(straight(e_series, (0.0, 0.1, 0.0), expected=False))
-        time.sleep(0.9)
+        time.sleep(0.8)
         e_series.ask("added_wrench", wrench=[0, 0, 14.0, 0, 0, 0])
         assert "soft force" in link.wait("paused", "stopped", seconds=5)["reason"]
         paused = e_series.state
@@ -225,7 +225,7 @@ def test_a_program_that_is_slow_to_read_holds_nothing_up(e_series):
         taken.append(rows)
     with RobotLink(cell_for(e_series.address), take) as link:
         tared(link)
-        link.start(straight(e_series, (0.0, 0.06, 0.0)))
+        link.start(straight(e_series, (0.0, 0.05, 0.0)))
         stalled.set()
         assert link.wait("reached", "stopped", seconds=30)["event"] == "reached"
         time.sleep(0.1)

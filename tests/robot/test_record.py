@@ -151,7 +151,7 @@ def test_a_killed_recording_is_taken_over(branch_folder, tmp_path, robot):
         assert time.monotonic() < end and process.poll() is None, process.stdout.read()
         time.sleep(0.02)
     begin = robot.state["clock"]
-    time.sleep(1.6)
+    time.sleep(1.4)
     killed = robot.state["clock"]
     process.send_signal(signal.SIGKILL)
     process.wait()

@@ -163,7 +163,7 @@ def test_the_real_client_moves_it(robot):
         assert control.moveL(off(*here), 0.05, 0.5, True)
         time.sleep(0.2)
         control.stopL(2.0, True)
-        time.sleep(0.2)
+        time.sleep(0.1)
         assert 0.005 < error(*here) < 0.031 and not np.any(receive.getActualQd())
         now = np.array(receive.getActualTCPPose())
         for k in range(50):
@@ -174,7 +174,7 @@ def test_the_real_client_moves_it(robot):
         time.sleep(0.1)
         assert receive.getActualTCPPose()[1] - now[1] == pytest.approx(0.0196, abs=0.006)
         assert control.speedL([0, -0.05, 0, 0, 0, 0], 1.0, 0)
-        time.sleep(0.3)
+        time.sleep(0.15)
         assert receive.getActualTCPSpeed()[1] == pytest.approx(-0.05, abs=1e-3)
         assert control.speedStop(10.0)
         assert control.setPayload(0.7, [0, 0, 0.05]) and control.setTcp([0, 0, 0.1, 0, 0, 0])

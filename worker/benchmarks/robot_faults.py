@@ -20,7 +20,7 @@ from limber.robot.virtual.server import SCRIPT_PORT
 
 STILL_M_S = 1e-4
 _TARE_READINGS = 25
-_AT_SPEED = 0.97  # of the trajectory's: it comes near to it slowly at the end
+_AT_SPEED = 0.95  # of the trajectory's: it comes near to it slowly at the end
 _START_SECONDS = 10.0
 
 
