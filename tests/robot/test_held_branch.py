@@ -171,21 +171,26 @@ def closed(held, flange) -> str:
 
 def settled(held, flange) -> None:
     """Stand still until the branch is solved there, and nothing more is asked."""
-    for _ in range(400):
-        # Its speed dies down first: else it would be solved where the gripper does not go.
-        held.wrench(flange, 0.002)
     for _ in range(10):
-        if not held._busy:
+        # Its speed dies down first: else it would be solved where the gripper does not go.
+        held.wrench(flange, 0.05)
+    for _ in range(20):
+        was_busy = held._busy
+        if was_busy:
+            held._pipe.poll(5.0)
+        held.wrench(flange, 0.05)
+        # An answer of another kind came in a step that asks for nothing; the next one does.
+        if not was_busy and not held._busy:
             return
-        held._pipe.poll(5.0)
-        held.wrench(flange, 0.002)
     raise AssertionError("the branch was solved again and again")
 
 
 def pulled_aside(held, flange):
-    """Move the flange by 10 mm and wait for the branch; where it is then."""
+    """Move the flange by 10 mm in a second and wait for the branch; where it is then."""
     moved = flange.copy()
-    moved[1, 3] += 0.01
+    for part in np.linspace(0, 1, 20):
+        moved[1, 3] = flange[1, 3] + 0.01 * part
+        held.wrench(moved, 0.05)
     settled(held, moved)
     return moved
 
@@ -228,7 +233,6 @@ def test_the_flange_feels_the_reaction_of_statics(held, setting, beam):
     assert held.wrench(moved, 0.002) == pytest.approx(np.zeros(6))
 
 
-@pytest.mark.slow
 def test_the_camera_sees_the_bent_branch(held, beam):
     """Between solutions it takes a picture: at rest the beam's own surface, then one moved."""
     flange = Controller("ur5e").flange
@@ -268,7 +272,6 @@ def test_views_stand_around_and_look_at_the_middle():
         assert camera.to_camera(middle[None])[0] == pytest.approx([0, 0, 0.6], abs=1e-12)
 
 
-@pytest.mark.slow
 def test_sliding_in_the_grip_lets_the_force_fall(held):
     flange = Controller("ur5e").flange
     held.wrench(flange, 0.002)
@@ -280,7 +283,6 @@ def test_sliding_in_the_grip_lets_the_force_fall(held):
     assert 0.3 * before < after < 0.7 * before
 
 
-@pytest.mark.slow
 def test_a_picture_that_comes_between_two_questions_is_not_lost(held, monkeypatch):
     """It was thrown away as a late solution, one scan in ten, and the camera waited for ever."""
     flange, asked = Controller("ur5e").flange, itertools.count()
@@ -296,7 +298,6 @@ def test_a_picture_that_comes_between_two_questions_is_not_lost(held, monkeypatc
     assert held.picture is not None
 
 
-@pytest.mark.slow
 def test_what_gives_way_is_in_series_with_the_branch(held):
     """A wrench F at compliance C is that of the branch C F nearer to its rest."""
     flange = Controller("ur5e").flange
@@ -312,7 +313,6 @@ def test_what_gives_way_is_in_series_with_the_branch(held):
     assert np.linalg.norm(felt) < np.linalg.norm(solution.wrench_at(patch, 0.0))
 
 
-@pytest.mark.slow
 def test_what_is_seen_stays_behind_by_what_gives_way(held):
     """Solved with the piece C F behind the gripper, the points are seen where they were solved."""
     flange = Controller("ur5e").flange
@@ -327,7 +327,6 @@ def test_what_is_seen_stays_behind_by_what_gives_way(held):
     assert held.points == pytest.approx(solution.points, abs=1e-4)
 
 
-@pytest.mark.slow
 def test_closing_on_nothing_is_told(held):
     far = Controller("ur5e").flange.copy()
     far[2, 3] += 0.3
