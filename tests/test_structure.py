@@ -3,6 +3,8 @@
 import ast
 import functools
 import graphlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -10,15 +12,58 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
+@dataclass(frozen=True)
+class Source:
+    """What these rules look at in a Python file.
+
+    Attributes:
+        imports: All statements that import.
+        type_imports: Those for type checkers alone.
+        calls: Line and dotted name of what is called.
+        attributes: Line and dotted name of what is looked up with a dot.
+    """
+
+    imports: list[ast.Import | ast.ImportFrom]
+    type_imports: set[ast.Import | ast.ImportFrom]
+    calls: list[tuple[int, str]]
+    attributes: list[tuple[int, str]]
+
+
+@functools.cache
+def source(path: Path) -> Source:
+    """Read a file once for all rules."""
+    found = Source([], set(), [], [])
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found.imports.append(node)
+        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            found.type_imports.update(each for each in ast.walk(node)
+                                      if isinstance(each, ast.Import | ast.ImportFrom))
+        elif isinstance(node, ast.Call):
+            found.calls.append((node.lineno, _dotted(node.func)))
+        elif isinstance(node, ast.Attribute):
+            found.attributes.append((node.lineno, _dotted(node)))
+    return found
+
+
+def _dotted(node: ast.expr) -> str:
+    """Return ``a.b.c`` of names and dots; of anything else nothing."""
+    if isinstance(node, ast.Attribute):
+        before = _dotted(node.value)
+        return f"{before}.{node.attr}" if before else ""
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+@functools.cache
 def imported_modules(folder: Path) -> dict[Path, set[str]]:
     """Return, for each Python file below ``folder``, the top-level names of what it imports."""
     found = {}
     for path in folder.rglob("*.py"):
         names = set()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in source(path).imports:
             if isinstance(node, ast.Import):
                 names |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            elif node.level == 0:
                 names.add((node.module or "").split(".")[0])
         found[path] = names
     return found
@@ -116,25 +161,22 @@ def core_imports() -> dict[str, set[str]]:
     for path in CORE.rglob("*.py"):
         parts = path.relative_to(CORE).with_suffix("").parts
         files[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return {module: _imported(ast.parse(path.read_text(encoding="utf-8")), files)
+    return {module: set(_imported(source(path), files)) - {""}
             for module, path in files.items()}
 
 
-def _imported(tree: ast.AST, files: dict[str, Path]) -> set[str]:
-    found: set[str] = set()
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+def _imported(read: Source, files: dict[str, Path]) -> Iterator[str]:
+    for node in read.imports:
+        if node in read.type_imports:
             continue
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "limber":
             base = (node.module or "").removeprefix("limber").strip(".")
             for alias in node.names:
                 inside = f"{base}.{alias.name}".strip(".")
-                found.add(inside if inside in files else base)
+                yield inside if inside in files else base
         elif isinstance(node, ast.Import):
-            found |= {alias.name.removeprefix("limber.") for alias in node.names
-                      if alias.name.startswith("limber.")}
-        found |= _imported(node, files)
-    return found - {""}
+            yield from (alias.name.removeprefix("limber.") for alias in node.names
+                        if alias.name.startswith("limber."))
 
 
 def place_of(module: str) -> tuple[int, str]:
@@ -220,9 +262,8 @@ def test_files_come_in_through_one_door():
         if module == "reading" or any(
                 module == name or module.startswith(name + ".") for name in OWN_LINES):
             continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and ast.unparse(node.func) in doors:
-                wrong.append(f"limber.{module}, line {node.lineno}: {ast.unparse(node.func)}")
+        wrong += [f"limber.{module}, line {line}: {name}" for line, name in source(path).calls
+                  if name in doors]
     assert not wrong
 
 
@@ -242,10 +283,8 @@ def test_only_stages_open_branch_folders():
     for path in CORE.rglob("*.py"):
         if path.relative_to(CORE).parts[0] in allowed:
             continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Attribute) and node.attr in ("open", "create") and (
-                    getattr(node.value, "id", "") == "Branch"):
-                wrong.append(f"{path.relative_to(CORE)}:{node.lineno}")
+        wrong += [f"{path.relative_to(CORE)}:{line}" for line, name in source(path).attributes
+                  if name in ("Branch.open", "Branch.create")]
     assert not wrong
 
 
