@@ -149,16 +149,16 @@ def test_what_follows_a_failure_is_not_run(jobs, tmp_path):
 @pytest.mark.slow
 def test_a_worker_that_hangs_is_told_from_one_that_works(jobs, tmp_path, monkeypatch):
     """Signs of life with work, without work, and none; what remains by what was done."""
-    monkeypatch.setattr(jobs, "_SILENT_SECONDS", 1.0)
-    monkeypatch.setattr(jobs, "_IDLE_SECONDS", 0.4)
+    monkeypatch.setattr(jobs, "_SILENT_SECONDS", 0.7)
+    monkeypatch.setattr(jobs, "_IDLE_SECONDS", 0.3)
     monkeypatch.setattr(jobs, "_KNOWN_SECONDS", 0.0)
     job = jobs.start("Trying", _worker(tmp_path, """
         say(progress=0.25, best_m2=1e-6)
         for number in range(8):
-            time.sleep(0.1)
+            time.sleep(0.05)
             say(alive=number, cpu_s=10.0 * number)
         for number in range(8):
-            time.sleep(0.1)
+            time.sleep(0.06)
             say(alive=number, cpu_s=70.001)
         time.sleep(60)
         """))
@@ -168,7 +168,7 @@ def test_a_worker_that_hangs_is_told_from_one_that_works(jobs, tmp_path, monkeyp
     assert job.numbers["best_m2"] == 1e-6
     _poll_until(job, lambda: job.life()[0] is jobs.Life.IDLE)
     _poll_until(job, lambda: job.life()[0] is jobs.Life.SILENT)
-    assert job.life()[1] > 1.0
+    assert job.life()[1] > 0.7
 
 
 def test_forget_ends_the_worker(jobs, tmp_path):

@@ -162,7 +162,7 @@ def test_interface(run, blender, environment, beam, tmp_path):
     """In a window, by events: the tab opens, a scan is imported and reconstructed by clicks, a job
     cancelled by a click, a result opened, all by the worker beside the interface, and played."""
     require_screen()
-    scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.004).cloud
+    scan = generate_branch(5, length=0.4, fork_count=0, point_spacing=0.006).cloud
     scan.write_ply(tmp_path / "scan.ply")
     slow = tmp_path / "slow_worker"
     slow.write_text("#!/bin/sh\necho '{\"progress\": 0.4, \"message\": \"slowly\"}'\n"

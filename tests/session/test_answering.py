@@ -96,13 +96,12 @@ def test_a_second_session_does_not_learn_again(session, branch_folder, cache):
 
 
 @pytest.mark.slow
-def test_a_damaged_cache_is_said_and_learnt_again(branch_folder, tmp_path):
+@pytest.mark.usefixtures("session")
+def test_a_damaged_cache_is_said_and_learnt_again(branch_folder, cache, tmp_path):
     """A broken file costs a warning and the time to learn, not the session."""
+    (path,) = cache.glob("*.npz")
+    (tmp_path / path.name).write_bytes(path.read_bytes()[:1000])
     options = {"mode": "pinned", "cache_folder": tmp_path, **SMALL}
-    with InteractiveSession(branch_folder, **options) as first:
-        assert first.wait_for("model", 90)
-    (path,) = tmp_path.glob("*.npz")
-    path.write_bytes(path.read_bytes()[:1000])
     with InteractiveSession(branch_folder, **options) as second:
         event = second.wait_for("model", 90)
         assert event is not None and not event["from_cache"]

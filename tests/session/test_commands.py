@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.subjects.processes import left_alive
 
+from limber.cli import call
 from limber.errors import InputError, WorkError
 from limber.mechanics import BranchModel, Grasp, solve_static
 from limber.session import client
@@ -290,19 +291,18 @@ def test_the_session_ends_with_a_client_that_was_killed(branch_folder, tmp_path)
 
 
 @pytest.mark.slow
-def test_the_command_is_a_session(branch_folder, tmp_path):
+def test_the_command_is_a_session(branch_folder, tmp_path, capsys):
     """`limber session` speaks the protocol; a folder that is none ends it with code 2."""
-    command = [sys.executable, "-m", "limber", "session"]
-    with subprocess.Popen([*command, str(branch_folder), "--no-reduced", "--no-grasp"],
+    command = [sys.executable, "-m", "limber", "session", str(branch_folder)]
+    with subprocess.Popen([*command, "--no-reduced", "--no-grasp"],
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         hello = json.loads(process.stdout.readline())
         assert (hello["protocol"], hello["grasps"]) == (PROTOCOL, [])
         process.stdin.close()
         assert json.loads(process.stdout.readline())["event"] == "closed"
         assert process.wait(15) == 0
-    done = subprocess.run([*command, str(tmp_path)], input=b"", capture_output=True, check=False)
-    assert done.returncode == 2
-    assert json.loads(done.stdout)["event"] == "failed"
+    assert call(["session", str(tmp_path)]) == 2
+    assert json.loads(capsys.readouterr().out)["event"] == "failed"
 
 
 @pytest.mark.slow
