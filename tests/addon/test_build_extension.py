@@ -170,8 +170,8 @@ def test_without_any_blender(tmp_path):
 
 def test_an_invalid_manifest_is_refused(tmp_path, bpy):
     """A tagline that Blender does not take ends the build with an error."""
-    if not (ROOT / ".venv").is_dir():
-        pytest.skip("NO .venv: scripts/setup brings it")
+    if not list((ROOT / ".venv").glob("lib/python3*/site-packages/bpy")):
+        pytest.skip("NO BPY in .venv: scripts/setup brings it")
     shutil.copytree(ROOT / "addon", tmp_path / "addon")
     (tmp_path / "scripts").mkdir()
     shutil.copy(ROOT / "scripts" / "build_extension", tmp_path / "scripts")
