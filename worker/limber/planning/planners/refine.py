@@ -31,7 +31,7 @@ _ROUNDS = 12
 _ITERATIONS = 80  # a round
 _WEIGHTS = (1e3, 1.0)  # of squared excesses at first: of place and length, and of loads
 _HOPELESS = 1e5  # times heavier: limits that are not kept then will not be
-_FAR = 10.0  # times a limit over it: weighs more than any cost, so heavier weights change nothing
+_FAR = 10.0  # relative excess that outweighs any cost: heavier weights then change nothing
 _HEAVIER = 5.0  # from a round to the next where limits are not kept much better than before
 _BETTER = 0.25
 _SETTLED = 3e-4  # change of the cost in a round, relative
@@ -51,15 +51,18 @@ def refine(path: np.ndarray, problem: GentleProblem) -> tuple[np.ndarray, float]
         cost = problem.cost(moved)
         if cost < least:
             best, least = moved, cost
-        # A margin makes up for what is over between two points, not for a path that is far over.
+        # A margin mends an excess between two points of a path, not a path that is far over.
         if np.isfinite(cost) or over > _FAR:
             break
     return best, least
 
 
 def _moved(path: np.ndarray, problem: GentleProblem, margin: float) -> tuple[np.ndarray, float]:
-    """Return the path [n, 3] moved to keep ``margin`` [m] from the limits, and the most that it is
-    over any of them in the end, relative."""
+    """Move a path [n, 3] to keep ``margin`` [m] from the limits.
+
+    Returns:
+        The path, and its largest excess over a limit, relative to that limit.
+    """
     line = _Line(problem)
     limits = Limited(problem, margin)
     flat = line.chart.map(path)
